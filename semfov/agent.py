@@ -3,43 +3,52 @@
 from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from os import PathLike, fspath
-from typing import Any, Self, get_args
+from typing import Any, Self
 
 from torch import Tensor, nn
 
-from semfov.agents.episode import EpisodeLimits, OnLook, only_for, without_none
-from semfov.agents.fovea import FoveaAgent, Start
+from semfov.agents.fovea import FoveaAgent
 from semfov.agents.head import HeadAgent
-from semfov.agents.picture import How, KindOfLook, OpenedPicture, PictureLike, check_order, counted_from
+from semfov.agents.kinds import KINDS_OF_LOOK, KindOfLook
+from semfov.agents.picture import OpenedPicture, PictureLike, check_order
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
-from semfov.belief.prior import check_prior
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
 from semfov.data.inputs import Color
 from semfov.data.tone import White
 from semfov.data.windowed import ChosenBands
-from semfov.decision import MOST_CLOSER, check_thresholds
 from semfov.detection.load import DetectorLike, loader_options
 from semfov.detection.scores import HALVES
-from semfov.errors import InputError, check, check_options, checked_keywords, lookup
+from semfov.errors import InputError, check, check_options, checked_keywords
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
-from semfov.io.schema import is_number
 from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazePrediction, Record
 from semfov.paths.gaze import ScanpathLike
 from semfov.presets import published_arguments, raw_arguments, recommended_arguments
-from semfov.strategy import Strategy
-from semfov.words import AGENT, missing
+from semfov.settings import (
+    ExploreSettings,
+    FindSettings,
+    How,
+    KindName,
+    LookSettings,
+    OnLook,
+    SearchSettings,
+    Start,
+    StreamSettings,
+    documented_by,
+)
+from semfov.strategy import Strategy, classes_named
+from semfov.words import missing
 from semfov.zoom import GlimpseEvidence, WindowEye
 
 _Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes
@@ -85,8 +94,11 @@ class ActivePerception(nn.Module):
         grid: tuple[int, int] = (10, 10),
     ) -> None:
         super().__init__()
-        self.eye, self.verification, self.windows = eye, verification, windows
-        self.searching, self.exploring = Strategy(*search), Strategy(*explore)
+        self.eye = eye
+        self.verification = verification
+        self.windows = windows
+        self.searching = Strategy(*search)
+        self.exploring = Strategy(*explore)
         check_cells(grid)
         self.columns, self.rows = grid
         settings = eye.settings()
@@ -106,7 +118,7 @@ class ActivePerception(nn.Module):
         grid: tuple[int, int] = (10, 10),
         **options: Any,
     ) -> Self:
-        """The agent for everyday use: it searches with learned target evidence and explores with a learned map.
+        """Make the agent for everyday use, which searches with learned target evidence and explores with a learned map.
 
         Args:
             name: a detector with shipped models: `yolox-nano`, `yolov3-tiny`, `nanodet-plus-m-1.5x` (with `weights=`).
@@ -126,7 +138,7 @@ class ActivePerception(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolox-nano", **options: Any) -> Self:
-        """The agent from a folder that `semfov.fit_detector` wrote, or the recommended agent for a detector.
+        """Load the agent from a folder that `semfov.fit_detector` wrote, or the recommended agent for a detector.
 
         Args:
             name: the folder, or the name of a detector as for `recommended`.
@@ -152,7 +164,7 @@ class ActivePerception(nn.Module):
         calibrated: bool = True,
         **options: Any,
     ) -> Self:
-        """The agent of Luzio, Bernardino and Moreno (2024), with one of the small detectors that have shipped models.
+        """Make the agent of Luzio, Bernardino and Moreno (2024), with one of the small detectors with shipped models.
 
         It has 10 x 10 cells with a uniform prior of 0.5. Kaplan's rule updates every cell that a box overlaps, with
         scores calibrated by Dirichlets of maximum likelihood. Exploration maximises the Kullback-Leibler divergence.
@@ -179,7 +191,7 @@ class ActivePerception(nn.Module):
 
     @classmethod
     def raw(cls, name: DetectorLike = "yolox-nano", *, sensor: str = "published", **options: Any) -> Self:
-        """An agent for any detector, without fitted models: raw scores as likelihoods, and random exploration.
+        """Make an agent for any detector, without fitted models: raw scores as likelihoods, and random exploration.
 
         Args:
             name: name, path or model of the detector, as for `semfov.load_detector`.
@@ -196,40 +208,41 @@ class ActivePerception(nn.Module):
         return cls._of(raw_arguments, name, sensor, **options)
 
     @classmethod
-    def _of(cls, make: Callable[..., dict[str, Any]], /, *given: Any, **options: Any) -> Self:
-        """The agent with the parts that a function makes from the options of a constructor, ready for use."""
-        known = [each for each in (*signature(make).parameters, *loader_options()) if each != "options"]
-        check_options(options, known, "the agent or of semfov.load_detector")
-        return cls(**make(*given, **options)).eval().requires_grad_(False)
+    def _of(cls, make: Callable[..., dict[str, Any]], /, *arguments: object, **options: Any) -> Self:
+        """Make an agent of the parts that a function gives from the options of a constructor, ready for use."""
+        names = [name for name in (*signature(make).parameters, *loader_options()) if name != "options"]
+        check_options(options, names, "the agent or of semfov.load_detector")
+        return cls(**make(*arguments, **options)).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""
         self.eye.detector.check_conversion(fn)
 
-        def precise(tensor: Tensor) -> Tensor:
+        def move_precisely(tensor: Tensor) -> Tensor:
             moved = fn(tensor)
             return tensor.to(moved.device) if moved.dtype in HALVES else moved
 
-        super()._apply(precise, recurse)
+        super()._apply(move_precisely, recurse)
         self.eye.detector._apply(fn, recurse)
         return self
 
     def __getattr__(self, name: str) -> Any:
-        """The parts of the module; other libraries' words for what an agent does are refused with its own."""
+        """Find a part of the module; other libraries' words for what an agent does are refused with its own."""
         if name in AGENT:
             raise missing("an agent", name, AGENT)
         return super().__getattr__(name)
 
-    def __call__(self, *given: Any, **options: Any) -> Any:
+    def __call__(self, *arguments: object, **options: object) -> Any:
         if type(self).forward is nn.Module.forward:
             raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
-        return super().__call__(*given, **options)
+        return super().__call__(*arguments, **options)
 
     def __repr__(self) -> str:
-        """The detector, the sensor and the parts that were fitted, in one line."""
+        """Write the detector, the sensor and the parts that were fitted in one line."""
         fitted = [name for name in ("windows", "verification") if getattr(self, name) is not None]
-        eye, sensor = f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes", type(self.eye.sensor)
-        return f"{type(self).__name__}({eye}, {sensor.__name__}, cells={(self.columns, self.rows)}, fitted={fitted})"
+        detector = f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes"
+        sensor = type(self.eye.sensor).__name__
+        return f"{type(self).__name__}({detector}, {sensor}, cells={(self.columns, self.rows)}, fitted={fitted})"
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -253,7 +266,8 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the agent has no learned evidence and map for its sensor.
         """
-        search, explore = self.searching.observer, self.exploring.observer
+        search = self.searching.observer
+        explore = self.exploring.observer
         if not (isinstance(search, Target) and isinstance(explore, LearnedMap)):
             got = f"{type(search).__name__} and {type(explore).__name__}"
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
@@ -262,8 +276,8 @@ class ActivePerception(nn.Module):
 
     def kind_of_look(
         self, picture: PictureLike | OpenedPicture, how: How = "auto", *, every: bool = False, foveal: bool = False
-    ) -> KindOfLook:
-        """How the agent looks at a picture.
+    ) -> KindName:
+        """Choose how the agent looks at a picture.
 
         Args:
             picture: as for `search`, or one that is opened.
@@ -277,11 +291,12 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the kind is unknown, or does not suit a scene.
         """
-        known = not foveal and self.windows is not None and self.windows.photograph is not None
-        return OpenedPicture.of(picture).kind(how, self.eye.detector.input_size, every=every, photographs=known)
+        photographs = not foveal and self.windows is not None and self.windows.photograph is not None
+        return OpenedPicture.of(picture).kind(how, self.eye.detector.input_size, every=every, photographs=photographs)
 
     @checked_keywords
-    def search(
+    @documented_by(SearchSettings)
+    def search(  # noqa: D417 (`documented_by`)
         self,
         picture: PictureLike,
         target: TargetLike,
@@ -325,23 +340,6 @@ class ActivePerception(nn.Module):
             target: class by name or index 1..K. A fovea also takes several: with `how="fovea"` in a list, of which any
                 will do, or each with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of
                 the record is then the most probable of them.
-            how: the kind of look, `fovea`, `windows` or `head`; `auto` chooses it by the picture.
-            passes: largest number of passes of the detector, closer looks included; None takes 24, and 40 for a head.
-            shifts: largest number of gaze shifts of a fovea, 0 to 10,000; None takes 30, or with `passes` no limit.
-            seconds: longest time in seconds on this machine.
-            duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.
-            on_look: called after each look with the record so far; returning False ends the search.
-            start: first cell of a fovea, by its number or as `(column, row)`, or first action of a head
-                (`semfov.head.views.Views`); None draws the cell at random, and looks straight ahead.
-            seed: seed of the generator that draws the start and breaks ties.
-            boxes: `(M, 4)`, true boxes `(x1, y1, x2, y2)` of the target in pixels of a photograph.
-            confirm: least probability for `found`: with closer looks, that the target is at the place; otherwise, that
-                the picture holds it. None takes the threshold that was chosen when the model was fitted, or a score of
-                0.5 for a belief without thresholds.
-            give_up: probability below which a look is not worth a pass; None takes the threshold of the model.
-            closer: largest number of closer looks, 0 to 100, each a pass of the detector. None takes 3 in a photograph,
-                all that there are passes for in a large picture, 2 for a fovea. 0, and no verification, make none.
-            prior: share of your pictures that hold the target, such as 0.15, which probabilities follow; None is half.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the value that is white where 0 is black, `(black, white)`, or `auto` for percentiles (`read_image`).
             bands: bands of a TIFF or a raster that are red, green and blue, from 1, or one as grey; None: as named.
@@ -354,36 +352,36 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture cannot be read.
         """
         check_order(picture, target, self.classes[1:])
-        check_thresholds(confirm, give_up, closer)
-        check_prior(prior)
-        # Class numbers may be those of NumPy or a tensor, which have no length.
-        targets = [target] if isinstance(target, str) or not isinstance(target, Mapping | Sequence) else list(target)
-        foveal = start is not None or boxes is not None
-        listed = len(targets) > 1 and not isinstance(target, Mapping)
-        several = "one class; find_all takes several, and how='fovea' searches for any of them"
-        check(not listed or how != "auto" or foveal or shifts is not None, "target", several, target)
-        foveal |= len(targets) > 1
-        opened, kind = self._open(picture, how, shifts, duration, color, white, bands, foveal=foveal)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
-        only_for(kind, "fovea", "passes", boxes=boxes)
-        if kind == "fovea":
-            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            settings: dict[str, Any] = {"start": start, "seed": seed, "boxes": boxes, "confirm": confirm}
-            settings |= {"give_up": give_up, "shifts": shifts, "prior": prior}
-            most = MOST_CLOSER if closer is None else closer
-            return opened.named(self.fovea.search(image, target, bounds, closer=most, **settings))
-        several = "one class for a search by windows or a head; find_all takes several"
-        check(len(targets) == 1, "target", several, target)
-        arguments = without_none(confirm=confirm, give_up=give_up, prior=prior, **limits)
-        if kind == "head":
-            only_for(kind, "fovea", "confirm", closer=closer)
-            arguments |= without_none(start=start, duration=duration)
-            return self.head.search(opened.world, targets[0], seed=seed, **arguments)
-        only_for(kind, "fovea", "none", start=start)
-        return self.zoom.search(opened.large, targets[0], **without_none(closer=closer), **arguments)
+        settings = SearchSettings(
+            how=how,
+            passes=passes,
+            shifts=shifts,
+            seconds=seconds,
+            duration=duration,
+            on_look=on_look,
+            start=start,
+            seed=seed,
+            confirm=confirm,
+            give_up=give_up,
+            closer=closer,
+            prior=prior,
+            boxes=boxes,
+        )
+        any_of_several = len(classes_named(target)) > 1
+        of_fovea = any(value is not None for value in (start, boxes, shifts))
+        if any_of_several and how == "auto" and not isinstance(target, Mapping):
+            check(
+                of_fovea,
+                "target",
+                "one class; find_all takes several, and how='fovea' searches for any of them",
+                target,
+            )
+        opened = OpenedPicture.of(picture, color, white, bands)
+        return self._look(opened, settings, foveal=of_fovea or any_of_several).search(opened, target, settings)
 
     @checked_keywords
-    def find_all(
+    @documented_by(FindSettings)
+    def find_all(  # noqa: D417 (`documented_by`)
         self,
         picture: PictureLike,
         target: _Targets = None,
@@ -409,15 +407,6 @@ class ActivePerception(nn.Module):
         Args:
             picture: as for `search`.
             target: class by name or index 1..K, several in a list, or None for all classes.
-            how: the kind of look, as for `search`; `auto` looks at windows, or moves the head in a scene.
-            passes: largest number of passes of the detector; None takes 24, and 40 for a head.
-            shifts: largest number of gaze shifts of a fovea; None takes 20, or with `passes` no limit.
-            seconds: longest time in seconds on this machine.
-            duration: in a scene, longest time in seconds that the movements of eye and head take.
-            on_look: called after each look with the record so far; returning False ends it.
-            worth: least gain of a look: of windows new objects (None: 0.01), of a head further right cells (None: 0).
-            least: score from which on an object counts; in windows, and for None, as for `ZoomAgent.find_all`.
-            batch: number of windows that are chosen jointly and pass the detector together.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
             bands: the bands that are shown, as for `search`.
@@ -431,21 +420,23 @@ class ActivePerception(nn.Module):
         """
         check_order(picture, target, self.classes[1:])
         targets = class_numbers(target, self.classes[1:], "target")
-        opened, kind = self._open(picture, how, shifts, duration, color, white, bands, every=True)
-        limits: dict[str, Any] = {"passes": passes, "seconds": seconds, "on_look": on_look}
-        if kind == "fovea":
-            only_for(kind, "windows", "passes", worth=worth)
-            image, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(**limits)
-            return counted_from(opened.named(self.fovea.find_all(image, targets, bounds, shifts=shifts)), least)
-        arguments = without_none(worth=worth, **limits)
-        if kind == "head":
-            arguments |= without_none(duration=duration)
-            return counted_from(self.head.find_all(opened.world, targets or None, **arguments), least)
-        aim = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.zoom.find_all(opened.large, aim, batch=batch, **without_none(least=least), **arguments)
+        settings = FindSettings(
+            how=how,
+            passes=passes,
+            shifts=shifts,
+            seconds=seconds,
+            duration=duration,
+            on_look=on_look,
+            worth=worth,
+            least=least,
+            batch=batch,
+        )
+        opened = OpenedPicture.of(picture, color, white, bands)
+        return self._look(opened, settings, every=True).find_all(opened, targets, settings)
 
     @checked_keywords
-    def explore(
+    @documented_by(ExploreSettings)
+    def explore(  # noqa: D417 (`documented_by`)
         self,
         picture: PictureLike,
         *,
@@ -470,18 +461,6 @@ class ActivePerception(nn.Module):
 
         Args:
             picture: as for `search`.
-            how: the kind of look, as for `search`.
-            passes: largest number of passes of the detector; None takes 24 for windows and 40 for a head.
-            shifts: largest number of gaze shifts of a fovea, 0 to 10,000; None takes 20, or with `passes` no limit.
-            seconds: longest time in seconds on this machine.
-            duration: in a scene, longest time in seconds that the movements of eye and head take; None takes 30.
-            on_look: called after each look with the record so far; returning False ends the exploration.
-            worth: least expected gain of a look: of a fovea with a learned map (None takes 0.1) or of a head the
-                further right cells, of windows the new objects (None takes 0.01). 0 makes all looks.
-            least: score or probability from which on an object counts, as for `find_all`.
-            start: first cell of a fovea or first action of a head, as for `search`.
-            policy: `people` moves a fovea as people move their gaze (`semfov.gaze.Viewer`); None as the agent does.
-            seed: seed of the generator that draws the start and breaks ties.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
             bands: the bands that are shown, as for `search`.
@@ -493,20 +472,22 @@ class ActivePerception(nn.Module):
             InputError: an argument does not fit the kind of look, or `worth` is given without a learned map.
             DataError: the file of the picture cannot be read.
         """
-        check(worth is None or (is_number(worth) and worth >= 0), "worth", "0 or more, or None", worth)
-        foveal = start is not None or policy is not None
-        opened, kind = self._open(picture, how, shifts, duration, color, white, bands, foveal=foveal)
-        only_for(kind, "fovea", "none", policy=policy)
-        if kind == "fovea":
-            given: dict[str, Any] = {"start": start, "shifts": shifts, "seed": seed, "worth": worth, "policy": policy}
-            seen, bounds = opened.image(self.eye.sensor.like), EpisodeLimits(passes, seconds, on_look)
-            return counted_from(opened.named(self.fovea.explore(seen, bounds, **given)), least)
-        arguments = without_none(worth=worth, passes=passes, seconds=seconds, on_look=on_look)
-        if kind == "head":
-            arguments |= without_none(start=start, duration=duration)
-            return counted_from(self.head.explore(opened.world, seed=seed, **arguments), least)
-        only_for(kind, "fovea", "none", start=start)
-        return self.zoom.explore(opened.large, **without_none(least=least), **arguments)
+        settings = ExploreSettings(
+            how=how,
+            passes=passes,
+            shifts=shifts,
+            seconds=seconds,
+            duration=duration,
+            on_look=on_look,
+            start=start,
+            seed=seed,
+            worth=worth,
+            least=least,
+            policy=policy,
+        )
+        of_fovea = any(value is not None for value in (start, policy, shifts))
+        opened = OpenedPicture.of(picture, color, white, bands)
+        return self._look(opened, settings, foveal=of_fovea).explore(opened, settings)
 
     @checked_keywords
     def gaze(
@@ -542,13 +523,14 @@ class ActivePerception(nn.Module):
         return GazePrediction.of(self.eye, image, model=model, source=opened.path, seen=seen)
 
     @checked_keywords
-    def live(
+    @documented_by(StreamSettings)
+    def live(  # noqa: D417 (`documented_by`)
         self,
         target: _Targets = None,
         *,
         how: How = "auto",
         rate: float | None = None,
-        start: int | None = None,
+        start: Start = None,
         seed: int = 0,
         confirm: float | None = None,
         give_up: float | None = None,
@@ -563,16 +545,6 @@ class ActivePerception(nn.Module):
 
         Args:
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.
-            how: the kind of look, `fovea` or `windows`; `auto` looks at windows (`semfov.live.LivePerception`).
-            rate: rate at which evidence fades, per second; 0 forgets nothing; None takes 2.5, and 0.75 for windows.
-            start: first cell of a fovea; None draws one at random.
-            seed: seed of the generator that draws the start and breaks ties.
-            confirm: least probability for `found`, as for `search`; None takes that of the model.
-            give_up: probability below which a look is not worth a frame; None takes that of the belief alone, as a
-                belief that fades can reach it, or with rate 0 that of `search`.
-            closer: largest number of closer looks, 0 to 100, in ln 2 / rate seconds; None takes that of `search`.
-            prior: how often the target is there, as a share of frames; None assumes half of them.
-            color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the values that are black and white in frames of other types than bytes, as for `search`.
 
         Returns:
@@ -581,20 +553,28 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: a class is unknown, or an argument does not fit.
         """
-        numbers, one = class_numbers(target, self.classes[1:], "target"), not isinstance(target, list | tuple)
-        check_thresholds(confirm, give_up, closer)
-        sought, found = numbers[0] if numbers and one else None, () if one else numbers
-        check(prior is None or (one and len(numbers) > 0), "prior", "None without one class to search for", prior)
-        settings: dict[str, Any] = {"confirm": confirm, "give_up": give_up, "closer": closer, "prior": prior}
-        settings |= {"how": lookup(how, get_args(How), "kind of look"), "rate": rate, "start": start, "seed": seed}
-        return LivePerception(self.fovea, self.zoom, sought, found, white=white, color=color, **settings)
+        settings = StreamSettings(
+            how=how,
+            rate=rate,
+            start=start,
+            seed=seed,
+            confirm=confirm,
+            give_up=give_up,
+            closer=closer,
+            prior=prior,
+            color=color,
+        )
+        classes = class_numbers(target, self.classes[1:], "target")
+        if isinstance(target, list | tuple):
+            check(prior is None, "prior", "None without one class to search for", prior)
+            return LivePerception(self, targets=classes, settings=settings, white=white)
+        check(prior is None or target is not None, "prior", "None without one class to search for", prior)
+        return LivePerception(self, classes[0] if classes else None, settings=settings, white=white)
 
-    def _open(
-        self, picture: PictureLike, how: How, shifts: int | None, duration: float | None, *given: Any, **wanted: bool
-    ) -> tuple[OpenedPicture, KindOfLook]:
-        """Open a picture, choose the kind of look (`kind_of_look`), and check the limits that suit it."""
-        opened, foveal = OpenedPicture.of(picture, *given), wanted.pop("foveal", False) or shifts is not None
-        kind = self.kind_of_look(opened, how, foveal=foveal, **wanted)
-        only_for(kind, "fovea", "passes=", shifts=shifts)
-        only_for(kind, "head", "seconds=", duration=duration)
-        return opened, kind
+    def _look(
+        self, opened: OpenedPicture, settings: LookSettings, *, every: bool = False, foveal: bool = False
+    ) -> KindOfLook:
+        """Choose the kind of look at a picture (`kind_of_look`), and check that the settings suit it."""
+        kind = KINDS_OF_LOOK[self.kind_of_look(opened, settings.how, every=every, foveal=foveal)]
+        kind.check_settings(settings)
+        return kind(self)

@@ -235,7 +235,7 @@ class Eye(StatedModule):
         return self.look(self.open(image), fixations)
 
     def settings(self) -> dict[str, Any]:
-        """Settings that the detections depend on, for the keys of caches and the metadata of fitted models.
+        """List the settings that the detections depend on, for the keys of caches and the metadata of fitted models.
 
         Returns:
             JSON values by `sensor` and `detector`.

@@ -1,23 +1,17 @@
 """Active perception of a camera or a video: one look at every frame, and evidence that fades between frames."""
 
-from typing import Any, get_args
-
 from numpy.typing import ArrayLike
 
-from semfov.agents.episode import Episode, without_none
-from semfov.agents.fovea import FoveaAgent, FoveaEpisode
+from semfov.agents.kinds import KINDS_OF_LOOK, AgentParts
 from semfov.agents.picture import OpenedPicture
-from semfov.agents.windows import ZoomAgent
-from semfov.data.inputs import FRAME, Color, ImageLike, as_image
+from semfov.data.inputs import FRAME, ImageLike, as_image
 from semfov.data.tone import White, check_white
-from semfov.errors import check, lookup
+from semfov.errors import check
 from semfov.motion import Motion
 from semfov.paths import Moment
+from semfov.settings import How, StreamSettings
 
 __all__ = ["LivePerception"]
-
-_FOVEA_RATE = 2.5  # default rate at which the belief of a fovea fades, per second
-_WINDOW_RATE = 0.75  # default rate at which looks at windows are forgotten, per second: a look counts for 0.9 s
 
 
 class LivePerception:
@@ -31,16 +25,11 @@ class LivePerception:
     again. The scene is taken to be flat or far away. A fovea does not follow the camera.
 
     Args:
-        fovea: the part of an agent that looks by a fovea.
-        windows: the part of the agent that looks at windows.
+        parts: the agent, whose parts look by a fovea and at windows.
         target: class 1..K to search for; None explores.
         targets: classes 1..K whose objects are all to be found, which windows do; empty for `target`.
-        how: the kind of look, `fovea`, `windows` or `auto`.
-        rate: rate at which evidence fades, per second; None takes 2.5 for a fovea and 0.75 for windows.
-        start: first cell of a fovea; None draws one at random.
-        seed: seed of the generator that draws the start and breaks ties.
+        settings: the settings of the task; None for the defaults.
         white: the values that are black and white in frames of other types than bytes (`ActivePerception.search`).
-        **settings: `confirm`, `give_up`, `closer`, `prior` and `color`, as for `ActivePerception.live`.
 
     Attributes:
         how: the kind of look; `auto` before the first frame.
@@ -58,40 +47,27 @@ class LivePerception:
 
     def __init__(
         self,
-        fovea: FoveaAgent,
-        windows: ZoomAgent,
+        parts: AgentParts,
         target: int | None = None,
         targets: tuple[int, ...] = (),
+        settings: StreamSettings | None = None,
         *,
-        how: str = "auto",
-        rate: float | None = None,
-        start: int | None = None,
-        seed: int = 0,
         white: White | None = None,
-        **settings: Any,
     ) -> None:
-        check(how != "head", "how", "'fovea', 'windows' or 'auto' for a stream; for a camera that turns use search, "
-              "and for a panoramic frame search or find_all of semfov.Panorama(frame)", how)  # fmt: skip
-        several = "for all objects of several classes use how='windows', and for one of them a class without a list"
-        check(not targets or how != "fovea", "target", f"one class, or None; {several}", targets)
-        self.how = "windows" if targets else how
+        settings = settings or StreamSettings()
         check_white(white)
+        self.how: How = "windows" if targets and settings.how == "auto" else settings.how
         self._white = white
-        self._start, self._canvas = start, windows.eye.detector.input_size
-        evidence = windows.evidence
-        self._photographs = start is None and evidence is not None and evidence.photograph is not None
-        lookup(settings.get("color", "rgb"), get_args(Color), "order of channels")
-        given, (slow, fast) = without_none(**settings), (_WINDOW_RATE, _FOVEA_RATE) if rate is None else (rate, rate)
-        by_kind = {"fovea": given, "windows": given}
-        without_prior = {name: value for name, value in given.items() if name != "prior"}
-        if self.how == "fovea":
-            by_kind["windows"] = without_prior
-        elif self.how == "windows" or self._photographs:  # a kind that is not used may know no prior
-            by_kind["fovea"] = without_prior
-        self._episodes: dict[str, Episode[Any]] = {
-            "fovea": FoveaEpisode(fovea, target, rate=fast, start=start, seed=seed, **by_kind["fovea"]),
-            "windows": windows.episode(target, targets, rate=slow, follows=True, **by_kind["windows"]),
-        }
+        self._start = settings.start
+        windows = parts.zoom
+        self._canvas = windows.eye.detector.input_size
+        knows_photographs = windows.evidence is not None and windows.evidence.photograph is not None
+        self._photographs = knows_photographs and settings.start is None
+        possible: tuple[str, ...] = (self.how,)
+        if self.how == "auto":
+            possible = ("windows",) if self._photographs else ("fovea", "windows")
+        # A kind of look that no frame can ask for is not made: it may refuse settings that suit the other.
+        self._episodes = {name: KINDS_OF_LOOK[name](parts).stream(target, targets, settings) for name in possible}
         self._check_start()
 
     def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> Moment:
@@ -126,17 +102,21 @@ class LivePerception:
     @property
     def criterion(self) -> str | None:
         """What a search needs for the decision `found`, in words, after the first frame; None for no decision."""
-        return self._episodes[self.how].criterion
+        return None if self.how == "auto" else self._episodes[self.how].criterion
 
     def describe(self) -> str:
-        """What is done in a few words."""
-        return self._episodes["windows"].describe()
+        """Say what is done in a few words."""
+        return next(iter(self._episodes.values())).describe()
 
     def __repr__(self) -> str:
-        """What is done, and the kind of look."""
+        """Write what is done, and the kind of look."""
         return f"{type(self).__name__}: {self.describe()}, how={self.how!r}"
 
     def _check_start(self) -> None:
         """Raise `InputError` for a first cell where there are no cells."""
-        fits = self._start is None or self.how != "windows"
-        check(fits, "start", "None for frames that are looked at by windows, or how='fovea'", self._start)
+        check(
+            self._start is None or self.how != "windows",
+            "start",
+            "None for frames that are looked at by windows, or how='fovea'",
+            self._start,
+        )

@@ -38,8 +38,20 @@ KINDS: dict[str, type[_FolderModel]] = {
 
 
 def open_folder(name: str | PathLike[str]) -> "ModelFolder | None":
-    """Open a folder of models."""
-    path, text = Path(name), os.fspath(name)
+    """Open a folder of models.
+
+    Args:
+        name: the folder, or the name or file of a detector.
+
+    Returns:
+        The folder; None for a detector.
+
+    Raises:
+        InputError: it is neither.
+        DataError: the folder has no manifest, or a damaged one.
+    """
+    path = Path(name)
+    text = os.fspath(name)
     if path.is_dir():
         return ModelFolder(path)
     if text in WEIGHTS or path.suffix or text.startswith("torchvision:"):
@@ -51,7 +63,7 @@ def open_folder(name: str | PathLike[str]) -> "ModelFolder | None":
 
 
 def _find_file(place: Mapping[str, str], folder: Path) -> Path:
-    """The file of a detector at its place, relative to the folder of models or as it was."""
+    """Find the file of a detector at its place, relative to the folder of models or as it was."""
     for path in (folder / place["relative"], Path(place["absolute"])):
         if path.is_file():
             return path
@@ -81,7 +93,18 @@ class ModelFolder:
     def detector_source(
         self, detector: str | PathLike[str] | None = None, weights: str | PathLike[str] | None = None
     ) -> tuple[str, dict[str, Any]]:
-        """Arguments with which `semfov.load_detector` loads the detector."""
+        """Find what `semfov.load_detector` loads.
+
+        Args:
+            detector: new place of the detector's file; None for that of the manifest.
+            weights: new place of its weights; None for that of the manifest.
+
+        Returns:
+            The name or the file of the detector, and the options of `semfov.load_detector`.
+
+        Raises:
+            DataError: a file is not where it was.
+        """
         record = self.manifest.detector
         options = dict(record["options"])
         place = record.get("weights_file")
@@ -100,9 +123,21 @@ class ModelFolder:
         weights: str | PathLike[str] | None = None,
         **options: Any,
     ) -> Detector:
-        """Load the detector, with the options of the time when the models were fitted."""
-        source, own = self.detector_source(detector, weights)
-        loaded = load_detector(source, **{**own, **options})
+        """Load the detector, with the options of the time when the models were fitted.
+
+        Args:
+            detector: new place of the detector's file; None for that of the manifest.
+            weights: new place of its weights; None for that of the manifest.
+            options: options of `semfov.load_detector` that replace those of the manifest.
+
+        Returns:
+            The detector.
+
+        Raises:
+            DataError: it is another network than the models were fitted to, or a file cannot be read.
+        """
+        source, fitted_options = self.detector_source(detector, weights)
+        loaded = load_detector(source, **{**fitted_options, **options})
         digest = self.manifest.detector["sha256"]
         if NETWORKS.get(loaded.digest, loaded.digest) != NETWORKS.get(digest, digest):
             raise DataError(
@@ -140,30 +175,44 @@ class ModelFolder:
         return FovealObservationModel.from_pretrained(file)
 
     def arguments(self, *, detector: str | PathLike[str] | None = None, **options: Any) -> dict[str, Any]:
-        """Arguments of `semfov.ActivePerception`, of the models that are used; takes the arguments of `load_detector`.
+        """Make the arguments of `semfov.ActivePerception`, of the models that are used.
 
         An agent decides without closer looks, and looks at slices of large pictures, where it has no models for more.
+
+        Args:
+            detector: new place of the detector's file; None for that of the manifest.
+            options: further options of `load_detector`.
+
+        Returns:
+            The arguments by name.
         """
-        eye, models, sensor = self.eye(detector=detector, **options), self._models, self.manifest.sensor
-        evidence, learned = models.get("evidence"), models.get("map")
-        components = len(self.manifest.classes) + 1
-        searching: Observer = Semantic(components)
-        if isinstance(evidence, TargetEvidence):
-            searching = Target(evidence)
-        elif self.used("tempering"):  # and calibration, where they were better when fitted
-            settings = self.manifest.parts["tempering"].settings
-            model = models.get("observation") if settings["scores"] == "calibrated" else None
-            assert model is None or isinstance(model, FovealObservationModel)
-            footprint, tempering = settings["footprint"], settings["exponent"]
-            searching = Semantic(components, model, footprint=footprint, tempering=tempering)
-        explore: tuple[Observer, Policy] = Semantic(components), Policy("random")
-        if isinstance(learned, MapEvidence):
-            explore = LearnedMap(learned), Policy("closer-look", fovea=eye.sensor.width(sensor) / sensor["reference"])
+        eye = self.eye(detector=detector, **options)
         return {
             "eye": eye,
-            "search": (searching, Policy("non-predictive")),
-            "explore": explore,
-            "verification": models.get("verification") if self.used("evidence") else None,
-            "windows": models.get("windows"),
+            "search": (self._search_observer(), Policy("non-predictive")),
+            "explore": self._exploration(eye),
+            "verification": self._models.get("verification") if self.used("evidence") else None,
+            "windows": self._models.get("windows"),
             "grid": self.manifest.grid,
         }
+
+    def _search_observer(self) -> Observer:
+        """Make the observer of searches: learned evidence, or scores as they were better when fitted."""
+        components = len(self.manifest.classes) + 1
+        evidence = self._models.get("evidence")
+        if isinstance(evidence, TargetEvidence):
+            return Target(evidence)
+        if not self.used("tempering"):
+            return Semantic(components)
+        settings = self.manifest.parts["tempering"].settings
+        model = self._models.get("observation") if settings["scores"] == "calibrated" else None
+        assert model is None or isinstance(model, FovealObservationModel)
+        return Semantic(components, model, footprint=settings["footprint"], tempering=settings["exponent"])
+
+    def _exploration(self, eye: Eye) -> tuple[Observer, Policy]:
+        """Make the observer and the policy of explorations: a learned map, or random looks without one."""
+        learned = self._models.get("map")
+        if not isinstance(learned, MapEvidence):
+            return Semantic(len(self.manifest.classes) + 1), Policy("random")
+        sensor = self.manifest.sensor
+        return LearnedMap(learned), Policy("closer-look", fovea=eye.sensor.width(sensor) / sensor["reference"])

@@ -31,7 +31,7 @@ PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.publi
 def recommended_arguments(
     name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
 ) -> dict[str, Any]:
-    """Arguments of the recommended agent: learned target evidence for search, a learned map for exploration."""
+    """Make the arguments of the recommended agent: learned evidence for search, a learned map for exploration."""
     fit = (
         "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
     )
@@ -44,36 +44,50 @@ def recommended_arguments(
     eye = Eye(Foveation(sigma, growth=growth), detector)
     name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
     evidence = TargetEvidence.from_pretrained(name)
-    mapping = LearnedMap(MapEvidence.from_pretrained(name)), Policy("closer-look", fovea=sigma / eye.reference)
-    verification = Verification.if_shipped(name)
     return {
         "eye": eye,
         "search": (Target(evidence), Policy("non-predictive")),
-        "explore": mapping,
-        "verification": verification,
+        "explore": (
+            LearnedMap(MapEvidence.from_pretrained(name)),
+            Policy("closer-look", fovea=sigma / eye.reference),
+        ),
+        "verification": Verification.if_shipped(name),
         "windows": GlimpseEvidence.if_shipped(detector.name),
         "grid": grid,
     }
 
 
 def published_model(detector: str, sensor: str, threshold: float) -> str:
-    """Name the observation model of the published agent."""
+    """Name the observation model of the published agent.
+
+    Args:
+        detector: name of the detector.
+        sensor: name of the published sensor.
+        threshold: score threshold of the detector, at which the wide fovea has models of its own.
+
+    Returns:
+        The name of the model.
+    """
     name = f"{detector}-{sensor}"
-    own = f"{name}-{threshold:g}"
-    return own if (FovealObservationModel.shipped / f"{own}.safetensors").is_file() else name
+    at_threshold = f"{name}-{threshold:g}"
+    is_shipped = (FovealObservationModel.shipped / f"{at_threshold}.safetensors").is_file()
+    return at_threshold if is_shipped else name
 
 
 def published_arguments(
     name: str | PathLike[str], sensor: str | None, search: str, calibrated: bool, **options: Any
 ) -> dict[str, Any]:
-    """Arguments of the published agent, by the name of a detector or from a folder of models."""
+    """Make the arguments of the published agent, by the name of a detector or from a folder of models."""
     lookup(search, ["predictive", "non-predictive"], "published search policy")
     folder = open_folder(name)
     if folder is not None:
         check(sensor is None, "sensor", "None with a folder of models, which has its own sensor", sensor)
-        eye, model, grid = folder.eye(**options), folder.observation(), folder.manifest.grid
+        eye = folder.eye(**options)
+        model = folder.observation()
+        grid = folder.manifest.grid
     else:
-        fovea, grid = lookup(sensor or "published", PUBLISHED_SENSORS, "published sensor"), (10, 10)
+        fovea = lookup(sensor or "published", PUBLISHED_SENSORS, "published sensor")
+        grid = (10, 10)
         eye = Eye(named_sensor(fovea), load_detector(name, **options))
         fitted = published_model(eye.detector.name, fovea, eye.detector.selection.threshold)
         model = FovealObservationModel.from_pretrained(shipped_model(FovealObservationModel, fitted, fspath(name)))
@@ -83,7 +97,7 @@ def published_arguments(
 
 
 def raw_arguments(name: DetectorLike, sensor: str, **options: Any) -> dict[str, Any]:
-    """Arguments of the raw agent: raw scores as likelihoods, and random exploration."""
+    """Make the arguments of the raw agent: raw scores as likelihoods, and random exploration."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)
     return {"eye": eye, "search": (observer, Policy("non-predictive")), "explore": (observer, Policy("random"))}

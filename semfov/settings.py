@@ -11,15 +11,17 @@ the kind of look and the models of the agent.
     StreamSettings                          x                 x            how, rate, color
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, Literal, get_args
+from dataclasses import Field, dataclass, field, fields
+from inspect import cleandoc
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from torch import Tensor
 
 from semfov.data.inputs import Color
-from semfov.errors import InputError, check, lookup
-from semfov.io.ranges import CheckedSettings, Probability, Range, Seconds, Seed, Shifts
+from semfov.errors import check, lookup
+from semfov.io.ranges import CheckedSettings, Form, Probability, Range, Seconds, Seed, Shifts, Weight
 
 __all__ = [
     "DecisionSettings",
@@ -31,8 +33,11 @@ __all__ = [
     "StreamSettings",
 ]
 
-KindOfLook = Literal["fovea", "windows", "head"]
-"""Kind of look: foveal fixations of a photograph, windows of a picture, or views of a scene."""
+KindName = Literal["fovea", "windows", "head"]
+"""Name of a kind of look (`semfov.agents.kinds`): fixations of a photograph, windows of a picture, views of a scene."""
+
+Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
+"""Figure that can be drawn of an episode."""
 
 How = Literal["auto", "fovea", "windows", "head"]
 """Kind of look, or `auto` for the one that suits the picture."""
@@ -46,17 +51,19 @@ OnLook = Callable[[Any], object]
 MOST_PASSES = 1_000_000
 """Largest number of passes that can be asked for."""
 
+FirstCell = Annotated[int | tuple[int, int], Form("a cell", "as column,row (5,5) or as its number (47)")]
 Passes = Annotated[int, Range(1, MOST_PASSES)]
 CloserLooks = Annotated[int, Range(0, 100)]
-Gain = Annotated[float, Range(0)]
 PriorShare = Annotated[float, Range(above=0, below=1, noun="a share")]
 Rate = Annotated[float, Range(0, 100)]
+
+_Function = TypeVar("_Function", bound=Callable[..., object])
 
 _KINDS = "kinds"  # metadata of a field: the kinds of look that the setting is for, first the one that messages suggest
 _INSTEAD = "instead"  # metadata of a field: what a message suggests for other kinds of look
 
 
-def _only_for(*kinds: KindOfLook, instead: str) -> Mapping[str, object]:
+def _only_for(*kinds: KindName, instead: str) -> Mapping[str, object]:
     """Make the metadata of a setting that means nothing to other kinds of look."""
     return {_KINDS: kinds, _INSTEAD: instead}
 
@@ -110,7 +117,7 @@ class StartSettings(CheckedSettings):
     StartSettings(start=(5, 5), seed=0)
     """
 
-    start: Start = field(default=None, metadata=_only_for("fovea", "head", instead="none"))
+    start: FirstCell | None = field(default=None, metadata=_only_for("fovea", "head", instead="none"))
     seed: Seed = 0
 
 
@@ -142,7 +149,7 @@ class DecisionSettings(CheckedSettings):
 
 
 @dataclass(frozen=True)
-class SearchSettings(DecisionSettings, StartSettings, LookSettings):
+class SearchSettings(DecisionSettings, LookSettings, StartSettings):
     """Settings of a search of a picture for a class (`ActivePerception.search`).
 
     Args:
@@ -179,13 +186,13 @@ class FindSettings(LookSettings):
     1
     """
 
-    worth: Gain | None = field(default=None, metadata=_only_for("windows", "head", instead="passes"))
+    worth: Weight | None = field(default=None, metadata=_only_for("windows", "head", instead="passes"))
     least: Probability | None = None
     batch: Annotated[int, Range(1, MOST_PASSES)] = 1
 
 
 @dataclass(frozen=True)
-class ExploreSettings(StartSettings, LookSettings):
+class ExploreSettings(LookSettings, StartSettings):
     """Settings of an exploration of a picture (`ActivePerception.explore`).
 
     Args:
@@ -203,7 +210,7 @@ class ExploreSettings(StartSettings, LookSettings):
     'people'
     """
 
-    worth: Gain | None = None
+    worth: Weight | None = None
     least: Probability | None = None
     policy: str | None = field(default=None, metadata=_only_for("fovea", instead="none"))
 
@@ -246,22 +253,57 @@ class StreamSettings(DecisionSettings, StartSettings):
         lookup(self.color, get_args(Color), "order of channels")
 
 
-def check_suits(settings: CheckedSettings, kind: str, described: str) -> None:
-    """Raise `InputError` for settings that mean nothing to a kind of look, with what to use instead.
+_ENTRY = re.compile(r"(?m)^    (\w+): .*(?:\n {8}.*)*")  # a setting in a docstring, with its help
+
+
+def help_of(kind: type[CheckedSettings]) -> dict[str, str]:
+    """Read the help of settings from the docstrings of their classes.
 
     Args:
-        settings: the settings of a task.
-        kind: the kind of look, one of `KindOfLook`.
-        described: the kind of look in words, such as `a head that turns`.
+        kind: dataclass of settings, whose help of an inherited setting replaces that of its base.
 
-    >>> check_suits(SearchSettings(passes=8), "windows", "windows")
+    Returns:
+        For each setting, its entry of the section `Args`.
+
+    >>> help_of(StartSettings)["seed"]
+    '    seed: seed of the generator that draws the start and breaks ties.'
     """
-    for setting in fields(settings):
-        kinds = setting.metadata.get(_KINDS, (kind,))
-        value = getattr(settings, setting.name)
-        if value is not None and kind not in kinds:
-            instead = setting.metadata[_INSTEAD]
-            raise InputError(
-                f"{setting.name}: expected none for a picture that is looked at by {described}, got {value}; "
-                f"use {instead}, or how={kinds[0]!r}"
-            )
+    entries: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        section = cleandoc(base.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
+        entries |= {match[1]: match[0] for match in _ENTRY.finditer(section)}
+    return {setting.name: entries[setting.name] for setting in fields(kind)}
+
+
+def documented_by(kind: type[CheckedSettings]) -> Callable[[_Function], _Function]:
+    """Decorate a function whose keywords are settings: their help follows that of its other arguments.
+
+    Args:
+        kind: dataclass of the settings.
+
+    Returns:
+        The decorator, which changes the docstring alone.
+    """
+
+    def document(function: _Function) -> _Function:
+        if function.__doc__ is not None:  # python -OO keeps none
+            arguments, following, rest = cleandoc(function.__doc__).partition("\n\nReturns:")
+            function.__doc__ = "\n".join([arguments, *help_of(kind).values()]) + following + rest
+        return function
+
+    return document
+
+
+def suitable_kinds(setting: Field[Any]) -> tuple[tuple[str, ...], str]:
+    """Find the kinds of look that a setting means something to.
+
+    Args:
+        setting: a field of the settings of a task.
+
+    Returns:
+        The names of the kinds, first the one to suggest, and what to use instead for the others.
+
+    >>> suitable_kinds(SearchSettings.__dataclass_fields__["shifts"])
+    (('fovea',), 'passes=')
+    """
+    return setting.metadata.get(_KINDS, get_args(KindName)), setting.metadata.get(_INSTEAD, "none")

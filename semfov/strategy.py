@@ -15,6 +15,24 @@ from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Unifor
 from semfov.gaze.policies import Policy
 
 
+def classes_named(target: TargetLike) -> list[str | int]:
+    """List the classes that a target names: itself, or several of which any is searched for.
+
+    Args:
+        target: a class by name or index, several in a list, or several with weights.
+
+    Returns:
+        The classes, by name or index.
+
+    >>> classes_named("cup"), classes_named({"cup": 0.9, "bowl": 0.1})
+    (['cup'], ['cup', 'bowl'])
+    """
+    # Indices may be those of NumPy or a tensor, which have no length.
+    if isinstance(target, str) or not isinstance(target, Mapping | Sequence):
+        return [target]
+    return list(target)
+
+
 class Strategy(nn.Module):
     """Observer and policy for a task."""
 
@@ -27,11 +45,19 @@ class Strategy(nn.Module):
         self.policy = policy
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
-        """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        """Make the acquisition function of episodes that fixate `cell` `(B,)`."""
         return self.policy(target, grid)
 
     def with_prior(self, share: float, target: int) -> tuple["Strategy", Prior]:
-        """Search for a class 1..K that is there in this share of searches."""
+        """Change a search for a class by how often it is there.
+
+        Args:
+            share: share of searches in which the class is there.
+            target: the class, 1..K.
+
+        Returns:
+            The strategy of the search, and the prior by which its probabilities change.
+        """
         observer = self.observer
         check(not isinstance(observer, AnyOf), "prior", "None for a search for any of several classes", share)
         prior = Prior.of(share, observer.model.shares if isinstance(observer, Target) else None, target)
@@ -39,7 +65,19 @@ class Strategy(nn.Module):
         return Strategy(Target(observer.model, together=observer.together, prior=prior), self.policy), prior
 
     def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
-        """Prepare the search for a target."""
+        """Prepare the search for a target.
+
+        Args:
+            target: a class by name or index 1..K, several, of which any will do, or each with the probability that it
+                is meant.
+            classes: names of the classes, background first.
+
+        Returns:
+            The strategy, the most probable class 1..K, and the weight of each class that is meant.
+
+        Raises:
+            InputError: a class is unknown or named twice, or the policy does not suit several classes.
+        """
         if isinstance(target, str) or not isinstance(target, Mapping | Sequence):
             index = class_index(target, classes[1:], "target")
             return self, index, {index: 1.0}
@@ -51,8 +89,7 @@ class Strategy(nn.Module):
             check(index not in weights, "target", "each class once", f"{classes[index]!r} twice")
             weights[index] = weight
         policy = self.policy
-        suits = policy.name in (TargetPosterior.name, Uniform.name) or policy.function.by_place
-        check(
-            suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(by_target)
-        )
+        uses_probabilities = policy.name in (TargetPosterior.name, Uniform.name) or policy.function.by_place
+        expected = f"one class for policy {policy.name!r}, which does not use probabilities"
+        check(uses_probabilities, "target", expected, dict(by_target))
         return Strategy(AnyOf(self.observer, weights), policy), max(weights, key=weights.__getitem__), weights

@@ -52,7 +52,7 @@ def _sizes(values: Iterable[object]) -> Iterator[int]:
 
 
 def available_cores() -> int:
-    """Number of CPU cores that this process may use."""
+    """Count the CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -20,6 +20,7 @@ import torch
 from examples.look_graph import OPSET
 from semfov import FovealObservationModel
 from semfov.agents.head import _CONFIRM
+from semfov.agents.kinds import FoveaKind, WindowKind
 from semfov.agents.windows import LIKELY
 from semfov.belief import Verification
 from semfov.data.inputs import FRAME
@@ -28,7 +29,6 @@ from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, LEAST
 from semfov.head import Speeds
-from semfov.live import _FOVEA_RATE, _WINDOW_RATE
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
 from semfov.zoom.closer import USUAL_WINDOW, PhotographPlaces
@@ -186,8 +186,8 @@ KNOWN = {
     "docs/guides/live.md": {
         f"{MOST_CLOSER} by default": "code",
         "for 15 s": "code, tested with a stream that breaks off",
-        f"{log(2) / _WINDOW_RATE:.1f} s by default": "code",
-        f"rate, {_FOVEA_RATE}, is {_FOVEA_RATE * FRAME:g} a frame at {1 / FRAME:.0f} frames": "code",
+        f"{log(2) / WindowKind.usual_rate:.1f} s by default": "code",
+        f"rate, {FoveaKind.usual_rate}, is {FoveaKind.usual_rate * FRAME:g} a frame at {1 / FRAME:.0f} frames": "code",
         f"1/{1 / FRAME:.0f} s is taken": "code",
         "of 16 bits": "a type",
     },

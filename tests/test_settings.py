@@ -1,6 +1,7 @@
 """The settings of tasks: what their types refuse, what suits which kind of look, and the keywords of the agent."""
 
 import inspect
+import re
 from dataclasses import FrozenInstanceError, fields, replace
 from typing import get_args
 
@@ -9,16 +10,19 @@ import pytest
 import torch
 
 from semfov import ActivePerception
+from semfov.agents.kinds import KINDS_OF_LOOK
+from semfov.cli.main import main
+from semfov.cli.options import ExploreOptions, FindOptions, LiveOptions, SearchOptions
 from semfov.errors import InputError
 from semfov.io.ranges import Range
 from semfov.settings import (
     ExploreSettings,
     FindSettings,
-    KindOfLook,
+    KindName,
     LookSettings,
     SearchSettings,
     StreamSettings,
-    check_suits,
+    help_of,
 )
 from tests.refusals import refused
 
@@ -44,6 +48,25 @@ def test_every_setting_is_documented_by_the_class_that_has_it(kind):
     assert [name for name in own if f"\n    {name}: " not in documented] == []
 
 
+@pytest.mark.parametrize(
+    ("command", "options", "task"),
+    [
+        ("search", SearchOptions, SearchSettings),
+        ("find", FindOptions, FindSettings),
+        ("explore", ExploreOptions, ExploreSettings),
+        ("live", LiveOptions, StreamSettings),
+    ],
+)
+def test_the_options_of_a_command_are_the_settings_of_its_task_with_their_help(command, options, task, capsys):
+    assert main([command, "--help-all"]) == 0
+    printed = "".join(capsys.readouterr().out.split())  # lines may break within a word
+    of_python = {"on_look", "boxes", "policy", "color"}
+    for name, entry in help_of(task).items():
+        text = "".join(entry.partition(": ")[2].split())
+        assert (f"--{name}" in printed and text in printed) == (name not in of_python)
+    assert of_python >= set(options.unused)
+
+
 WRONG = [
     (SearchSettings, {"passes": 0}, "passes: expected a whole number from 1 to 1,000,000, got 0"),
     (SearchSettings, {"passes": True}, "passes: expected a whole number"),
@@ -53,7 +76,7 @@ WRONG = [
     (FindSettings, {"seconds": float("nan")}, "seconds: expected a number from 0, got nan"),
     (FindSettings, {"batch": 1.5}, "batch: expected a whole number"),
     (FindSettings, {"least": 1.5}, "least: expected a probability from 0 to 1, got 1.5"),
-    (ExploreSettings, {"worth": -0.1}, "worth: expected a number from 0, got -0.1"),
+    (ExploreSettings, {"worth": -0.1}, "worth: expected a number from 0 to 1,000,000,000, got -0.1"),
     (ExploreSettings, {"policy": "cats"}, "policy: expected 'people', or None, got cats"),
     (ExploreSettings, {"seed": 2**63}, "seed: expected a whole number from 0 to 9,223,372,036,854,775,807"),
     (ExploreSettings, {"on_look": 1}, "on_look: expected a function of the record, got 1"),
@@ -91,10 +114,10 @@ def test_settings_do_not_change_and_boxes_do_not_count_where_they_are_compared()
 @pytest.mark.parametrize(
     ("settings", "kind", "message"),
     [
-        (SearchSettings(shifts=2), "windows", "shifts: expected none for a picture that is looked at by B, got 2; use "
-         "passes=, or how='fovea'"),
-        (SearchSettings(duration=2), "fovea", "duration: .* use seconds=, or how='head'"),
-        (SearchSettings(closer=2), "head", "closer: .* use confirm, or how='fovea'"),
+        (SearchSettings(shifts=2), "windows", "shifts: expected none for a picture that is looked at by windows, "
+         "got 2; use passes=, or how='fovea'"),
+        (SearchSettings(duration=2), "fovea", "duration: .* by a fovea, got 2; use seconds=, or how='head'"),
+        (SearchSettings(closer=2), "head", "closer: .* by a head that turns, got 2; use confirm, or how='fovea'"),
         (SearchSettings(start=2), "windows", "start: .* use none, or how='fovea'"),
         (SearchSettings(boxes=[(0, 0, 1, 1)]), "head", "boxes: .* use passes, or how='fovea'"),
         (FindSettings(worth=0.1), "fovea", "worth: .* use passes, or how='windows'"),
@@ -103,10 +126,13 @@ def test_settings_do_not_change_and_boxes_do_not_count_where_they_are_compared()
     ids=str,
 )  # fmt: skip
 def test_settings_of_another_kind_of_look_are_refused_with_what_to_use(settings, kind, message):
-    refused(message, check_suits, settings, kind, "B")
-    for suits in set(get_args(KindOfLook)) - {kind}:
-        if f"how={suits!r}" in message:
-            check_suits(settings, suits, "B")
+    refused(f"^{message}", KINDS_OF_LOOK[kind].check_settings, settings)
+    (suggested,) = re.findall(r"how='(\w+)'", message)
+    KINDS_OF_LOOK[suggested].check_settings(settings)
+
+
+def test_every_kind_of_look_has_its_object():
+    assert list(KINDS_OF_LOOK) == list(get_args(KindName))
 
 
 def test_a_range_says_what_it_holds():

@@ -140,4 +140,4 @@ def test_prices_are_numbers_for_an_agent_with_a_learned_map(image, model):
     assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, worth=0).ending == "shifts"
     assert agent.explore(image, shifts=50).ending == "cells"
     for worth in [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400]:
-        refused("worth: expected 0 or more", agent_of(model).explore, image, worth=worth)
+        refused("worth: expected a number from 0", agent_of(model).explore, image, worth=worth)

@@ -1,7 +1,9 @@
 """A Griffe extension that converts formulas, examples and names in docstrings to Markdown for mkdocstrings."""
 
+import inspect
 import re
 from collections.abc import Container
+from pkgutil import resolve_name
 from typing import Any
 
 import griffe
@@ -49,6 +51,15 @@ def _arguments(obj: griffe.Object) -> set[str]:
     return {obj.name, *(argument.name for argument in arguments), *obj.members}
 
 
+def _whole_docstring(obj: griffe.Object) -> str:
+    """Return a docstring of the source, or as Python has it where a decorator adds the help of settings to it."""
+    assert obj.docstring is not None
+    decorators = obj.decorators if isinstance(obj, griffe.Function) else []
+    if any(decorator.callable_path.endswith(".documented_by") for decorator in decorators):
+        return inspect.getdoc(resolve_name(obj.path)) or ""
+    return obj.docstring.value
+
+
 class Docstrings(griffe.Extension):
     """Convert every docstring once, when it is read."""
 
@@ -60,7 +71,7 @@ class Docstrings(griffe.Extension):
         """Convert the docstring of a module, class, function or attribute that was loaded."""
         if obj.docstring and not obj.is_alias:
             try:
-                text, module = obj.docstring.value, obj.module.path
+                text, module = _whole_docstring(obj), obj.module.path
                 obj.docstring.value = markdown(text, self.names, module, _arguments(obj))
             except LookupError as error:
                 griffe.logger.warning(f"{obj.path}: {error}")

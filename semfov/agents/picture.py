@@ -3,11 +3,10 @@
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, Self, cast, get_args
+from typing import Self, cast, get_args
 
 from torch import Tensor
 
@@ -17,16 +16,12 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
-from semfov.errors import InputError, SemfovError, check, check_number, lookup
+from semfov.errors import InputError, SemfovError, check, lookup
 from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import World
 from semfov.paths import Record
+from semfov.settings import How, KindName
 from semfov.zoom.lattice import Lattice
-
-KindOfLook = Literal["fovea", "windows", "head"]
-"""Kind of look: foveal fixations of a photograph, windows of a large picture, or views of a scene."""
-
-How = Literal["auto", "fovea", "windows", "head"]  # kind of look, or `auto` for the one that suits the picture
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
@@ -34,17 +29,33 @@ PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 
 
 class OpenedPicture:
-    """A photograph, a large picture or a scene; what a kind of look needs of it is read when it is asked for."""
+    """A photograph, a large picture or a scene; what a kind of look needs of it is read when it is asked for.
+
+    Args:
+        source: the picture.
+        color: order of the channels of arrays and tensors.
+        white: the values that are black and white; None for those of the type.
+        bands: the bands that are shown; None for those that the file names.
+
+    Attributes:
+        scene: whether it is a scene: a `Panorama`, a `Flat` or a camera that turns.
+
+    Raises:
+        InputError: it names several pictures, or values or bands are given for a picture that is open.
+    """
 
     def __init__(
         self, source: PictureLike, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
     ) -> None:
-        several = "one picture; semfov.run looks at folders, patterns and lists of names"
-        check(not _names_several(source), "picture", several, source)
-        self.source, self.color, self.white, self.bands = source, color, white, bands
-        self.scene = hasattr(source, "look_at")  # a `Panorama`, a `Flat` or a camera that turns
-        made = isinstance(source, World | LargePicture)
-        check(not made or white is bands is None, "white", "None for a picture that is open", white)
+        expected = "one picture; semfov.run looks at folders, patterns and lists of names"
+        check(not _names_several(source), "picture", expected, source)
+        self.source = source
+        self.color = color
+        self.white = white
+        self.bands = bands
+        self.scene = hasattr(source, "look_at")
+        is_open = isinstance(source, World | LargePicture)
+        check(not is_open or white is bands is None, "white", "None for a picture that is open", white)
 
     @classmethod
     def of(
@@ -59,36 +70,71 @@ class OpenedPicture:
         object.__setattr__(record, "source", self.path)
         return record
 
-    def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindOfLook:
-        """The kind of look that suits it, of photographs, too, windows; canvas `(width, height)` of the input."""
+    def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindName:
+        """Choose the kind of look that suits the picture.
+
+        Args:
+            how: a kind of look, or `auto`.
+            canvas: `(width, height)` of the detector's input.
+            every: whether all objects are wanted.
+            photographs: whether windows also suit photographs.
+
+        Returns:
+            The name of the kind of look.
+
+        Raises:
+            InputError: the kind is unknown, or does not suit a scene.
+        """
         how = lookup(how, get_args(How), "kind of look")
         if self.scene:
             check(how in ("auto", "head"), "how", "'head' or 'auto' for a scene", how)
             return "head"
         if how != "auto":
-            return cast(KindOfLook, how)
+            return cast(KindName, how)
         if every:
             return "windows"
         # What cannot be opened is refused where it is read.
         with suppress(SemfovError):
-            file = isinstance(self.source, str | PathLike)
-            size = self.large.size if file else picture_size(cast(ImageLike | LargePicture, self.source))
+            lattice = Lattice.over(self._size(), canvas)
             # Windows pay where there are two octaves or more to zoom in.
-            return "windows" if photographs or Lattice.over(size, canvas).levels >= 3 else "fovea"
+            if photographs or lattice.levels >= 3:
+                return "windows"
         return "fovea"
 
+    def _size(self) -> tuple[int, int]:
+        """Find the `(width, height)` of a flat picture, without reading its pixels where that is possible."""
+        if isinstance(self.source, str | PathLike):
+            return self.large.size
+        return picture_size(cast(ImageLike | LargePicture, self.source))
+
     def image(self, like: Tensor) -> Tensor:
-        """The pixels for a fovea, `(1, 3, H, W)`."""
+        """Read the pixels for a fovea.
+
+        Args:
+            like: tensor whose type and device the pixels get.
+
+        Returns:
+            `(1, 3, H, W)`, RGB in [0, 1].
+
+        Raises:
+            InputError: it is a scene, or too large to be read as a whole.
+            DataError: the file cannot be read.
+        """
         remedy = "a scene is looked at by search, find_all and explore"
         check(not self.scene, "picture", "a flat picture for a fovea", f"a {type(self.source).__name__}; {remedy}")
-        source, path = self.source, isinstance(self.source, str | PathLike)
-        if isinstance(source, LargePicture) or (path and Path(cast(str, source)).suffix.lower() in BY_WINDOWS):
-            width, height = self.large.size
-            most = f"at most {MAX_PIXELS:,} pixels for a fovea"
-            check(width * height <= MAX_PIXELS, "picture", most, f"{width} × {height}; use how='windows'")
-            return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
-        settings: dict[str, Any] = {"color": self.color, "white": self.white}
-        return as_image(cast(ImageLike, source), like=like, argument="picture", **settings)[None]
+        if not self._is_read_by_windows():
+            source = cast(ImageLike, self.source)
+            return as_image(source, like=like, argument="picture", color=self.color, white=self.white)[None]
+        width, height = self.large.size
+        expected = f"at most {MAX_PIXELS:,} pixels for a fovea"
+        check(width * height <= MAX_PIXELS, "picture", expected, f"{width} × {height}; use how='windows'")
+        return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
+
+    def _is_read_by_windows(self) -> bool:
+        """Tell whether the pixels are read by windows, as those of a TIFF are."""
+        if isinstance(self.source, str | PathLike):
+            return Path(self.source).suffix.lower() in BY_WINDOWS
+        return isinstance(self.source, LargePicture)
 
     @property
     def path(self) -> str | None:
@@ -105,24 +151,33 @@ class OpenedPicture:
     @cached_property
     def world(self) -> World:
         """The scene for a head."""
-        given = self.white is not None or self.bands is not None
-        return open_scene(self.large if given else self.source, self.color)
+        shows_chosen_values = self.white is not None or self.bands is not None
+        return open_scene(self.large if shows_chosen_values else self.source, self.color)
 
 
 def _names_several(source: object) -> bool:
     """Tell whether something names several pictures: a list of names, a folder, or a pattern that is no file."""
     if isinstance(source, list | tuple):
-        return any(isinstance(each, str | PathLike) for each in source)
+        return any(isinstance(item, str | PathLike) for item in source)
     if not isinstance(source, str | PathLike):
         return False
-    return os.path.isdir(source) or (bool({*os.fspath(source)} & {*"*?["}) and not os.path.lexists(source))
+    has_wildcards = bool({*os.fspath(source)} & {*"*?["})
+    # A file may have brackets in its name, as copies do: photo[1].jpg.
+    return os.path.isdir(source) or (has_wildcards and not os.path.lexists(source))
 
 
 def check_order(picture: object, target: object, classes: Sequence[str]) -> None:
-    """Raise `InputError` where a class stands in the place of the picture, and what is none in that of the class."""
-    named = isinstance(picture, str) and not os.path.lexists(picture) and _is_class(picture, classes)
-    swapped = named and target is not None and not isinstance(target, int | list | Mapping)
-    check(not swapped or _is_class(target, classes), "picture", "the picture before the class", repr(picture))
+    """Raise `InputError` where a class stands in the place of the picture, and what is none in that of the class.
+
+    Args:
+        picture: the argument `picture` of a method of the agent.
+        target: its argument `target`.
+        classes: the detector's classes.
+    """
+    picture_is_class = isinstance(picture, str) and not os.path.lexists(picture) and _is_class(picture, classes)
+    target_is_word = target is not None and not isinstance(target, int | list | Mapping)
+    if picture_is_class and target_is_word:
+        check(_is_class(target, classes), "picture", "the picture before the class", repr(picture))
 
 
 def _is_class(name: object, classes: Sequence[str]) -> bool:
@@ -132,9 +187,3 @@ def _is_class(name: object, classes: Sequence[str]) -> bool:
     except InputError:
         return False
     return True
-
-
-def counted_from(record: Record, least: float | None) -> Record:
-    """Count the objects of a record from a probability or score on; None leaves the record as it is."""
-    check_number(0.0 if least is None else least, "least", 0, 1)
-    return record if least is None else replace(record, least=least)

@@ -13,34 +13,55 @@ from semfov.data.classes import class_index
 from semfov.detection.load import check_detector, given_names
 from semfov.detection.onnx_file import write_settings
 from semfov.detection.weights import WEIGHTS
-from semfov.errors import check, check_device
+from semfov.errors import InputError, check, check_device
 from semfov.io.manifest import Manifest
 from semfov.sensor import SENSORS, Foveation
 
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
-    """Names of the detector's classes, or None where they are known only after it is loaded."""
-    given = detector_options(options).get("classes")
+    """Find the names of the detector's classes before it is loaded.
+
+    Args:
+        options: the options of a command.
+
+    Returns:
+        The names, or None where they are known only after it is loaded.
+
+    Raises:
+        InputError: there is no such detector, it has classes of its own, or the weights are of another kind.
+    """
+    names = detector_options(options).get("classes")
     if options.models is not None:
         return Manifest.read(options.models).classes
-    classes, weights = check_detector(options.detector), options.weights
-    named = f"none for {options.detector}, which has its own; `semfov find --target CLASS` looks for one of them"
-    check(given is None or classes is None, "classes", named, given and ", ".join(given))
-    classes = classes or given
-    own = WEIGHTS.get(options.detector.lower())
-    mixed = weights is not None and weights.suffix == ".onnx" and own is not None and not own.file.endswith(".onnx")
+    classes = check_detector(options.detector)
+    if classes is not None and names is not None:
+        expected = f"none for {options.detector}, which has its own; `semfov find --target CLASS` looks for one of them"
+        raise InputError(f"classes: expected {expected}, got {', '.join(names)}")
+    weights = options.weights
+    registered = WEIGHTS.get(options.detector.lower())
+    takes_onnx = registered is None or registered.file.endswith(".onnx")
     expected = f"Darknet weights for {options.detector}; an ONNX file is a detector of its own, --detector FILE"
-    check(not mixed, "weights", expected, weights)
-    return classes
+    check(weights is None or weights.suffix != ".onnx" or takes_onnx, "weights", expected, weights)
+    return names if classes is None else classes
 
 
 def detector_options(options: DetectorOptions) -> dict[str, Any]:
-    """What the options give to `load_detector`: among them a device that PyTorch has, and names or a file of them."""
+    """Take the options of `load_detector`.
+
+    Args:
+        options: the options of a command.
+
+    Returns:
+        Those that are given, by the names that they have in Python.
+
+    Raises:
+        InputError: PyTorch has no such device, or the file of names cannot be read.
+    """
     check_device(options.device)
     names = options.classes
     if names is not None and len(names) == 1 and Path(names[0]).is_file():
         names = given_names(names[0])
-    given = {
+    values = {
         "weights": options.weights,
         "device": options.device,
         "classes": names,
@@ -50,7 +71,7 @@ def detector_options(options: DetectorOptions) -> dict[str, Any]:
         "logits": options.logits or None,
         "preprocessing": options.colour and {"channels": options.colour},
     }
-    return {name: value for name, value in given.items() if value is not None}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 _OF_ONNX = "head", "colour", "input_size", "logits", "remember"
@@ -58,24 +79,45 @@ _OF_ONNX = "head", "colour", "input_size", "logits", "remember"
 
 
 def check_onnx_options(options: DetectorOptions, detector: str) -> None:
-    """Raise `InputError` where an option of ONNX files is given for a detector that is none."""
-    known = WEIGHTS.get(detector.lower())
+    """Raise `InputError` where an option of ONNX files is given for a detector that is none.
+
+    Args:
+        options: the options of a command.
+        detector: name or file of the detector.
+    """
+    registered = WEIGHTS.get(detector.lower())
     is_file = detector.endswith(".onnx")
-    onnx = is_file or (known is not None and known.file.endswith(".onnx"))
+    is_onnx = is_file or (registered is not None and registered.file.endswith(".onnx"))
     for name in _OF_ONNX:
-        fits = is_file if name == "remember" else onnx
-        check(fits or not getattr(options, name), name, "none for a detector that is no ONNX file", detector)
+        # Settings are remembered beside a file of one's own.
+        suits = is_file if name == "remember" else is_onnx
+        check(suits or not getattr(options, name), name, "none for a detector that is no ONNX file", detector)
 
 
 def remember(options: DetectorOptions, detector: str) -> Path | None:
-    """Write the settings that the options give beside the detector's file, if they ask for it; returns the file."""
+    """Write the settings that the options give beside the detector's file, if they ask for it.
+
+    Args:
+        options: the options of a command.
+        detector: the detector's file.
+
+    Returns:
+        The file that was written; None for none.
+    """
     if not options.remember:
         return None
     return write_settings(Path(detector), detector_options(options))
 
 
 def make_agent(options: AgentOptions) -> ActivePerception:
-    """The agent that the options name, on the device that they name."""
+    """Make the agent that the options name, on the device that they name.
+
+    Args:
+        options: the options of a command.
+
+    Returns:
+        The agent, ready for use.
+    """
     device = options.device
     if options.models is None:
         check_onnx_options(options, options.detector)
@@ -92,12 +134,12 @@ def make_agent(options: AgentOptions) -> ActivePerception:
 
 
 def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePerception:
-    """The agent that the options name, with options of `load_detector`."""
+    """Load the agent that the options name, with options of `load_detector`."""
     if options.models is not None:
         check(options.agent != "raw", "agent", "recommended or published with --models", options.agent)
         moved = loaded if options.detector == AgentOptions.detector else {"detector": options.detector, **loaded}
-        own = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
-        return own(options.models, **moved)
+        load = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
+        return load(options.models, **moved)
     if options.agent == "recommended":
         sensor = SENSORS[options.sensor or "gradual"]
         kind = sensor.make.__name__
@@ -109,7 +151,18 @@ def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePercepti
 
 
 def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str] | None:
-    """The classes that a text names, with commas between them; None for all."""
+    """Read the classes that a text names, with commas between them.
+
+    Args:
+        text: the text; None or `all` for all classes.
+        classes: the detector's classes, by which names are checked; None where they are not known yet.
+
+    Returns:
+        The names; None for all classes.
+
+    Raises:
+        InputError: a class is unknown, or none is named.
+    """
     if text is None or text == "all":
         return None
     names = [name.strip() for name in text.split(",") if name.strip()]

@@ -43,13 +43,21 @@ _MOST_PIXELS = 2**25  # of a picture: on this page it is decoded as a whole
 _SECONDS = 60.0  # longest time of a search, for which others wait
 _LONGEST = 1600  # longer side in pixels of the picture that is clicked on
 
-_PICTURE, _CLASS = "one, or an example", "one to search for"  # what is expected
+_PICTURE = "one, or an example"  # what is expected
+_CLASS = "one to search for"  # likewise
 _CLICK = "Choose a class, and click on the picture to look there."
 _STYLE = "footer { display: none !important; } .page iframe { width: 100%; border: 0; border-radius: 8px; }"
 
 
 def serve(options: AppOptions) -> int:
-    """Serve the page until Ctrl-C."""
+    """Serve the page until Ctrl-C.
+
+    Args:
+        options: the options of the command.
+
+    Returns:
+        The exit code.
+    """
     os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")  # nothing is sent elsewhere
     try:
         import gradio  # noqa: F401
@@ -58,8 +66,8 @@ def serve(options: AppOptions) -> int:
     try:
         socket.create_server((options.host, options.port or 0)).close()
     except OSError as error:
-        where = f"{options.host}:{options.port or 'any'}"
-        raise DataError(f"app: cannot be served on {where}: {error.strerror or error}") from None
+        address = f"{options.host}:{options.port or 'any'}"
+        raise DataError(f"app: cannot be served on {address}: {error.strerror or error}") from None
     detector_classes(options)
     agent = make_agent(options)
     with tempfile.TemporaryDirectory() as folder:
@@ -95,7 +103,8 @@ class _Doorkeeper:
     # Another page in the same browser can send requests here, also under a name of its own for this address.
 
     def __init__(self, app: Any, host: str) -> None:
-        self._app, self._host = app, host
+        self._app = app
+        self._host = host
 
     async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
         headers = {key.decode("latin-1"): value.decode("latin-1") for key, value in scope.get("headers", ())}
@@ -113,10 +122,10 @@ class _Doorkeeper:
         """Whether a request may enter, by the address that it was sent to and the page that it comes from."""
         try:
             name = urlsplit(f"//{address}").hostname or ""
-            own = origin is None or urlsplit(origin).netloc.lower() == address.lower()
+            is_own_page = origin is None or urlsplit(origin).netloc.lower() == address.lower()
         except ValueError:
             return False
-        if not own:
+        if not is_own_page:
             return False
         if name in ("localhost", self._host.lower()):
             return True
@@ -139,17 +148,18 @@ def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: S
         episode.open(image[None].to(agent.eye.sensor.like))
         while episode.look() is not None:
             pass
-        own = agent.search(image, target, how="fovea", start=cells[0], shifts=len(cells) - 1, closer=0)
+        of_agent = agent.search(image, target, how="fovea", start=cells[0], shifts=len(cells) - 1, closer=0)
     record = episode.record()
-    left = record.values[-1].index_fill(0, record.cells, -torch.inf)
-    return _OwnLooks(record, int(left.argmax()), own)
+    values = record.values[-1].index_fill(0, record.cells, -torch.inf)
+    return _OwnLooks(record, int(values.argmax()), of_agent)
 
 
 class _Calls:
     """What the page calls; refusals are shown on it."""
 
     def __init__(self, agent: ActivePerception) -> None:
-        self.agent, self.classes = agent, list(agent.classes[1:])
+        self.agent = agent
+        self.classes = list(agent.classes[1:])
         self.examples: list[Scene] = []
         with suppress(InputError):  # the detector knows none of their classes
             scenes = [example_scene(name, self.classes) for name in EXAMPLES]
@@ -158,37 +168,47 @@ class _Calls:
         self._stops: dict[str, threading.Event] = {}
 
     def take(self) -> tuple[Image.Image, str]:
-        """The next example, and the class of most of its objects."""
+        """Take the next example, and the class of most of its objects."""
         scene = next(self._turns)
         return pillow(scene.image), self.classes[int(scene.labels.mode().values) - 1]
 
     def look(self, path: str | None, target: str, task: str, passes: float, visitor: str = "") -> tuple[str, str]:
-        """Words about a record of a picture, and its page in a frame; `stop` of the same visitor ends the search."""
-        with _told():
-            agent, picture = self.agent, _read(path)
+        """Look at a picture; `stop` of the same visitor ends it.
+
+        Args:
+            path: file of the picture.
+            target: class, or all of them.
+            task: one of `_TASKS`.
+            passes: largest number of passes of the detector.
+            visitor: who asks.
+
+        Returns:
+            Words about the record, and its page in a frame.
+        """
+        with _errors_on_page():
+            picture = _read(path)
             check(task != "search" or target in self.classes, "class", _CLASS, target)
-            stop = self._stops[visitor] = threading.Event()
-            limits: dict[str, Any] = {
-                "passes": int(passes),
-                "seconds": _SECONDS,
-                "on_look": lambda _: not stop.is_set(),
-            }
             if task == "gaze":
-                prediction = agent.gaze(picture)
+                prediction = self.agent.gaze(picture)
                 part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
-                words, page = prediction.describe(), gaze_page_html("Where people look", [part])
-            else:
-                if task == "search":
-                    record = agent.search(picture, target, **limits)
-                elif task == "find all":
-                    record = agent.find_all(picture, None if target == _EVERY else target, **limits)
-                else:
-                    record = agent.explore(picture, **limits)
-                data = record.page_data(picture if record.kind.fine else None)
-                words, page = record.summary(), page_html(record.describe(), [data])
-            # A frame that shares nothing with the page around it.
-            source = f'sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"'
-            return words, f'<iframe title="The looks" {source}></iframe>'
+                return prediction.describe(), _framed(gaze_page_html("Where people look", [part]))
+            record = self._record(picture, target, task, int(passes), visitor)
+            data = record.page_data(picture if record.kind.fine else None)
+            return record.summary(), _framed(page_html(record.describe(), [data]))
+
+    def _record(self, picture: Tensor, target: str, task: str, passes: int, visitor: str) -> Record:
+        """Search a picture, find all objects in it or explore it, until the visitor stops it."""
+        stop = self._stops[visitor] = threading.Event()
+
+        def go_on(_: Record) -> bool:
+            return not stop.is_set()
+
+        if task == "search":
+            return self.agent.search(picture, target, passes=passes, seconds=_SECONDS, on_look=go_on)
+        if task == "find all":
+            classes = None if target == _EVERY else target
+            return self.agent.find_all(picture, classes, passes=passes, seconds=_SECONDS, on_look=go_on)
+        return self.agent.explore(picture, passes=passes, seconds=_SECONDS, on_look=go_on)
 
     def stop(self, visitor: str = "") -> None:
         """End a visitor's search after the look that it is at; what was found is shown."""
@@ -196,40 +216,51 @@ class _Calls:
             self._stops[visitor].set()
 
     def click(self, path: str | None, target: str, cells: list[int], event: Any) -> tuple[Any, ...]:
-        """The cells with that of the click, and what they show."""
-        with _told():
+        """Add the cell of a click, and draw what they show."""
+        with _errors_on_page():
             image = _read(path)
             check(target in self.classes, "class", _CLASS, target)
             scale = image.shape[-1] / _reduced(image).width
             point = torch.tensor([[side * scale for side in event.index]])
             grid = Grid(self.agent.columns, self.agent.rows, (image.shape[-1], image.shape[-2]))
             cells = [*cells, int(grid.cell_of(point)[0])]
-            looked = _look_at_cells(self.agent, image, target, cells)
-            seen = render([plot_foveated_strip(looked.record, most=1)], dpi=250)[0]
-            believed = render([plot_belief(looked.record, -1)], dpi=110)[0]
-            # Numbered looks, and a ring where the agent would look next.
-            drawn = _reduced(image)
-            draw, scale = ImageDraw.Draw(drawn), drawn.width / image.shape[-1]
-            radius = max(drawn.size) / 50
-            points = [(x * scale, y * scale) for x, y in looked.record.fixations.tolist()]
-            draw.line(points, fill="white", width=5)
-            draw.line(points, fill=GAZE, width=3)
-            for number, (x, y) in enumerate(points, 1):
-                draw.circle((x, y), radius, fill=GAZE, outline="white", width=2)
-                draw.text((x, y), str(number), fill="white", anchor="mm", font_size=1.2 * radius)
-            x, y = (side * scale for side in looked.point)
-            draw.circle((x, y), radius, outline="white", width=6)
-            draw.circle((x, y), radius, outline=TARGET, width=4)
-            return cells, drawn, seen, believed, looked.describe()
+            looks = _look_at_cells(self.agent, image, target, cells)
+            view = render([plot_foveated_strip(looks.record, most=1)], dpi=250)[0]
+            belief = render([plot_belief(looks.record, -1)], dpi=110)[0]
+            return cells, _with_looks(image, looks), view, belief, looks.describe()
 
     def fresh(self, path: str | None) -> tuple[Any, ...]:
         """No cells, and the picture to click on."""
-        with _told():
+        with _errors_on_page():
             return [], None if path is None else _reduced(_read(path)), None, None, _CLICK
 
 
+def _framed(page: str) -> str:
+    """Put a page into a frame that shares nothing with the page around it."""
+    attributes = f'sandbox="allow-scripts" srcdoc="{escape(page)}" height="{_HEIGHT}"'
+    return f'<iframe title="The looks" {attributes}></iframe>'
+
+
+def _with_looks(image: Tensor, looks: "_OwnLooks") -> Image.Image:
+    """Draw the numbered looks of a person, and a ring where the agent would look next."""
+    picture = _reduced(image)
+    draw = ImageDraw.Draw(picture)
+    scale = picture.width / image.shape[-1]
+    radius = max(picture.size) / 50
+    points = [(x * scale, y * scale) for x, y in looks.record.fixations.tolist()]
+    draw.line(points, fill="white", width=5)
+    draw.line(points, fill=GAZE, width=3)
+    for number, (x, y) in enumerate(points, 1):
+        draw.circle((x, y), radius, fill=GAZE, outline="white", width=2)
+        draw.text((x, y), str(number), fill="white", anchor="mm", font_size=1.2 * radius)
+    x, y = (side * scale for side in looks.point)
+    draw.circle((x, y), radius, outline="white", width=6)
+    draw.circle((x, y), radius, outline=TARGET, width=4)
+    return picture
+
+
 def _read(path: str | None) -> Tensor:
-    """The picture in a file that was uploaded, `(3, H, W)`; larger ones than a page should wait for are refused."""
+    """Read the picture in a file that was uploaded, `(3, H, W)`; one that a page should not wait for is refused."""
     check(path is not None, "picture", _PICTURE, "none")
     assert path is not None
     width, height = PhotographPicture(path).size
@@ -239,7 +270,7 @@ def _read(path: str | None) -> Tensor:
 
 
 @contextmanager
-def _told() -> Iterator[None]:
+def _errors_on_page() -> Iterator[None]:
     """Show an error of the library on the page."""
     import gradio
 
@@ -250,7 +281,7 @@ def _told() -> Iterator[None]:
 
 
 def _make_page(agent: ActivePerception) -> Any:
-    """The page, a `gradio.Blocks`; pictures that it is given are removed within minutes."""
+    """Make the page, a `gradio.Blocks`; pictures that it is given are removed within minutes."""
     import gradio
 
     calls = _Calls(agent)
@@ -292,22 +323,22 @@ def _make_page(agent: ActivePerception) -> Any:
                     about = gradio.Markdown(_CLICK)
                     again = gradio.Button("Start again")
                     cells = gradio.State([])
-                    own = gradio.Image(label="Your looks", type="pil", elem_id="own", **fixed)
+                    looks = gradio.Image(label="Your looks", type="pil", elem_id="own", **fixed)
                     with gradio.Row():
-                        seen = gradio.Image(label="What the fovea sees there", **fixed)
-                        believed = gradio.Image(label="What is believed", **fixed)
-        outputs = [cells, own, seen, believed, about]
+                        view = gradio.Image(label="What the fovea sees there", **fixed)
+                        belief = gradio.Image(label="What is believed", **fixed)
+        outputs = [cells, looks, view, belief, about]
         example.click(calls.take, [], [picture, target], api_visibility="private")
         go.click(look, [picture, target, task, passes], [words, shown], api_visibility="private")
         end.click(stop, [], [], api_visibility="private", queue=False)
         for changed in (picture.change, again.click, target.change):
             changed(calls.fresh, [picture], outputs, api_visibility="private")
-        own.select(click, [picture, target, cells], outputs, api_visibility="private")
+        looks.select(click, [picture, target, cells], outputs, api_visibility="private")
     return page
 
 
 def _reduced(image: Tensor) -> Image.Image:
-    """The picture that is clicked on."""
+    """Reduce the picture that is clicked on."""
     picture = pillow(image)
     picture.thumbnail((_LONGEST, _LONGEST))
     return picture
@@ -327,15 +358,16 @@ class _OwnLooks(NamedTuple):
         return x, y
 
     def describe(self) -> str:
-        """What the last look showed, what the belief is, and what the agent did, in lines of Markdown."""
-        record, target = self.record, self.record.target_name
-        seen = detections_in_words(record.looks[-1].detections, record.classes)
+        """Say what the last look showed, what the belief is, and what the agent did, in lines of Markdown."""
+        record = self.record
+        detections = detections_in_words(record.looks[-1].detections, record.classes)
         assert record.presence is not None
-        chances, (x, y) = record.presence.tolist(), self.point
+        chances = record.presence.tolist()
+        x, y = self.point
         before = f", {chances[-2]:.2f} before it" if len(chances) > 1 else ""
         lines = [
-            f"**Look {len(record)}** shows {seen}.",
-            f"The probability that the picture holds “{target}” is {chances[-1]:.2f} after it{before}.",
+            f"**Look {len(record)}** shows {detections}.",
+            f"The probability that the picture holds “{record.target_name}” is {chances[-1]:.2f} after it{before}.",
             f"The agent would look next at ({x:.0f}, {y:.0f}): the orange ring.",
             f"The agent itself, from your first look and in as many looks: {self.agent.describe()}.",
         ]

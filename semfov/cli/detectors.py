@@ -32,31 +32,39 @@ _WIDTH = 100  # characters of a line of names
 
 def _show_one(options: DetectorsOptions, path: Path) -> int:
     """List the classes of a detector, or try it out in a photograph."""
-    name, loaded = fspath(path), detector_options(options)
+    name = fspath(path)
+    loading = detector_options(options)
     if path.is_dir():
         classes = Manifest.read(path).classes
     else:
         check_onnx_options(options, name)
-        known = check_detector(name)
-        classes = load_detector(name, **loaded).classes if known is None or loaded else known
+        registered = check_detector(name)
+        classes = load_detector(name, **loading).classes if registered is None or loading else registered
     written = remember(options, name)
     if written is not None:
         print(f"wrote {written}")
     if options.try_ is not None:
         fitted = path.is_dir() or (GlimpseEvidence.shipped / f"{name}.safetensors").is_file()
-        agent = ActivePerception.from_pretrained(name, **loaded) if fitted else ActivePerception.raw(name, **loaded)
-        try_detector(agent, options.try_)
+        make = ActivePerception.from_pretrained if fitted else ActivePerception.raw
+        try_detector(make(name, **loading), options.try_)
         return 0
     print(f"{name} knows {len(classes)} classes:")
-    wide = max(map(len, classes)) + 2
-    down = -(-len(classes) // max(1, _WIDTH // wide))
-    for row in range(down):  # in order down each column
-        print("".join(each.ljust(wide) for each in classes[row::down]).rstrip())
+    width = max(map(len, classes)) + 2
+    rows = -(-len(classes) // max(1, _WIDTH // width))
+    for row in range(rows):  # in order down each column
+        print("".join(class_name.ljust(width) for class_name in classes[row::rows]).rstrip())
     return 0
 
 
 def show(options: DetectorsOptions) -> int:
-    """List the detectors, or the classes of one, or try one out."""
+    """List the detectors, or the classes of one, or try one out.
+
+    Args:
+        options: the options of the command.
+
+    Returns:
+        The exit code.
+    """
     if options.name is not None:
         return _show_one(options, options.name)
     for name in ("try_", "remember"):
@@ -64,9 +72,9 @@ def show(options: DetectorsOptions) -> int:
     rows = [["name", "size", "weights", "models shipped for", "licence"]]
     for name, weights in WEIGHTS.items():
         elsewhere = "downloaded when needed" if weights.sources else "given by --weights"
-        there = "here" if weights_path(name).is_file() else elsewhere
-        models = [what for what, kind in _PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
-        rows.append([name, f"{weights.size / 1e6:.0f} MB", there, ", ".join(models) or "none", weights.licence])
+        place = "here" if weights_path(name).is_file() else elsewhere
+        purposes = [purpose for purpose, kind in _PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
+        rows.append([name, f"{weights.size / 1e6:.0f} MB", place, ", ".join(purposes) or "none", weights.licence])
     print("\n".join(table_lines(rows)))
     print(f"\nDownloaded weights are kept in {cache_folder()}.")
     print("Others: torchvision:MODEL, hf:OWNER/NAME, a .onnx file, a .cfg and its weights, or a folder of semfov fit.")

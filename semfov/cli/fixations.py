@@ -19,6 +19,8 @@ from semfov.data.large import picture_size
 from semfov.data.sources import PHOTOGRAPHS, picture_files
 from semfov.errors import DataError, SemfovError, check, printable
 
+_FRAMES_NAMED = 3  # largest number of sizes of frames that are named
+
 
 class _PictureSizes(Mapping[str, tuple[int, int]]):
     """`(width, height)` of a picture or those in a folder, by names as tables have them: with any path and ending."""
@@ -31,11 +33,11 @@ class _PictureSizes(Mapping[str, tuple[int, int]]):
         self._sizes: dict[Path, tuple[int, int]] = {}
 
     def path(self, name: str) -> Path:
-        """The file of a picture by its name; `KeyError` where there is none."""
-        whole = name.lower().replace("\\", "/")
-        parts = whole.split("/")
-        names = [*("/".join(parts[first:]) for first in range(len(parts))), Path(parts[-1]).stem]
-        path = next((self._files[each] for each in names if each in self._files), None)
+        """Find the file of a picture by its name; `KeyError` where there is none."""
+        parts = name.lower().replace("\\", "/").split("/")
+        # A table may have other folders before the name than there are here, or no ending.
+        candidates = [*("/".join(parts[first:]) for first in range(len(parts))), Path(parts[-1]).stem]
+        path = next((self._files[candidate] for candidate in candidates if candidate in self._files), None)
         if path is None:
             raise KeyError(name)
         return path
@@ -54,80 +56,122 @@ class _PictureSizes(Mapping[str, tuple[int, int]]):
 
 
 def check_fixations(options: CheckOptions) -> int:
-    """Print what is in files of fixations, and what is suspicious; returns the exit code, 1 if anything is."""
+    """Print what is in files of fixations, and what is suspicious.
+
+    Args:
+        options: the files, and what they do not tell themselves.
+
+    Returns:
+        The exit code, 1 if anything is suspicious or a file cannot be read.
+    """
     check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
-    given: dict[str, Any] = {} if options.size is None else {"size": frame_of(options.size)}
-    given |= {name: getattr(options, name) for name in ("picture", "subject") if getattr(options, name) is not None}
-    if options.columns is not None:
-        given["columns"] = {
-            ours.strip(): theirs.strip()
-            for ours, _, theirs in (each.partition("=") for each in options.columns.split(","))
-        }
-        for ours, theirs in given["columns"].items():
-            check(bool(theirs), "columns", f"the file's name of {ours}, as in x=FPOGX,y=FPOGY", "none")
+    arguments = _reading_arguments(options)
     place = None if options.picture is None else Path(options.picture)
-    folder = place is not None and place.is_dir()
-    if folder:
-        del given["picture"]
-    pictures = place is not None and (folder or (place.is_file() and place.suffix.lower() in PHOTOGRAPHS))
-    sizes = _PictureSizes(place) if place is not None and pictures else None
+    sizes = _PictureSizes(place) if place is not None and _shows_pictures(place) else None
     wrong = False
     for name in options.files:
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of what the lines below say
-                reader = reader_of(Path(name), given.get("columns"))
-                records = _records(reader, Path(name), given, sizes)
-            if sizes is not None and not folder:  # one picture is compared with what was looked at in it
-                records = [each for each in records if each.picture in sizes] or records
-            lines = suspicions(records, sizes)
-            if sizes is not None and not options.rules_alone:
-                lines += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
+            wrong |= _report(Path(name), options, arguments, sizes)
         except SemfovError as error:
             if len(options.files) == 1:
                 raise
             print(f"{printable(name)}: cannot be read: {error}")
             wrong = True
-            continue
-        kind = DATA_SETS.get(reader)
-        usual = f" (those of {kind}, or give --size)" if kind in ("OSIE", "COCO-Search18") and not options.size else ""
-        print(f"{printable(name)}: {_content(records, usual)}")
-        compared = "" if sizes is not None else "; frames were not compared with pictures (--picture FOLDER)"
-        found = [f"  suspicious: {line}" for line in lines] or [f"  nothing is suspicious{compared}"]
-        print(*found, sep="\n")
-        wrong = wrong or bool(lines)
-    return 1 if wrong else 0
+    return int(wrong)
+
+
+def _reading_arguments(options: CheckOptions) -> dict[str, Any]:
+    """Take the arguments of the readers of fixations that are given: `size`, `picture`, `subject` and `columns`."""
+    arguments: dict[str, Any] = {}
+    if options.size is not None:
+        arguments["size"] = frame_of(options.size)
+    if options.picture is not None and not Path(options.picture).is_dir():  # a folder is no picture's name
+        arguments["picture"] = options.picture
+    if options.subject is not None:
+        arguments["subject"] = options.subject
+    if options.columns is not None:
+        arguments["columns"] = _columns_of(options.columns)
+    return arguments
+
+
+def _columns_of(text: str) -> dict[str, str]:
+    """Read the file's names of columns by ours: `x=FPOGX,y=FPOGY`."""
+    columns = {}
+    for pair in text.split(","):
+        ours, _, theirs = (word.strip() for word in pair.partition("="))
+        check(bool(theirs), "columns", f"the file's name of {ours}, as in x=FPOGX,y=FPOGY", "none")
+        columns[ours] = theirs
+    return columns
+
+
+def _shows_pictures(place: Path) -> bool:
+    """Tell whether a place is a folder of pictures or a photograph; otherwise it is the name of a picture."""
+    return place.is_dir() or (place.is_file() and place.suffix.lower() in PHOTOGRAPHS)
+
+
+def _report(path: Path, options: CheckOptions, arguments: dict[str, Any], sizes: _PictureSizes | None) -> bool:
+    """Print what is in one file, and what is suspicious; tell whether anything is."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what the lines below say
+        reader = reader_of(path, arguments.get("columns"))
+        records = _records(reader, path, arguments, sizes)
+    if sizes is not None and "picture" in arguments:  # a single one is compared with what was looked at in it
+        records = [record for record in records if record.picture in sizes] or records
+    suspicious = suspicions(records, sizes)
+    if sizes is not None and not options.rules_alone:
+        suspicious += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
+    data_set = DATA_SETS.get(reader)
+    has_usual_frames = data_set in ("OSIE", "COCO-Search18") and "size" not in arguments
+    usual = f" (those of {data_set}, or give --size)" if has_usual_frames else ""
+    print(f"{printable(str(path))}: {_content(records, usual)}")
+    for line in suspicious:
+        print(f"  suspicious: {line}")
+    if not suspicious:
+        not_compared = "" if sizes is not None else "; frames were not compared with pictures (--picture FOLDER)"
+        print(f"  nothing is suspicious{not_compared}")
+    return bool(suspicious)
 
 
 def _records(
-    reader: Callable[..., list[Fixations]], path: Path, given: dict[str, Any], sizes: _PictureSizes | None
+    reader: Callable[..., list[Fixations]], path: Path, arguments: dict[str, Any], sizes: _PictureSizes | None
 ) -> list[Fixations]:
-    """The records of a file; where it has no frames, they are the pictures."""
-    unnamed = {name: value for name, value in given.items() if name != "picture"}
-    if "picture" in given and "picture" not in signature(reader).parameters:
+    """Read the records of a file; where it has no frames, they are the pictures."""
+    unnamed = {name: value for name, value in arguments.items() if name != "picture"}
+    if "picture" in arguments and "picture" not in signature(reader).parameters:
         # The file names its pictures.
-        check(sizes is not None, "picture", "a picture or folder that exists", given["picture"])
+        check(sizes is not None, "picture", "a picture or folder that exists", arguments["picture"])
         return _records(reader, path, unnamed, sizes)
-    if "picture" in given and sizes is not None:  # a photograph, which may be one of those that the table names
+    if "picture" in arguments and sizes is not None:  # a photograph, which may be one of those that the table names
         with suppress(PictureError):
             return _records(reader, path, unnamed, sizes)
     try:
-        return read_by(reader, path, given)
+        return read_by(reader, path, arguments)
     except FrameError as error:
         if sizes is None:
             raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
-        return read_by(reader, path, {**given, "size": sizes})
+        return read_by(reader, path, {**arguments, "size": sizes})
 
 
 def _content(records: list[Fixations], usual: str) -> str:
-    """What is in the records, in a line; `usual` is said of frames that the file does not tell."""
+    """Say what is in the records, in a line; `usual` is said of frames that the file does not tell."""
     if not records:
         return "no fixations"
-    people, pictures = ({getattr(each, name) for each in records} for name in ("subject", "picture"))
-    sizes = sorted({each.size for each in records})
-    frames = ", ".join(f"{width} × {height}" for width, height in sizes[:3]) + (", …" if sizes[3:] else "")
-    counts = ((sum(map(len, records)), "fixation"), (len(records), "scanpath"), (len(people), "person"))
-    words = ", ".join(f"{n} {name if n == 1 else {'person': 'people'}.get(name, f'{name}s')}" for n, name in counts)
-    times = [each.durations for each in records if each.durations is not None]
-    lasting = f"; they take {np.median(np.concatenate(times)):g} ms in the median" if times else "; without durations"
-    return f"{words}, {len(pictures)} picture{'' if len(pictures) == 1 else 's'}, frames of {frames}{usual}{lasting}"
+    people = {record.subject for record in records}
+    pictures = {record.picture for record in records}
+    words = [
+        _counted(sum(map(len, records)), "fixation", "fixations"),
+        _counted(len(records), "scanpath", "scanpaths"),
+        _counted(len(people), "person", "people"),
+        _counted(len(pictures), "picture", "pictures"),
+    ]
+    sizes = sorted({record.size for record in records})
+    frames = ", ".join(f"{width} × {height}" for width, height in sizes[:_FRAMES_NAMED])
+    more = ", …" if len(sizes) > _FRAMES_NAMED else ""
+    times = [record.durations for record in records if record.durations is not None]
+    lasting = f"they take {np.median(np.concatenate(times)):g} ms in the median" if times else "without durations"
+    return f"{', '.join(words)}, frames of {frames}{more}{usual}; {lasting}"
+
+
+def _counted(number: int, one: str, several: str) -> str:
+    """Write a number of things in words."""
+    return f"{number} {one if number == 1 else several}"

@@ -2,6 +2,7 @@
 
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,74 +34,107 @@ _Outcome = dict[str, Any]
 
 
 def predict_gaze(options: GazeOptions) -> int:
-    """Predict where people look in all pictures; returns the exit code, 1 if a picture was left out."""
+    """Predict where people look in all pictures.
+
+    Args:
+        options: the options of the command.
+
+    Returns:
+        The exit code, 1 if a picture was left out.
+    """
     job = _GazeJob(options)
-    with held_outputs(options):
+    with held_outputs(options):  # no other command writes the same files meanwhile
         return _look_at_pictures(job)
 
 
 class _GazeJob:
-    """Predicts where people look in pictures; what an interrupted command has predicted is read again."""
+    """Predicts where people look in pictures; what an interrupted command has predicted is read again.
+
+    Attributes:
+        kind: end of the name of the file that is written; empty for a folder or nothing.
+        table: file of the scanpaths; None where none are written.
+        outcomes: what is known of the pictures so far, by number.
+        finished: the outcomes that the same command takes up after an interruption; None where it keeps none.
+    """
 
     def __init__(self, options: GazeOptions) -> None:
-        self.options, self.sources, out = options, picture_sources(options), options.out
-        kind = "" if out is None or out.is_dir() else out.suffix.lower()
-        check(kind in ("", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", out)
-        several = len(self.sources) > 1
-        check(kind not in _DENSITIES or not several, "out", "a .csv file or a folder for several pictures", out)
+        self.options = options
+        self.sources = picture_sources(options)
+        self.several = len(self.sources) > 1
+        self.kind = _kind_of_output(options.out, several=self.several)
+        self.table = _table_of(options.out, self.kind)
         if options.report is not None:
             check_writable(page_path(options.report))
         check_detector(options.detector)
         check_onnx_options(options, options.detector)
-        loaded = detector_options(options)
-        own = None if options.model is None else FixationDensity.from_pretrained(options.model)
-        self.detector = load_detector(options.detector, **loaded)
+        loading = detector_options(options)
+        # A model that cannot be read is told before the detector is loaded.
+        given_model = None if options.model is None else FixationDensity.from_pretrained(options.model)
+        self.detector = load_detector(options.detector, **loading)
         remember(options, options.detector)
-        self.model = FixationDensity.for_detector(self.detector) if own is None else own
+        self.model = FixationDensity.for_detector(self.detector) if given_model is None else given_model
         if not self.sources:
             self.sources = [example_source(EXAMPLES[0])]
             print(f"no picture was given: looking at {self.sources[0].name}, which comes with semfov")
-        self.kind, self.several = kind, several
-        self.table = None if out is None or kind in _DENSITIES else out if kind else out / "scanpaths.csv"
         self.outcomes: dict[int, _Outcome] = {}
         self.finished: SceneResults | None = None
-        if several and self.table is not None:
-            settings = {name: value for name, value in options.plain().items() if name not in (*WHERE, "quiet")}
-            depends_on = {"options": settings, "detector": self.detector.settings(), "model": self.model}
-            self.finished = unfinished(self.table, depends_on, self.sources)
-            for number, each in self.finished.items(len(self.sources)):
-                (outcome,) = each["records"]
-                if "density" not in outcome or Path(outcome["density"]).exists():  # one that is gone is written again
-                    self.outcomes[number] = outcome
+        if self.several and self.table is not None:
+            self.finished = self._take_up(self.table)
+
+    def _take_up(self, table: Path) -> SceneResults:
+        """Read what an interrupted command has predicted of the same pictures."""
+        settings = {name: value for name, value in self.options.plain().items() if name not in (*WHERE, "quiet")}
+        depends_on = {"options": settings, "detector": self.detector.settings(), "model": self.model}
+        finished = unfinished(table, depends_on, self.sources)
+        for number, values in finished.items(len(self.sources)):
+            (outcome,) = values["records"]
+            if "density" not in outcome or Path(outcome["density"]).exists():  # one that is gone is written again
+                self.outcomes[number] = outcome
+        return finished
 
     def look(self, number: int) -> None:
         """Predict where people look in a picture, and write the density."""
-        source, out = self.sources[number], self.options.out
-        image = OpenedPicture.of(source.opened("auto")).image(torch.zeros(1))[0]
+        options = self.options
+        source = self.sources[number]
+        image = OpenedPicture.of(source.picture()).image(torch.zeros(1))[0]
         file = None if source.file is None else str(source.file)
         prediction = GazePrediction.of(self.detector, image, model=self.model, source=file)
-        paths = prediction.scanpaths(self.options.people, seconds=self.options.seconds, seed=self.options.seed)
+        paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
+        outcome: _Outcome = {
+            "text": self._text(source.name, prediction, paths),
+            "size": prediction.size,
+            "viewers": [[path.subject, path.points.tolist(), np.asarray(path.durations).tolist()] for path in paths],
+            "part": None if options.report is None else gaze_part(prediction, paths),
+        }
+        if options.out is not None and self.kind != ".csv":
+            outcome["density"] = str(prediction.save_density(self._density_path(options.out, number, prediction)))
+        self.outcomes[number] = outcome
+
+    def _text(self, name: str, prediction: GazePrediction, paths: Sequence[Fixations]) -> str:
+        """Say what is known of a prediction and the viewers that are drawn from it."""
         places = "; ".join(
             f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %"
             for number, peak in enumerate(prediction.peaks(), 1)
         )
         terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
         mean = sum(map(len, paths)) / len(paths)
-        text = (
-            f"{source.name}: {prediction.describe()}\n  places: {places}\n  added by each term, in bits: {terms}\n"
-            f"  {len(paths)} viewers drawn, {mean:.1f} fixations each"
-        )
+        lines = [
+            f"{name}: {prediction.describe()}",
+            f"  places: {places}",
+            f"  added by each term, in bits: {terms}",
+            f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
+        ]
         width, height = prediction.size
         if self.options.model is None and width <= height:
-            text += "\n  the model was fitted to pictures that are wider than high, and may be wrong here"
-        viewers = [[each.subject, each.points.tolist(), np.asarray(each.durations).tolist()] for each in paths]
-        part = None if self.options.report is None else gaze_part(prediction, paths)
-        outcome: _Outcome = {"text": text, "size": prediction.size, "viewers": viewers, "part": part}
-        if out is not None and self.kind != ".csv":
-            name = f"{plain_name(Path(prediction.name).stem)}.png"
-            name = f"{number:03d}-{name}" if self.several else name
-            outcome["density"] = str(prediction.save_density(out if self.kind else out / name))
-        self.outcomes[number] = outcome
+            lines.append("  the model was fitted to pictures that are wider than high, and may be wrong here")
+        return "\n".join(lines)
+
+    def _density_path(self, out: Path, number: int, prediction: GazePrediction) -> Path:
+        """Name the file of a density: the one that is given, or one in the folder, numbered if there are several."""
+        if self.kind:
+            return out
+        name = f"{plain_name(Path(prediction.name).stem)}.png"
+        return out / (f"{number:03d}-{name}" if self.several else name)
 
     def keep(self, number: int) -> None:
         """Keep what was predicted of a picture for the same command, until all pictures are looked at."""
@@ -109,50 +143,78 @@ class _GazeJob:
 
     def write(self, *, complete: bool) -> None:
         """Write scanpaths and page of the pictures so far, and list all files."""
-        outcomes = [self.outcomes[number] for number in sorted(self.outcomes)]
-        written = [Path(each["density"]) for each in outcomes if "density" in each]
-        # As in the folder, or where two pictures would then have one name, as they were named.
-        names = [Path(source.name).name for source in self.sources]
-        count = Counter(name.lower() for name in names)
-        named = zip(names, self.sources, strict=True)
-        names = [name if count[name.lower()] == 1 else source.name for name, source in named]
+        outcomes = dict(sorted(self.outcomes.items()))
+        written: list[object] = [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
+        names = self._names()
         if self.table is not None and outcomes:
-            paths = [
-                Fixations(names[number], subject, np.array(points), tuple(each["size"]), np.array(durations))
-                for number, each in sorted(self.outcomes.items())
-                for subject, points, durations in each["viewers"]
-            ]
-            write_table(self.table, paths)
+            write_table(
+                self.table,
+                [path for number, outcome in outcomes.items() for path in _fixations(names[number], outcome)],
+            )
             written.insert(0, self.table)
         if self.options.report is not None and outcomes:
-            parts = [each["part"] for each in outcomes]
-            for number, part in zip(sorted(self.outcomes), parts, strict=True):
-                part["picture"]["name"] = names[number]
+            for number, outcome in outcomes.items():
+                outcome["part"]["picture"]["name"] = names[number]
+            parts = [outcome["part"] for outcome in outcomes.values()]
             written.append(write_html(self.options.report, gaze_page_html("semfov: where people look", parts)))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
 
+    def _names(self) -> list[str]:
+        """Name the pictures as in their folder, or as they were named where two would have the same."""
+        names = [Path(source.name).name for source in self.sources]
+        count = Counter(name.lower() for name in names)
+        return [
+            name if count[name.lower()] == 1 else source.name for name, source in zip(names, self.sources, strict=True)
+        ]
+
+
+def _kind_of_output(out: Path | None, *, several: bool) -> str:
+    """Find the end of the name of the file that is written; empty for a folder or nothing."""
+    kind = "" if out is None or out.is_dir() else out.suffix.lower()
+    check(kind in ("", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", out)
+    check(kind not in _DENSITIES or not several, "out", "a .csv file or a folder for several pictures", out)
+    return kind
+
+
+def _table_of(out: Path | None, kind: str) -> Path | None:
+    """Name the file of the scanpaths; None where none are written."""
+    if out is None or kind in _DENSITIES:
+        return None
+    return out if kind else out / "scanpaths.csv"
+
+
+def _fixations(name: str, outcome: _Outcome) -> list[Fixations]:
+    """Make the scanpaths of the viewers that were drawn for a picture."""
+    size = tuple(outcome["size"])
+    return [
+        Fixations(name, subject, np.array(points), size, np.array(durations))
+        for subject, points, durations in outcome["viewers"]
+    ]
+
 
 def _look_at_pictures(job: _GazeJob) -> int:
-    """Predict where people look; no other command writes the same files meanwhile."""
+    """Predict where people look in the pictures that are left; a command that is stopped has written those so far."""
     options = job.options
-    sources, outcomes = job.sources, job.outcomes
-    if outcomes:
-        print(f"continuing: {len(outcomes)} of {len(sources)} pictures were looked at before")
-    left, complete = [number for number in range(len(sources)) if number not in outcomes], False
+    sources = job.sources
+    if job.outcomes:
+        print(f"continuing: {len(job.outcomes)} of {len(sources)} pictures were looked at before")
+    numbers = [number for number in range(len(sources)) if number not in job.outcomes]
     hidden = not job.several or options.quiet or not sys.stderr.isatty()
+    complete = False
     try:
-        for number in tqdm(left, unit="picture", leave=False, disable=hidden):
+        for number in tqdm(numbers, unit="picture", leave=False, disable=hidden):
             try:
                 job.look(number)
             except Exception as error:
+                # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
                 fault = sources[number].fault(error, several=job.several)
                 if not job.several:
                     raise
                 tqdm.write(f"skipped {sources[number].name}: {fault}", file=sys.stderr)
             else:
                 job.keep(number)
-                tqdm.write(outcomes[number]["text"], file=sys.stdout)
+                tqdm.write(job.outcomes[number]["text"], file=sys.stdout)
         complete = True
-    finally:  # a command that is stopped has written the pictures so far
+    finally:
         job.write(complete=complete)
-    return 1 if len(outcomes) < len(sources) else 0
+    return int(len(job.outcomes) < len(sources))

@@ -14,48 +14,41 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from semfov.cli.help import HELP
+from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
 from semfov.words import OPTIONS, meant_options
 
-_PICTURES = ("pictures", "photographs, large pictures, or folders of them (none: one that comes with semfov)")
-_DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
-
-_SUBCOMMANDS: dict[str, tuple[tuple[str, str], str, str]] = {
-    "search": (_PICTURES, "cli.options:SearchOptions", "cli.search:look_at"),
-    "find": (_PICTURES, "cli.options:FindOptions", "cli.search:look_at"),
-    "explore": (_PICTURES, "cli.options:ExploreOptions", "cli.search:look_at"),
-    "live": (("source", "video file, or address"), "cli.options:LiveOptions", "cli.live:look_live"),
-    "gaze": (_PICTURES, "cli.options:GazeOptions", "cli.gaze:predict_gaze"),
-    "check": (("files", "files of fixations"), "cli.options:CheckOptions", "cli.fixations:check_fixations"),
-    "fit": (("model", _DETECTOR), "fit.settings:FitDetectorConfig", "fit.detector:fit_folder"),
-    "app": (("detector", _DETECTOR), "cli.options:AppOptions", "cli.app:serve"),
-    "detectors": (("name", "detector, or folder of models"), "cli.options:DetectorsOptions", "cli.detectors:show"),
-}
-"""The positional argument of each subcommand with its text, its options, and what it calls."""
-
-_LOOKING = "search", "find", "explore", "live"
+_LOOKING = tuple(name for name, command in SUBCOMMANDS.items() if command.looking)
+"""Subcommands that look at pictures or frames."""
 
 
 def _options_of(name: str) -> type[Any]:
-    """The options of a subcommand, imported when they are asked for: help and mistakes need no tensors."""
-    return resolve_name(f"semfov.{_SUBCOMMANDS[name][1]}")
+    """Import the options of a subcommand when they are asked for: help and mistakes need no tensors."""
+    return resolve_name(f"semfov.{SUBCOMMANDS[name].options}")
 
 
 def _run(name: str, options: Any) -> int | None:
     """Run a subcommand, without its texts if it is to be quiet, or with them beside results in standard output."""
-    stream, beside = sys.stdout, str(getattr(options, "out", None)) == "-"
+    command = SUBCOMMANDS[name]
+    stream = sys.stdout
+    texts = sys.stderr if str(getattr(options, "out", None)) == "-" else stream
     with ExitStack() as stack:
         nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
-        quiet = getattr(options, "quiet", False)
-        stack.enter_context(redirect_stdout(nowhere if quiet else sys.stderr if beside else stream))
+        stack.enter_context(redirect_stdout(nowhere if getattr(options, "quiet", False) else texts))
         # What it needs is imported now.
-        run: Callable[..., int | None] = resolve_name(f"semfov.{_SUBCOMMANDS[name][2]}")
-        return run(options, stream) if name in ("search", "find", "explore") else run(options)
+        run: Callable[..., int | None] = resolve_name(f"semfov.{command.function}")
+        return run(options, stream) if command.writes_rows else run(options)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command."""
+    """Run the command.
+
+    Args:
+        arguments: the words after `semfov`; None for those of this process.
+
+    Returns:
+        The exit code.
+    """
     command_line = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, TextIOWrapper):
         # Files of Windows may have another encoding, without the signs of a text or the letters of a picture's name.
@@ -67,33 +60,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if text is not None:
         print(text, end="")
         return 0
-    refused = _of_others(name, rest) if name in _SUBCOMMANDS else _unknown(name)
+    refused = _of_others(name, rest) if name in SUBCOMMANDS else _unknown(name)
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
         return 2
     from semfov.runs.command import make_parser, run_command
 
-    options, positional, program = _options_of(name), _SUBCOMMANDS[name][0], f"semfov {name}"
+    options = _options_of(name)
+    command = SUBCOMMANDS[name]
+    positional = (command.positional, command.positional_help)
+    program = f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
-        make_parser(options, HELP[name].partition("\nusage:")[0], positional, program).print_help()
+        make_parser(options, command.help.partition("\nusage:")[0], positional, program).print_help()
         return 0
     words = partial(_in_command_words, options=_told_options(name))
     names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": name == "fit"}
     with warnings.catch_warnings():  # each is one line in the words of the command, without the place in the code
         warnings.showwarning = lambda message, *_, **__: print(f"warning: {words(str(message))}", file=sys.stderr)
-        return run_command(partial(_run, name), options, HELP[name], rest, words=words, **names)
+        return run_command(partial(_run, name), options, command.help, rest, words=words, **names)
 
 
 def _text(name: str, rest: Sequence[str]) -> str | None:
-    """The text of a command line that asks for one: the version, help, or the script of a shell."""
+    """Find the text of a command line that asks for one: the version, help, or the script of a shell."""
     if name in ("--version", "-V", "version"):
         return f"semfov {__version__}\n"
     if name in ("--help", "-h", "--help-all"):
-        return HELP["semfov"]
-    if name in _SUBCOMMANDS and ("--help" in rest or "-h" in rest):
-        return HELP[name]
+        return OVERVIEW
+    if name in SUBCOMMANDS and ("--help" in rest or "-h" in rest):
+        return SUBCOMMANDS[name].help
     if name == "completion":
-        return _completion(rest[0] if rest else None, {each: _option_names(each) for each in _SUBCOMMANDS})
+        return _completion(rest[0] if rest else None, {command: _option_names(command) for command in SUBCOMMANDS})
     return None
 
 
@@ -118,67 +114,80 @@ complete -c semfov -n __fish_use_subcommand -a "{commands}"
 
 
 def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
-    """The script with which a shell completes the command, from the options of each subcommand."""
+    """Write the script with which a shell completes the command, from the options of each subcommand."""
     script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
     if script is None:
         return "usage: semfov completion bash|zsh|fish, for example: semfov completion bash >> ~/.bashrc\n"
-    named = {name: [each.replace("_", "-") for each in several] for name, several in options.items()}
-    cases = "\n".join(f'    {name}) words="{" ".join(f"--{each}" for each in some)}";;' for name, some in named.items())
-    lines = "\n".join(
-        f'complete -c semfov -n "__fish_seen_subcommand_from {name}" -l {each}'
-        for name, some in named.items()
-        for each in some
-    )
+    cases = []
+    lines = []
+    for command, names in options.items():
+        words = [name.replace("_", "-") for name in names]
+        cases.append(f'    {command}) words="{" ".join(f"--{word}" for word in words)}";;')
+        lines += [f'complete -c semfov -n "__fish_seen_subcommand_from {command}" -l {word}' for word in words]
     start = "autoload -Uz compinit bashcompinit && compinit && bashcompinit\n" if shell == "zsh" else ""
-    return start + script.format(cases=cases, commands=" ".join(named), lines=lines)
+    return start + script.format(cases="\n".join(cases), commands=" ".join(options), lines="\n".join(lines))
 
 
 def _unknown(name: str) -> str:
-    """What to type instead of a name that is no subcommand."""
+    """Say what to type instead of a name that is no subcommand."""
     if Path(name).exists():
         return f"expected a command before {name!r}; try `semfov search {name} --target CLASS`"
     if name.startswith("-"):
-        return f"expected a command before {name}: {', '.join(_SUBCOMMANDS)}"
-    near = get_close_matches(name, _SUBCOMMANDS, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(_SUBCOMMANDS)}"
+        return f"expected a command before {name}: {', '.join(SUBCOMMANDS)}"
+    matches = get_close_matches(name, SUBCOMMANDS, n=1)
+    hint = f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(SUBCOMMANDS)}"
     return f"unknown command {name!r}; {hint}"
 
 
 def _option_names(name: str) -> list[str]:
     """Names of the options of a subcommand, without the positional one."""
     options = _options_of(name)
-    names = [field.name for field in fields(options) if field.name not in (_SUBCOMMANDS[name][0][0], *options.unused)]
-    return [each.rstrip("_") for each in names]  # `try_` is --try
+    names = [
+        field.name for field in fields(options) if field.name not in (SUBCOMMANDS[name].positional, *options.unused)
+    ]
+    return [name.rstrip("_") for name in names]  # `try_` is --try
 
 
 def _told_options(name: str) -> list[str]:
-    """Names of the options that messages may name; those of `semfov fit` for a detector are dotted."""
-    own = [field.name for field in fields(_options_of(name))]
+    """List the options that messages may name; those of `semfov fit` for a detector are dotted."""
+    names = [field.name for field in fields(_options_of(name))]
     if name != "fit":
-        return own
+        return names
     detector = resolve_name("semfov.runs.config:DetectorConfig")
-    return [*(f"detector.{field.name}" for field in fields(detector) if field.name not in own), *own]
+    return [*(f"detector.{field.name}" for field in fields(detector) if field.name not in names), *names]
 
 
-def _of_others(own: str, rest: Sequence[str]) -> str | None:
-    """What to say about an option that other subcommands or other programs have; None if there is none."""
-    names = {each: set(_option_names(each)) for each in (*_LOOKING, own)}
-    first = _SUBCOMMANDS[own][0][0]
-    singular = first.removesuffix("s")
-    for word in rest:
+def _of_others(command: str, words: Sequence[str]) -> str | None:
+    """Say what is wrong with an option that other subcommands or other programs have; None if there is none."""
+    for word in words:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
-        whole = (own, option) == ("fit", "detector")  # its parts are options, detector.name and others
-        asked = {option, option.removesuffix("s"), *OPTIONS.get(option, "").split()}
-        if whole or (option and option not in names[own] and asked & {first, singular}):
-            return f"unknown option --{option}; the {singular} has no option before it: semfov {own} {singular.upper()}"
-        if own not in (*_LOOKING, "gaze"):
-            continue
-        meant = next(iter(meant_options(option, names[own])), None)
-        if meant is not None and option not in names[own]:
-            return f"unknown option --{option.replace('_', '-')}; did you mean --{meant.replace('_', '-')}?"
-        having = [each for each in _LOOKING if option in names[each] - names[own]]
-        if having:
-            return f"unknown option --{option.replace('_', '-')}; it is one of `semfov {'` and `semfov '.join(having)}`"
+        refusal = _refusal(command, option)
+        if refusal is not None:
+            return refusal
+    return None
+
+
+def _refusal(command: str, option: str) -> str | None:
+    """Say what is wrong with one option of a subcommand; None where the parser says it, or nothing is wrong."""
+    names = {name: set(_option_names(name)) for name in (*_LOOKING, command)}
+    positional = SUBCOMMANDS[command].positional
+    singular = positional.removesuffix("s")
+    is_unknown = bool(option) and option not in names[command]
+    meanings = {option, option.removesuffix("s"), *OPTIONS.get(option, "").split()}
+    # The parts of the detector are options of `semfov fit`: detector.name and others.
+    is_whole_detector = (command, option) == ("fit", "detector")
+    if is_whole_detector or (is_unknown and meanings & {positional, singular}):
+        usage = f"semfov {command} {singular.upper()}"
+        return f"unknown option --{option}; the {singular} has no option before it: {usage}"
+    if command not in (*_LOOKING, "gaze") or not is_unknown:
+        return None
+    dashed = option.replace("_", "-")
+    meant = next(iter(meant_options(option, names[command])), None)
+    if meant is not None:
+        return f"unknown option --{dashed}; did you mean --{meant.replace('_', '-')}?"
+    having = [name for name in _LOOKING if option in names[name]]
+    if having:
+        return f"unknown option --{dashed}; it is one of `semfov {'` and `semfov '.join(having)}`"
     return None
 
 

@@ -1,25 +1,30 @@
-"""Options of the subcommands: dataclasses with the names that they have in Python."""
+"""Options of the subcommands: dataclasses with the names that they have in Python.
+
+Those of a task are its settings (`semfov.settings`), with their names, types and help, and what a command adds: the
+agent, the pictures and the files that are written.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from semfov.agents.episode import MOST_PASSES
-from semfov.agents.picture import How
 from semfov.data.tone import White
 from semfov.errors import InputError
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Weight, Whole, Workers
+from semfov.io.ranges import Count, Range, Seed, Whole, Workers
+from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
-
-Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]  # figures that can be drawn of an episode
+from semfov.settings import (
+    Drawing,
+    ExploreSettings,
+    FindSettings,
+    LookSettings,
+    SearchSettings,
+    StartSettings,
+    StreamSettings,
+)
 
 ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 """Figures that are drawn unless others are named."""
-
-OF_ANY_LOOK: tuple[Drawing, ...] = ("scanpath", "animation")
-"""Figures of looks of any kind; the others are of a fovea, and `belief_bars` of a search."""
-
-_MostCloserLooks = Annotated[int, Range(0, 100)]  # largest number of closer looks
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,8 @@ class DetectorOptions(Settings):
 
 
 @dataclass(frozen=True)
-class AgentOptions(DetectorOptions):
-    """The agent.
+class AgentOptions(StartSettings, DetectorOptions):
+    """The agent, and where it starts.
 
     Args:
         agent: `recommended` (learned models, if they are shipped for the detector), `published` (the paper's:
@@ -65,8 +70,6 @@ class AgentOptions(DetectorOptions):
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
         half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
-        start: first cell of a fovea, as `column,row` or as its number row by row (none: drawn at random).
-        seed: seed of the random start and of ties.
         quiet: print errors and warnings alone.
     """
 
@@ -74,24 +77,16 @@ class AgentOptions(DetectorOptions):
     models: Path | None = None
     half: bool = False
     sensor: SensorName | None = None
-    start: str | None = None
-    seed: Seed = 0
     quiet: bool = False
 
 
 @dataclass(frozen=True)
-class PictureOptions(AgentOptions):
+class PictureOptions(LookSettings, AgentOptions):
     """Looks at pictures, and what is written of them.
 
     Args:
         pictures: photographs, large pictures, folders of them, or patterns of names (none: one that comes with semfov).
         recursive: also take the photographs of the folders in a folder.
-        how: kind of look: `fovea`, `windows`, `head` (in a panorama, which is twice as wide as high, or another picture
-            in front of the viewer), or `auto` for what suits the picture.
-        passes: largest number of passes of the detector, closer looks included (none: 24 for windows, 40 for a head).
-        shifts: largest number of gaze shifts of a fovea (none: 30 for a search, 20 otherwise, without limit of passes).
-        seconds: longest time in seconds for each picture on this machine.
-        duration: longest time in seconds that eye and head move in a scene (none: 30).
         white: values that are black and white in thermal pictures, reflectances or 12 bits: the white, `4095`, both as
             `300,3000`, or `auto` for percentiles (none: 0 and the largest value of 8 or 16 bits).
         bands: bands of a TIFF or a raster that are red, green and blue, as `4,3,2`, or one as grey (none: those that
@@ -112,13 +107,10 @@ class PictureOptions(AgentOptions):
         scheduler: address of a Dask scheduler whose workers do the work instead (docs/guides/cluster.md).
     """
 
+    unused: ClassVar[tuple[str, ...]] = ("on_look",)
+
     pictures: tuple[str, ...] = ()
     recursive: bool = False
-    how: How = "auto"
-    passes: Annotated[int, Range(1, MOST_PASSES)] | None = None
-    shifts: Shifts | None = None
-    seconds: Positive | None = None
-    duration: Positive | None = None
     white: str | None = None
     bands: str | None = None
     out: Path | None = None
@@ -133,66 +125,41 @@ class PictureOptions(AgentOptions):
 
 
 @dataclass(frozen=True)
-class SearchOptions(PictureOptions):
+class SearchOptions(SearchSettings, PictureOptions):
     """Search pictures for a class.
 
     Args:
         target: class to search for.
         embeddings: file of word vectors (text format of GloVe or word2vec); a target that is not a class of the
             detector is then spread over the classes closest in meaning.
-        confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
-            in the picture for a search without closer looks (none: the value chosen when the model was fitted; for
-            agents without a fitted belief, a detection's score of 0.5).
-        give_up: probability of the target below which a look is not worth a pass (none: the value chosen when the
-            belief was fitted).
-        closer: largest number of closer looks, in which a window around a place that seems to hold the target is
-            enlarged to the detector's input; 0: none. Each takes one of the passes.
-        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (none: half of them).
     """
+
+    unused: ClassVar[tuple[str, ...]] = ("on_look", "boxes")
 
     target: str | None = None
     embeddings: Path | None = None
-    confirm: Share | None = None
-    give_up: Share | None = None
-    closer: _MostCloserLooks | None = None
-    prior: Share | None = None
 
 
 @dataclass(frozen=True)
-class FindOptions(PictureOptions):
+class FindOptions(FindSettings, PictureOptions):
     """Find all objects.
 
     Args:
         target: class to find, or several with commas (none: all classes).
-        worth: a look is worth a pass if it is expected to show this many new objects (none: 0.01).
-        least: score from which on an object counts, in windows its probability or its score in the whole picture
-            (none: 0.5 there).
-        batch: number of windows that are looked at together.
     """
 
     target: str | None = None
-    worth: Weight | None = None
-    least: Share | None = None
-    batch: Count = 1
 
 
 @dataclass(frozen=True)
-class ExploreOptions(PictureOptions):
-    """Explore pictures.
+class ExploreOptions(ExploreSettings, PictureOptions):
+    """Explore pictures."""
 
-    Args:
-        worth: least expected gain of a look: cells that are named right with a learned map (none: 0.1), or in a large
-            picture new objects (none: 0.01); 0 makes all looks.
-        least: score from which on an object counts, in windows its probability or its score in the whole picture
-            (none: 0.5 there).
-    """
-
-    worth: Weight | None = None
-    least: Share | None = None
+    unused: ClassVar[tuple[str, ...]] = ("on_look", "policy")
 
 
 @dataclass(frozen=True)
-class LiveOptions(AgentOptions):
+class LiveOptions(StreamSettings, AgentOptions):
     """Look at a video, a camera or a network stream.
 
     Args:
@@ -200,32 +167,19 @@ class LiveOptions(AgentOptions):
         camera: number of a camera.
         target: class to search for (none: explore).
         find: class of which all objects are to be found, or several with commas, in place of a target.
-        how: kind of look: `fovea`, `windows`, or `auto`: windows, or a fovea where frames are small and the agent has
-            no evidence for photographs or `start` is given.
         frames: number of frames to look at (none: all of them; a camera until Ctrl-C).
-        rate: rate at which evidence fades, per second; 0: never (none: 2.5 for a fovea, 0.75 for windows).
-        confirm: the target is found from this probability on, with closer looks that of its place (none: that of the
-            model).
-        give_up: probability of the target below which a look is not worth a frame (none: that of the belief).
-        closer: largest number of closer looks in the time until half of the evidence has faded (none: 2 for a fovea, 3
-            for windows of small frames, as many as there are frames for those of large ones); 0: none.
-        prior: how often the target is there: the share of the frames that hold it (none: half of them).
         white: values that are black and white, as for `semfov search`, such as of a thermal camera of 16 bits.
         out: video to write, `.mp4` or `.avi`, or a folder for it, with gaze and belief, or windows and objects, drawn
             into each frame.
     """
 
+    unused: ClassVar[tuple[str, ...]] = ("color",)
+
     source: str | None = None
     camera: Whole | None = None
     target: str | None = None
     find: str | None = None
-    how: How = "auto"
     frames: Count | None = None
-    rate: Annotated[float, Range(0, 100)] | None = None
-    confirm: Share | None = None
-    give_up: Share | None = None
-    closer: _MostCloserLooks | None = None
-    prior: Share | None = None
     white: str | None = None
     out: Path | None = None
 
@@ -273,7 +227,7 @@ class AppOptions(AgentOptions):
         port: its port (none: the first free one from 7860 on).
     """
 
-    unused = ("seed", "start")
+    unused: ClassVar[tuple[str, ...]] = ("seed", "start")
 
     host: str = "127.0.0.1"
     port: Annotated[int, Range(1, 65_535)] | None = None
@@ -313,27 +267,14 @@ class DetectorsOptions(DetectorOptions):
         try_: photograph in which to compare what the bare detector shows with what semfov lists.
     """
 
-    unused = ("detector",)
+    unused: ClassVar[tuple[str, ...]] = ("detector",)
 
     name: Path | None = None
     try_: Path | None = None
 
 
-def start_of(text: str | None) -> int | tuple[int, int] | None:
-    """The first cell as a number, or as column and row."""
-    if text is None:
-        return None
-    try:
-        numbers = [int(word) for word in text.strip("()[] ").split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (1, 2) or min(numbers) < 0:
-        raise InputError(f"start: expected a cell as column,row (5,5) or as its number (47), got {text!r}")
-    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
-
-
 def white_of(text: str | None) -> White | None:
-    """The values that are black and white."""
+    """Read the values that are black and white."""
     if text is None:
         return None
     try:

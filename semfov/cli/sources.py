@@ -6,25 +6,40 @@ from collections.abc import Mapping, Sequence
 from glob import glob
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
-from semfov.agents.picture import How, PictureLike
+from torch import Tensor
+
+from semfov.agents.picture import PictureLike
 from semfov.cli.options import GazeOptions, PictureOptions, white_of
 from semfov.data.examples import example_scene
+from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large, picture_size
 from semfov.data.scenes import CLASSES
 from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
+from semfov.data.windowed import LargePicture
 from semfov.errors import DataError, InputError, SemfovError, check, printable
 from semfov.head import Flat, Panorama
 from semfov.io.files import disk_is_full
+from semfov.settings import How
 
 _DEBUG = "SEMFOV_DEBUG"  # variable of the environment that also prints where in the code a picture has failed
+
+FlatPicture = str | Tensor | LargePicture  # a picture that is no scene: a file, pixels, or one that is open
 
 _EXAMPLE = "example:"  # before the name of a picture that comes with the package
 
 
 class PictureSource(NamedTuple):
-    """A picture to look at: `place` is its path in the folder that was named, `shown` are arguments of `open_large`."""
+    """A picture to look at, which is opened when it is looked at.
+
+    Attributes:
+        name: name of the picture, as results have it.
+        file: its file; None for a picture that comes with the package.
+        scene: the picture that comes with the package; None for a file.
+        place: path in the folder that was named.
+        shown: the values and the bands that are shown, as arguments of `open_large`.
+    """
 
     name: str
     file: Path | None = None
@@ -32,18 +47,29 @@ class PictureSource(NamedTuple):
     place: Path = Path("example")
     shown: Mapping[str, Any] = MappingProxyType({})
 
+    def picture(self) -> FlatPicture:
+        """Open the picture, with the values and bands that are to be shown."""
+        picture = str(self.file) if self.scene is None else self.scene.image
+        return open_large(picture, **self.shown) if self.shown else picture
+
     def opened(self, how: How) -> PictureLike:
-        """The picture, with the values and bands that are to be shown, or for a head the scene that it is one of."""
-        picture: Any = str(self.file) if self.scene is None else self.scene.image
-        if self.shown:
-            picture = open_large(picture, **self.shown)
+        """Open the picture for a kind of look: for a head it is the scene in front of the viewer, or a panorama.
+
+        Args:
+            how: kind of look, or `auto`.
+
+        Returns:
+            The picture, or the scene that it shows.
+        """
+        picture = self.picture()
         if how != "head":
             return picture
         width, height = picture_size(picture)
-        return Panorama(picture) if width == 2 * height else Flat(picture)
+        pixels = cast(ImageLike, picture)  # scenes take pictures that are open, too
+        return Panorama(pixels) if width == 2 * height else Flat(pixels)
 
     def version(self) -> list[object]:
-        """What changes with the file: its name, size and time of change."""
+        """List what changes with the file: its name, size and time of change."""
         if self.file is None:
             return [self.name]
         try:
@@ -53,7 +79,19 @@ class PictureSource(NamedTuple):
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
 
     def fault(self, error: Exception, *, several: bool) -> SemfovError:
-        """Return what is wrong with this picture, which is not the end of `several`; raise what ends a command."""
+        """Say what is wrong with this picture.
+
+        Args:
+            error: what was raised when it was looked at.
+            several: whether other pictures can still be looked at.
+
+        Returns:
+            The error of this picture.
+
+        Raises:
+            DataError: the disk is full, which ends the command.
+            Exception: a fault of the code, at a single picture.
+        """
         if os.environ.get(_DEBUG):
             traceback.print_exception(error)
         if disk_is_full(error):
@@ -67,49 +105,79 @@ class PictureSource(NamedTuple):
 
 
 def example_source(name: str, classes: Sequence[str] = CLASSES, target: str | None = None) -> PictureSource:
-    """A picture that comes with the package, with the boxes of a target."""
+    """Take a picture that comes with the package, with the boxes of a target.
+
+    Args:
+        name: name of the picture.
+        classes: names of the classes, of which the boxes have their labels.
+        target: class whose boxes it has; None for no boxes.
+
+    Returns:
+        The picture.
+    """
     scene = example_scene(name, classes)
     boxes = None if target is None else scene.boxes[scene.labels == [*classes].index(target) + 1]
     return PictureSource(f"{_EXAMPLE}{name}", scene=Picture(name, scene.image, boxes), place=Path(name))
 
 
 def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
-    """The pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names."""
+    """Find the pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names.
+
+    Args:
+        options: the options of a command.
+
+    Returns:
+        The pictures, each once.
+
+    Raises:
+        InputError: there is no such file or folder, or it is no picture.
+    """
     sources: dict[str, PictureSource] = {}
-    pictures, shown = options.pictures, _shown_by(options)
-    # A file may have brackets in its name, as copies do: photo[1].jpg.
-    patterns = (name if set(name) & set("*?[") and not os.path.lexists(name) else None for name in pictures)
-    matched = ([] if pattern is None else sorted(glob(pattern, recursive=True)) for pattern in patterns)
-    names = [each for one, some in zip(pictures, matched, strict=True) for each in some or [one]]
-    # What a shell makes of `flight/*` is what is in a folder.
-    kept = {*photographs([Path(name) for name in names], "pictures")} if len(names) > 1 else set()
-    for name in [name for name in names if Path(name) in kept] or names:
+    shown = _shown_by(options)
+    names = [name for word in options.pictures for name in _matching(word)]
+    # What a shell makes of `flight/*` is what is in a folder, where other files than photographs are left out.
+    photos = {*photographs([Path(name) for name in names], "pictures")} if len(names) > 1 else set()
+    for name in [name for name in names if Path(name) in photos] or names:
         if name.startswith(_EXAMPLE):
             sources.setdefault(name, example_source(name.removeprefix(_EXAMPLE)))
             continue
+        _check_may_be_picture(name, has_target=hasattr(options, "target"))
         path = Path(name)
-        check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
-        there = path.exists() or bool(path.suffix) or len(path.parts) > 1
-        of_class = f" (a class is given by --target {name})" if hasattr(options, "target") else ""
-        check(there, "picture", f"a file or folder{of_class}", f"{name}, which does not exist")
-        video = path.suffix.lower() in VIDEOS and not path.is_dir()
-        check(not video, "picture", "photographs; `semfov live` takes videos", name)
-        for each in picture_files(path, recursive=options.recursive):
-            place = each.relative_to(path) if path.is_dir() else Path(each.name)
-            source = PictureSource(printable(str(each)), each, place=place, shown=shown)
+        for file in picture_files(path, recursive=options.recursive):
+            place = file.relative_to(path) if path.is_dir() else Path(file.name)
+            source = PictureSource(printable(str(file)), file, place=place, shown=shown)
             # A picture that is named twice, such as by its name and by its folder, is looked at once.
-            sources.setdefault(os.path.abspath(each), source)
+            sources.setdefault(os.path.abspath(file), source)
     return [*sources.values()]
 
 
+def _matching(word: str) -> list[str]:
+    """Find the files that match a pattern; what is none, or matches nothing, stands for itself."""
+    # A file may have brackets in its name, as copies do: photo[1].jpg.
+    is_pattern = bool(set(word) & set("*?[")) and not os.path.lexists(word)
+    return (sorted(glob(word, recursive=True)) if is_pattern else []) or [word]
+
+
+def _check_may_be_picture(name: str, *, has_target: bool) -> None:
+    """Raise `InputError` for what cannot be a picture: an address, a word that is no file, or a video."""
+    path = Path(name)
+    check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
+    looks_like_file = path.exists() or bool(path.suffix) or len(path.parts) > 1
+    of_class = f" (a class is given by --target {name})" if has_target else ""
+    check(looks_like_file, "picture", f"a file or folder{of_class}", f"{name}, which does not exist")
+    is_video = path.suffix.lower() in VIDEOS and not path.is_dir()
+    check(not is_video, "picture", "photographs; `semfov live` takes videos", name)
+
+
 def _shown_by(options: PictureOptions | GazeOptions) -> dict[str, Any]:
-    """The values and the bands that are shown, as `semfov.data.large.open_large` takes them; those that are given."""
+    """Take the values and the bands that are to be shown, as arguments of `semfov.data.large.open_large`."""
+    shown: dict[str, Any] = {}
     white = white_of(options.white)
-    shown: dict[str, Any] = {} if white is None else {"white": white}
+    if white is not None:
+        shown["white"] = white
     if options.bands is not None:
         try:
-            numbers = tuple(int(each) for each in options.bands.split(","))
+            shown["bands"] = tuple(int(number) for number in options.bands.split(","))
         except ValueError:
             raise InputError(f"bands: expected 4,3,2 or the number of one band, got {options.bands!r}") from None
-        shown["bands"] = numbers
     return shown

@@ -34,29 +34,47 @@ class Trial:
     @classmethod
     @torch.inference_mode()
     def of(cls, agent: ActivePerception, photo: Path) -> "Trial":
-        """Run the bare detector: its best class of each box, and non-maximum suppression."""
-        eye, detector = agent.zoom.eye, agent.eye.detector
+        """Run the bare detector: its best class of each box, and non-maximum suppression.
+
+        Args:
+            agent: the agent, whose detector is run.
+            photo: the photograph.
+
+        Returns:
+            What the detector shows.
+        """
+        eye = agent.zoom.eye
+        detector = agent.eye.detector
         view = eye.open(photo)
         canvas, frames = eye.glimpse(view, torch.tensor([Window.overview(view.lattice).fixation]))
         proposals = detector.propose(canvas).precise()
-        confidence, labels = proposals.confidence[0], proposals.classes[0].argmax(-1)
-        sure = (confidence >= LEAST).nonzero()[:, 0]
-        boxes = proposals.boxes[0, sure]
-        kept = suppress(boxes, confidence[sure], labels[sure], detector.selection)
-        low, high, first, last = frames[0].view(4, 2).repeat(1, 2).unbind()
-        placed = ((boxes[kept] - first) * (high - low) / (last - first) + low).clamp(low, high)
-        return cls(placed, confidence[sure][kept], labels[sure][kept] + 1, proposals)
+        confidence = proposals.confidence[0]
+        labels = proposals.classes[0].argmax(-1)
+        confident = (confidence >= LEAST).nonzero()[:, 0]
+        boxes = proposals.boxes[0, confident]
+        chosen = suppress(boxes, confidence[confident], labels[confident], detector.selection)
+        # From the canvas, where the photograph lies between two corners, to its pixels.
+        first_pixel, last_pixel, first, last = frames[0].view(4, 2).repeat(1, 2).unbind()
+        placed = (boxes[chosen] - first) * (last_pixel - first_pixel) / (last - first) + first_pixel
+        placed = placed.clamp(first_pixel, last_pixel)
+        return cls(placed, confidence[confident][chosen], labels[confident][chosen] + 1, proposals)
 
 
 def try_detector(agent: ActivePerception, photo: Path) -> None:
-    """Print what a detector shows in a photograph beside what semfov lists after one look, and what may be lost."""
-    detector, bare = agent.eye.detector, Trial.of(agent, photo)
+    """Print what a detector shows in a photograph beside what semfov lists after one look, and what may be lost.
+
+    Args:
+        agent: the agent of the detector.
+        photo: the photograph.
+    """
+    detector = agent.eye.detector
+    bare = Trial.of(agent, photo)
     record = agent.find_all(photo, how="windows", passes=1, least=LEAST)
     rows = _rows(bare, record.objects, agent.classes)
-    both = sum("-" not in row[1:3] for row in rows)
+    listed = sum("-" not in row[1:3] for row in rows)
     print(f"{detector.name}: {_settings(detector)}")
     print(
-        f"{photo.name}: the bare detector shows {len(bare.scores)} from {LEAST:g} on, and semfov lists {both} of them"
+        f"{photo.name}: the bare detector shows {len(bare.scores)} from {LEAST:g} on, and semfov lists {listed} of them"
     )
     if rows:
         print("\n".join(table_lines([["class", "bare", record.words.measure, "box"], *rows])))
@@ -65,6 +83,7 @@ def try_detector(agent: ActivePerception, photo: Path) -> None:
 
 
 def _settings(detector: Detector) -> str:
+    """Write the settings of a detector that its scores depend on."""
     width, height = detector.input_size
     parts = [f"{len(detector.classes)} classes", f"{width} × {height} px"]
     if isinstance(detector, OnnxDetector):
@@ -75,24 +94,27 @@ def _settings(detector: Detector) -> str:
 def _rows(bare: Trial, objects: Objects, classes: tuple[str, ...]) -> list[list[str]]:
     """Class, both scores and box of what the bare detector shows, and then of what semfov lists beyond it."""
     overlap = box_iou(bare.boxes, objects.boxes.to(bare.boxes)) * (bare.labels[:, None] == objects.labels)
-    rows, left = list[list[str]](), set(range(len(objects)))
+    rows = list[list[str]]()
+    unmatched = set(range(len(objects)))
     for number, (box, score, label) in enumerate(zip(bare.boxes, bare.scores, bare.labels, strict=True)):
         best = int(overlap[number].argmax()) if len(objects) else 0
-        same = best in left and float(overlap[number, best]) >= _SAME
-        left -= {best} if same else set()
-        listed = f"{objects.scores[best]:.2f}" if same else "-"
+        listed = "-"
+        if best in unmatched and float(overlap[number, best]) >= _SAME:
+            unmatched.remove(best)
+            listed = f"{objects.scores[best]:.2f}"
         rows.append([classes[label], f"{score:.2f}", listed, box_text(box.tolist())])
-    for number in sorted(left):
-        name, score = classes[int(objects.labels[number])], f"{objects.scores[number]:.2f}"
-        rows.append([name, "-", score, box_text(objects.boxes[number].tolist())])
+    for number in sorted(unmatched):
+        name = classes[int(objects.labels[number])]
+        rows.append([name, "-", f"{objects.scores[number]:.2f}", box_text(objects.boxes[number].tolist())])
     return rows
 
 
 def _about_scores(bare: Trial, detector: Detector) -> list[str]:
-    """What the scores of the proposals tell of the export, its head and its background."""
+    """Say what the scores of the proposals tell of the export, its head and its background."""
     confidence = bare.proposals.confidence[0]
     if not len(bare.scores):
-        best, values = float(confidence.amax()) if len(confidence) else 0.0, len(confidence.unique())
+        best = float(confidence.amax()) if len(confidence) else 0.0
+        values = len(confidence.unique())
         if len(confidence) >= _ENOUGH and values <= _FEW:
             return [
                 f"its {len(confidence):,} boxes have {values} different score{'s' if values > 1 else ''}: an export to "

@@ -32,25 +32,39 @@ class Truth:
 
     def _warn_of_boxes(self) -> None:
         """Warn of boxes that are written in another form, and of those without area, which are not judged."""
-        boxes, sizes, empty = [], [], 0
+        boxes = []
+        sizes = []
+        empty = 0
         for image, entries in self.annotations.objects.items():
             size = self.annotations.size(image)
-            empty += sum(min(each["bbox"][2:]) == 0 for each in entries)
+            empty += sum(min(entry["bbox"][2:]) == 0 for entry in entries)
             if size is not None:
-                boxes += [each["bbox"] for each in entries]
+                boxes += [entry["bbox"] for entry in entries]
                 sizes += [size * 2] * len(entries)
         warn_of_form(torch.tensor(boxes).view(-1, 4).double(), torch.tensor(sizes).view(-1, 4).double(), self.path)
         if empty:
             warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
 
     def image_id(self, name: str, size: tuple[int, int] | None = None) -> Id:
-        """The id of a picture of `(width, height)`; of several of one name that whose folders agree best."""
+        """Find the id of a picture; of several of one name that whose folders agree best.
+
+        Args:
+            name: path of the picture.
+            size: `(width, height)` that the annotations must have; None checks nothing.
+
+        Returns:
+            The id of the image in the annotations.
+
+        Raises:
+            DataError: no image, or several, have this name, or its size is another one.
+        """
         parts = _parts(name)
 
         def agreement(image: Id) -> int:
-            own = _parts(self.annotations.images[image]["file_name"])
-            pairs = zip(reversed(own), reversed(parts), strict=False)
-            return next((count for count, (one, other) in enumerate(pairs) if one != other), min(len(own), len(parts)))
+            """Count the last parts of both paths that are equal."""
+            image_parts = _parts(self.annotations.images[image]["file_name"])
+            equal = [mine == theirs for mine, theirs in zip(reversed(parts), reversed(image_parts), strict=False)]
+            return equal.index(False) if False in equal else len(equal)
 
         found = sorted(self._images.get(parts[-1], ()), key=agreement)
         if not found or (len(found) > 1 and agreement(found[-1]) == agreement(found[-2])):
@@ -66,12 +80,23 @@ class Truth:
         return found[-1]
 
     def categories(self, classes: Collection[str]) -> dict[str, Id]:
-        """The categories of the file that are among some classes: their canonical names, and the first id of each."""
+        """Find the categories of the file that are among some classes.
+
+        Args:
+            classes: names of the classes.
+
+        Returns:
+            The first id of each category, by its canonical name.
+
+        Raises:
+            InputError: none of the classes is a category.
+        """
         names = {canonical_name(name) for name in classes}
-        categories = [(canonical_name(each["name"]), id_) for id_, each in self.annotations.categories.items()]
-        found = {name: id_ for name, id_ in reversed(categories) if name in names}
-        own = ", ".join(each["name"] for each in [*self.annotations.categories.values()][:5])
-        check(bool(found), "annotations", f"some of the classes {', '.join([*classes][:5])} as categories", own)
+        categories = self.annotations.categories
+        ids = [(canonical_name(category["name"]), id_) for id_, category in categories.items()]
+        found = {name: id_ for name, id_ in reversed(ids) if name in names}
+        examples = ", ".join(category["name"] for category in [*categories.values()][:5])
+        check(bool(found), "annotations", f"some of the classes {', '.join([*classes][:5])} as categories", examples)
         return found
 
     def judge(self, results: Sequence[dict[str, Any]], images: Sequence[Id], classes: Collection[str]) -> str:
@@ -84,5 +109,5 @@ class Truth:
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """The parts of a path, of Windows or not."""
+    """Split a path into its parts, of Windows or not."""
     return PurePosixPath(name.replace("\\", "/")).parts or (name,)

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
@@ -60,6 +60,22 @@ class Range:
         )
 
 
+@dataclass(frozen=True)
+class Form:
+    """How a value is written on a command line, in a type annotation.
+
+    Args:
+        noun: what the value is, such as `a cell`.
+        words: how it is written.
+    """
+
+    noun: str
+    words: str
+
+    def __repr__(self) -> str:
+        return self.words
+
+
 class _FileName:
     """Restriction of a text setting to valid file names, in a type annotation."""
 
@@ -85,7 +101,8 @@ Shifts = Annotated[int, Range(0, 10_000)]  # number of gaze shifts in an episode
 Side = Annotated[int, Range(1, 200)]  # number of cells in a row or in a column
 Workers = Annotated[int, Range(1, 1024)]  # number of processes
 
-_NOUNS = {int: "a whole number", float: "a number", str: "a name"}
+NOUNS = {int: "a whole number", float: "a number", str: "a name"}
+"""What values of a type are, in messages."""
 
 _type_hints = cache(get_type_hints)
 
@@ -111,7 +128,7 @@ def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: 
             check_settings(hint, value, f"{prefix}{field.name}.")  # type: ignore[arg-type]
 
 
-def _check_value(hint: Any, value: object, name: str) -> None:
+def _check_value(hint: object, value: object, name: str) -> None:
     """Raise `InputError` if a value is out of the range of its type, which may be of several kinds."""
     if value is None or isinstance(value, Mapping):
         return
@@ -128,16 +145,16 @@ def _check_value(hint: Any, value: object, name: str) -> None:
         _check_alternatives(get_args(hint), value, name)
 
 
-def _check_ranges(hint: Any, value: object, name: str) -> None:
+def _check_ranges(hint: object, value: object, name: str) -> None:
     """Raise `InputError` if a value is out of a range that its type is annotated with."""
     base, *annotations = get_args(hint)
     for annotation in annotations:
         if isinstance(annotation, Range | _FileName):
-            expected = f"{annotation.noun or _NOUNS[base]} {annotation}"
+            expected = f"{annotation.noun or NOUNS[base]} {annotation}"
             check(annotation.holds(value, whole=base is int), name, expected, excerpt(value))
 
 
-def _check_alternatives(alternatives: tuple[Any, ...], value: object, name: str) -> None:
+def _check_alternatives(alternatives: Iterable[object], value: object, name: str) -> None:
     """Raise `InputError` if a value is out of the range of the alternative that it is meant to be."""
     # Where a setting is a number or a word, its words are checked where the setting is used.
     is_word = isinstance(value, str) and any(map(_takes_text, alternatives))
@@ -148,7 +165,7 @@ def _check_alternatives(alternatives: tuple[Any, ...], value: object, name: str)
             _check_ranges(alternative, value, name)
 
 
-def _takes_text(hint: Any) -> bool:
+def _takes_text(hint: object) -> bool:
     """Tell whether text can be a value of a type."""
     if get_origin(hint) is Annotated:
         return get_args(hint)[0] is str

@@ -117,8 +117,11 @@ class SensorConfig(Settings):
 
     def whole(self) -> dict[str, Any]:
         """List all settings of the sensor: those of its name, changed by those that are given."""
-        own = [each for each in fields(self) if each.name not in ("name", "reference", "settings")]
-        changes = {each.name: getattr(self, each.name) for each in own if getattr(self, each.name) != each.default}
+        changes = {}
+        for field_ in fields(self):
+            value = getattr(self, field_.name)
+            if field_.name not in ("name", "reference", "settings") and value != field_.default:
+                changes[field_.name] = value
         named = SENSORS[lookup(self.name, SENSORS, "sensor")]
         return named.changed({**changes, **(self.settings or {})})
 
@@ -131,11 +134,19 @@ class SensorConfig(Settings):
         return self.kind.width(self.whole()) / self.reference
 
     def level_edges(self, levels: int = 8, width: float = 50.0) -> list[float]:
-        """Borders between levels of distance, in longer sides: its own, or by a `width` in px of 640."""
-        own = self.kind.borders(self.whole())
-        if own is not None:
+        """Find the borders between levels of distance: those of the sensor, or at equal distances.
+
+        Args:
+            levels: number of levels, where the sensor has no borders of its own.
+            width: width of a level then, in pixels of an image of 640, for a fovea of 100 pixels.
+
+        Returns:
+            The borders, in longer sides of the image.
+        """
+        borders = self.kind.borders(self.whole())
+        if borders is not None:
             # Farther away than the longer side there is hardly anything.
-            return [edge / self.reference for edge in own if edge < self.reference]
+            return [edge / self.reference for edge in borders if edge < self.reference]
         return [width / 100.0 * self.fovea * n for n in range(1, levels)]
 
     def record(self) -> dict[str, Any]:

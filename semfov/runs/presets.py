@@ -8,7 +8,7 @@ from typing import get_args
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Association, CellMemory
-from semfov.errors import InputError, lookup
+from semfov.errors import InputError, check, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
 from semfov.gaze.acquisition.static import Static, Uniform
 from semfov.gaze.policies import policy_names
@@ -32,90 +32,173 @@ _ALIASES = ("recommended", "published")
 _MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
 """Name of Najemnik and Geisler (2005) for the searcher that fixates where the target is most probable."""
 
+_SCORED: tuple[Scores, ...] = ("raw", "calibrated")  # scores that any policy guided by the belief can have
+
+_Presets = dict[str, PolicyConfig]
+
 _OF_THE_MAP = ("tempering", "footprint", "memory", "misses", "association")  # settings of the map of all classes
 
 
 def presets(task: Task) -> Mapping[str, PolicyConfig]:
+    """List the policies that have a name.
+
+    Args:
+        task: `search` or `exploration`.
+
+    Returns:
+        Their settings by name.
+    """
     return _presets(task, tuple(policy_names(task)))
 
 
 @cache
 def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig]:
+    """Make the presets of a task, made anew where policies were registered since."""
     plain = {name: PolicyConfig(name) for name in policies if name != Static.name}
-    salient = {model: PolicyConfig(Static.name, saliency=model) for model in _SALIENCY_MODELS}
+    salient: _Presets = {model: PolicyConfig(Static.name, saliency=model) for model in _SALIENCY_MODELS}
     if task == "search":
-        # The scores do not matter to these: no belief guides them, or one of their own.
-        alone = {name: PolicyConfig(name) for name in (Uniform.name, TARGET_EVIDENCE)}
-        alone |= {name: policy for name, policy in plain.items() if not FUNCTIONS[name].by_belief} | salient
-        alone["non-predictive-fitted"] = PolicyConfig("non-predictive", "fitted")
-        best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
-        scored = {name: policy for name, policy in plain.items() if name not in alone}
-        alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if FUNCTIONS[name].by_place}
-    else:
-        best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
-        scored = {name: policy for name, policy in plain.items() if not FUNCTIONS[name].needs_map} | salient
-        mapped = {**scored, "expected-gain": PolicyConfig("expected-gain")}
-        mapped = {name: policy for name, policy in mapped.items() if not FUNCTIONS[policy.policy].needs_model}
-        alone = {f"{name}-learned": replace(policy, scores="learned") for name, policy in mapped.items()}
-    kinds: tuple[Scores, ...] = ("raw", "calibrated")
-    both = {f"{name}-{kind}": replace(policy, scores=kind) for name, policy in scored.items() for kind in kinds}
-    same = {"recommended": best, "published": published}
-    if task == "search":
-        same |= {f"{_MAXIMUM_A_POSTERIORI}-{kind}": both[f"non-predictive-{kind}"] for kind in kinds}
-        same[f"{_MAXIMUM_A_POSTERIORI}-learned"] = alone[TARGET_EVIDENCE]
-    return MappingProxyType({**alone, **both, **same})
+        return MappingProxyType(_search_presets(plain, salient))
+    return MappingProxyType(_exploration_presets(plain, salient))
+
+
+def _search_presets(plain: _Presets, salient: _Presets) -> _Presets:
+    """Make the presets of searches, of policies and of saliency maps by name."""
+    # The scores do not matter to these: no belief guides them, or one of their own.
+    without_scores = {name: PolicyConfig(name) for name in (Uniform.name, TARGET_EVIDENCE)}
+    without_scores |= {name: policy for name, policy in plain.items() if not FUNCTIONS[name].by_belief}
+    without_scores |= salient
+    without_scores["non-predictive-fitted"] = PolicyConfig("non-predictive", "fitted")
+    scored = {name: policy for name, policy in plain.items() if name not in without_scores}
+    learned = {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if FUNCTIONS[name].by_place}
+    raw_and_calibrated = _with_both_scores(scored)
+    named = {"recommended": PolicyConfig(TARGET_EVIDENCE), "published": PolicyConfig("predictive", "calibrated")}
+    for scores in _SCORED:
+        named[f"{_MAXIMUM_A_POSTERIORI}-{scores}"] = raw_and_calibrated[f"non-predictive-{scores}"]
+    named[f"{_MAXIMUM_A_POSTERIORI}-learned"] = without_scores[TARGET_EVIDENCE]
+    return {**without_scores, **learned, **raw_and_calibrated, **named}
+
+
+def _exploration_presets(plain: _Presets, salient: _Presets) -> _Presets:
+    """Make the presets of explorations, of policies and of saliency maps by name."""
+    scored = {name: policy for name, policy in plain.items() if not FUNCTIONS[name].needs_map} | salient
+    of_learned_map = {**scored, "expected-gain": PolicyConfig("expected-gain")}
+    learned = {
+        f"{name}-learned": replace(policy, scores="learned")
+        for name, policy in of_learned_map.items()
+        if not FUNCTIONS[policy.policy].needs_model
+    }
+    named = {"recommended": PolicyConfig("closer-look", "learned"), "published": PolicyConfig("kl", "calibrated")}
+    return {**learned, **_with_both_scores(scored), **named}
+
+
+def _with_both_scores(policies: _Presets) -> _Presets:
+    """Policies with raw and with calibrated scores, after which the presets are named."""
+    return {
+        f"{name}-{scores}": replace(policy, scores=scores) for name, policy in policies.items() for scores in _SCORED
+    }
 
 
 def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
-    """The settings of a policy, which is given by the name of a preset or by settings."""
-    by_name = presets(task)
+    """Find the settings of a policy, and check that they suit each other.
+
+    Args:
+        choice: the name of a preset, or settings.
+        task: `search` or `exploration`.
+
+    Returns:
+        The settings.
+
+    Raises:
+        InputError: the name is unknown, or a setting does not suit the policy.
+    """
     if isinstance(choice, str):
-        if choice[:1] in ("[", "{"):
-            settings = ", ".join(field.name for field in fields(PolicyConfig))
-            raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
-        return by_name[lookup(choice, by_name, "policy")]
-    lookup(choice.policy, [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])], "policy")
-    saliency = choice.saliency if choice.policy == Static.name else None
-    if choice.policy == Static.name and saliency is None:
+        return _preset(choice, task)
+    names = [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
+    lookup(choice.policy, names, "policy")
+    if choice.policy == Static.name and choice.saliency is None:
         models = ", ".join(_SALIENCY_MODELS)
         raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
     for setting, words in _WORDS.items():
-        if getattr(choice, setting) is not None:
-            lookup(getattr(choice, setting), get_args(words), setting)
-    if choice.samples is not None and not (
-        choice.policy in FUNCTIONS and "likelihoods" in FUNCTIONS[choice.policy].takes
-    ):
-        names = ", ".join(name for name in policy_names(task) if "likelihoods" in FUNCTIONS[name].takes)
-        raise InputError(f"samples: expected null, except for {names}; got {choice.samples} for {choice.policy!r}")
-    known = presets(task).values()
-    scores = [s for s in get_args(Scores) if PolicyConfig(choice.policy, s, saliency=saliency) in known] or ["raw"]
-    if choice.scores not in scores:
-        expected = " or ".join(map(repr, scores))
-        raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
+        word = getattr(choice, setting)
+        if word is not None:
+            lookup(word, get_args(words), setting)
+    if choice.samples is not None:
+        _check_takes_samples(choice, task)
+    _check_scores(choice, task)
     if choice.scores in ("learned", "fitted") or choice.policy == TARGET_EVIDENCE:
-        conflict = next((setting for setting in _OF_THE_MAP if getattr(choice, setting) is not None), None)
-        if conflict is not None:
-            raise InputError(
-                f"{conflict}: expected null, since policy {choice.policy!r} with {choice.scores!r} scores has its own "
-                f"belief, got {getattr(choice, conflict)!r}"
-            )
+        _check_own_belief(choice)
     return choice
 
 
+def _preset(name: str, task: Task) -> PolicyConfig:
+    """Look up the preset of a name."""
+    if name[:1] in ("[", "{"):
+        settings = ", ".join(field.name for field in fields(PolicyConfig))
+        raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {name}")
+    by_name = presets(task)
+    return by_name[lookup(name, by_name, "policy")]
+
+
+def _check_takes_samples(choice: PolicyConfig, task: Task) -> None:
+    """Raise `InputError` for drawn looks of a policy that takes no expectation over looks."""
+    names = [name for name in policy_names(task) if "likelihoods" in FUNCTIONS[name].takes]
+    takes_them = choice.policy in FUNCTIONS and "likelihoods" in FUNCTIONS[choice.policy].takes
+    if not takes_them:
+        raise InputError(
+            f"samples: expected null, except for {', '.join(names)}; got {choice.samples} for {choice.policy!r}"
+        )
+
+
+def _check_scores(choice: PolicyConfig, task: Task) -> None:
+    """Raise `InputError` for scores with which no preset has the policy."""
+    all_presets = presets(task).values()
+    possible = [scores for scores in get_args(Scores) if _based_on(choice, scores) in all_presets] or ["raw"]
+    check(
+        choice.scores in possible,
+        "scores",
+        f"{' or '.join(map(repr, possible))} for policy {choice.policy!r}",
+        repr(choice.scores),
+    )
+
+
+def _check_own_belief(choice: PolicyConfig) -> None:
+    """Raise `InputError` for settings of the map of all classes where the policy has a belief of its own."""
+    for setting in _OF_THE_MAP:
+        value = getattr(choice, setting)
+        if value is not None:
+            raise InputError(
+                f"{setting}: expected null, since policy {choice.policy!r} with {choice.scores!r} scores has its own "
+                f"belief, got {value!r}"
+            )
+
+
+def _based_on(choice: PolicyConfig, scores: Scores) -> PolicyConfig:
+    """Make the preset that settings are based on, with some scores: a static policy is named by its saliency map."""
+    return PolicyConfig(choice.policy, scores, saliency=choice.saliency if choice.policy == Static.name else None)
+
+
 def label(choice: str | PolicyConfig, task: Task) -> str:
-    """The name of a policy in tables: the preset that it is based on, and the settings that differ from it."""
+    """Name a policy for tables: the preset that it is based on, and the settings that differ from it.
+
+    Args:
+        choice: the name of a preset, or settings.
+        task: `search` or `exploration`.
+
+    Returns:
+        The label, such as `kl-calibrated, tempering 0.5`.
+    """
     settings = resolve(choice, task)
     names = {
         preset: name
         for name, preset in presets(task).items()
         if name not in _ALIASES and not name.startswith(_MAXIMUM_A_POSTERIORI)
     }
-    alone = settings.saliency if settings.policy == Static.name else None
-    base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]
-    differs = []
+    base = _based_on(settings, settings.scores)
+    differences = []
     for field in fields(PolicyConfig)[2:]:
         value = getattr(settings, field.name)
-        if value is not None and not (field.name == "saliency" and alone is not None):
-            text = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
-            differs.append(field.name if value is True else f"{field.name} {text}")
-    return ", ".join([base, *differs])
+        if value is None or value == getattr(base, field.name):
+            continue
+        text = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
+        differences.append(field.name if value is True else f"{field.name} {text}")
+    return ", ".join([names[base], *differences])

@@ -13,16 +13,26 @@ from tqdm import tqdm
 
 _Item = TypeVar("_Item")
 
-_whole: ContextVar[WholeBar | None] = ContextVar("whole", default=None)
+_open_bar: ContextVar[WholeBar | None] = ContextVar("open bar", default=None)
 
 
 class WholeBar:
-    """One bar for several stages of different duration, each of which consists of tasks."""
+    """One bar for several stages of different duration, each of which consists of tasks.
+
+    The bar shows `_position` of `_total` seconds, and never moves back. `_tasks` holds the tasks of the present stage
+    that have not begun.
+
+    Args:
+        title: title of the bar.
+        stages: the stages in their order, each with the seconds that its tasks are expected to take.
+    """
 
     def __init__(self, title: str, stages: Mapping[str, Mapping[str, float]]) -> None:
-        self.title, self.stages = title, stages
+        self.title = title
+        self.stages = stages
         self._total = sum(sum(tasks.values()) for tasks in stages.values()) or 1.0
-        self._at, self._tasks = 0.0, dict[str, float]()
+        self._position = 0.0
+        self._tasks = dict[str, float]()
         form = "{desc} {percentage:3.0f} % |{bar}| {elapsed} < {remaining}{postfix}"
         self._bar = tqdm(total=1.0, desc=title, bar_format=form, dynamic_ncols=True)
         self._closed = threading.Event()
@@ -31,7 +41,7 @@ class WholeBar:
     @property
     def done(self) -> float:
         """The share of the work that is done."""
-        return self._at / self._total
+        return self._position / self._total
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -48,7 +58,7 @@ class WholeBar:
         self._move(before + sum(self.stages[name].values()))
 
     def task(self, title: str, total: float) -> tqdm[Any]:
-        """A task with this title, which moves the bar."""
+        """Open a task with this title, which moves the bar."""
         return _Task(self, self._tasks.pop(title, 0.0) / max(total, 1))
 
     def _tick(self) -> None:
@@ -57,15 +67,15 @@ class WholeBar:
             self._bar.refresh()
 
     def _move(self, to: float) -> None:
-        self._at = max(self._at, to)
+        self._position = max(self._position, to)
         self._bar.update(min(self.done, 1.0) - self._bar.n)
 
     def __enter__(self) -> WholeBar:
-        self._token = _whole.set(self)
+        self._token = _open_bar.set(self)
         return self
 
     def __exit__(self, *_: object) -> None:
-        _whole.reset(self._token)
+        _open_bar.reset(self._token)
         self._closed.set()
         self._bar.close()
 
@@ -75,18 +85,19 @@ class _Task(tqdm):  # type: ignore[type-arg]
 
     def __init__(self, whole: WholeBar, step: float) -> None:
         super().__init__(disable=True)
-        self._whole, self._step = whole, step
+        self._whole = whole
+        self._step = step
 
     def update(self, n: float | None = 1) -> None:
         """Move the bar by so many items."""
-        self._whole._move(self._whole._at + (n or 0) * self._step)
+        self._whole._move(self._whole._position + (n or 0) * self._step)
 
 
 def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> tqdm[Any]:
-    """A bar for a task; if a `WholeBar` is open, the task moves its bar instead."""
-    whole = _whole.get()
-    if whole is not None:
-        return whole.task(title, total)
+    """Open a bar for a task; if a `WholeBar` is open, the task moves its bar instead."""
+    bar = _open_bar.get()
+    if bar is not None:
+        return bar.task(title, total)
     return tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden)
 
 

@@ -30,7 +30,16 @@ _DAMAGED = (sqlite3.DatabaseError, UnicodeDecodeError)
 
 
 class SceneResults:
-    """Outcomes of finished scenes in a SQLite database; damaged rows and those of changed scenes count as missing."""
+    """Outcomes of finished scenes in a SQLite database; damaged rows and those of changed scenes count as missing.
+
+    `_waiting` holds the rows that are not written yet: each write waits for the disk, so that those of a second are
+    written together. Everything that reads writes them first.
+
+    Args:
+        folder: folder of the database.
+        key: digest of everything that outcomes depend on beside the scenes.
+        digest: digest of a scene by its number.
+    """
 
     def __init__(self, folder: Path, key: str, digest: Callable[[int], str]) -> None:
         self.path = folder / f"{key}.sqlite"
@@ -40,7 +49,7 @@ class SceneResults:
         self._flushed = -math.inf
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Count the rows."""
         return int(next(self._rows("SELECT COUNT(*) FROM scenes"), (0,))[0])
 
     def finished(self, scenes: int) -> set[int]:
@@ -48,14 +57,14 @@ class SceneResults:
         return {row[0] for row in self._rows("SELECT * FROM scenes WHERE number < ?", scenes) if self._whole(*row)}
 
     def items(self, scenes: int) -> Iterator[tuple[int, dict[str, Any]]]:
-        """The numbers and outcomes of finished scenes in their order, one at a time."""
+        """Yield the numbers and outcomes of finished scenes in their order, one at a time."""
         for row in self._rows("SELECT * FROM scenes WHERE number < ? ORDER BY number", scenes):
             result = self._read(*row)
             if result is not None:
                 yield row[0], result
 
     def read(self, scenes: int) -> Iterator[dict[str, Any]]:
-        """The outcomes of all scenes in their order, one at a time."""
+        """Yield the outcomes of all scenes in their order, one at a time."""
         expected = 0
         for number, result in self.items(scenes):
             if number != expected:
@@ -66,9 +75,16 @@ class SceneResults:
             raise DataError(f"{self.path}: scene {expected} is missing or damaged; run the same command again")
 
     def save(self, index: int, records: list[ResultRecord], seconds: dict[str, float]) -> None:
-        """Append the outcomes of a scene, or replace them; those of a second are written together."""
-        took, made = json.dumps(seconds), json.dumps(records)
-        self._waiting.append((index, self._sha256(index, took, made), took, made))
+        """Append the outcomes of a scene, or replace them; those of a second are written together.
+
+        Args:
+            index: number of the scene.
+            records: outcomes of its episodes, as JSON values.
+            seconds: how long the parts of the work took.
+        """
+        seconds_text = json.dumps(seconds)
+        records_text = json.dumps(records)
+        self._waiting.append((index, self._sha256(index, seconds_text, records_text), seconds_text, records_text))
         if time.monotonic() >= self._flushed + _TOGETHER:
             self.flush()
 
@@ -93,7 +109,7 @@ class SceneResults:
             database.executemany("INSERT OR REPLACE INTO scenes VALUES (?, ?, ?, ?)", self._waiting)
 
     def _rows(self, query: str, *given: int) -> Iterator[tuple[Any, ...]]:
-        """The rows of a query, as far as the database is whole."""
+        """Yield the rows of a query, as far as the database is whole."""
         self.flush()
         check_regular(self.path)
         if not self.path.exists():
@@ -112,15 +128,18 @@ class SceneResults:
             return False
 
     def _read(self, index: int, sha256: str, seconds: str, records: str) -> dict[str, Any] | None:
+        """Read the outcomes of a row; None if it is damaged, or of a scene that has changed."""
         if not self._whole(index, sha256, seconds, records):
             return None
         try:
             result = {"records": json.loads(records), "seconds": json.loads(seconds)}
         except (ValueError, RecursionError):
             return None
-        formed = isinstance(result["records"], list) and all(isinstance(each, dict) for each in result["records"])
-        formed = formed and isinstance(result["seconds"], dict) and all(map(is_number, result["seconds"].values()))
-        return result if formed else None
+        records_are_formed = isinstance(result["records"], list) and all(
+            isinstance(record, dict) for record in result["records"]
+        )
+        seconds_are_formed = isinstance(result["seconds"], dict) and all(map(is_number, result["seconds"].values()))
+        return result if records_are_formed and seconds_are_formed else None
 
     def _sha256(self, index: int, seconds: str, records: str) -> str:
         head = json.dumps([self.key, index, self.digest(index), seconds])

@@ -49,11 +49,11 @@ class Settings(CheckedSettings):
     unused: ClassVar[tuple[str, ...]] = ()  # inherited settings that mean nothing here: no options, and not written
 
     def plain(self) -> dict[str, Any]:
-        """The settings as JSON values, in which paths are text and tuples are lists."""
+        """Write the settings as JSON values, in which paths are text and tuples are lists."""
         return plain({name: value for name, value in asdict(self).items() if name not in self.unused})
 
     def yaml(self) -> str:
-        """The settings as a file that `--config` reads."""
+        """Write the settings as a file that `--config` reads."""
         return yaml.safe_dump(self.plain(), sort_keys=False)
 
 

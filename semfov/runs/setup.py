@@ -18,6 +18,9 @@ from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.sensor import Foveation, named_sensor
 
+_OPTIONAL = "background", "weights", "classes", "head", "stride", "input_size", "runtime", "logits", "per_class"
+"""Settings of a detector that are options of `load_detector` of the same name, given only where they are changed."""
+
 _Learned = TypeVar("_Learned", TargetEvidence, MapEvidence, Verification)
 
 
@@ -38,7 +41,19 @@ def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> N
 
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...], ids: Sequence[Any] | None = None) -> Scenes:
-    """The scenes of the settings: photographs if a root is given, of which some ids are chosen, else embedded ones."""
+    """Make the scenes of the settings.
+
+    Args:
+        data: the settings: photographs if a root is given, else embedded scenes.
+        classes: names of the detector's classes.
+        ids: ids of the photographs to use; None for those of the settings.
+
+    Returns:
+        The scenes.
+
+    Raises:
+        DataError: a file or a folder is missing or damaged.
+    """
     check_sources(data)
     if data.root is None or data.annotations is None:
         return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
@@ -49,35 +64,60 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...], ids: Sequence[Any] |
 
 
 def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
-    """Split photographs into every n-th one and the others; of the embedded scenes make two sets."""
+    """Split photographs into those to fit on and those that are held out; of embedded scenes make two sets.
+
+    Args:
+        data: the settings of the scenes.
+        classes: names of the detector's classes.
+        every: one in so many photographs is held out.
+
+    Returns:
+        The scenes to fit on, and those that are held out.
+
+    Raises:
+        InputError: there are too few photographs.
+    """
     check_sources(data)
     if data.root is None:
-        count, seeds = data.limit or 16, (data.scene_seed, data.scene_seed + 1)
-        larger, smaller = (EmbeddedScenes(classes, count=count, seed=seed) for seed in seeds)
-        return larger, smaller
+        count = data.limit or 16
+        fitted = EmbeddedScenes(classes, count=count, seed=data.scene_seed)
+        held_out = EmbeddedScenes(classes, count=count, seed=data.scene_seed + 1)
+        return fitted, held_out
     ids = [*make_scenes(data, classes).ids]
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
-    others = [name for number, name in enumerate(ids) if number % every]
-    return make_scenes(data, classes, others), make_scenes(data, classes, ids[::every])
+    fitted_ids = [name for number, name in enumerate(ids) if number % every]
+    return make_scenes(data, classes, fitted_ids), make_scenes(data, classes, ids[::every])
 
 
 def make_detector(detector: DetectorConfig) -> Detector:
+    """Load the detector of the settings."""
     # A session of onnxruntime keeps the number of threads that it is opened with.
     with one_thread():
         return load_detector(detector.name, **detector_options(detector))
 
 
 def detector_options(detector: DetectorConfig) -> dict[str, Any]:
-    """The options of `semfov.load_detector` that correspond to the settings."""
-    onnx = detector.name.endswith(".onnx")
+    """List the options of `semfov.load_detector` that correspond to the settings.
+
+    Args:
+        detector: the settings.
+
+    Returns:
+        The options by name: the selection of boxes, and what differs from the defaults.
+
+    Raises:
+        InputError: an option of ONNX files is given for a detector that is none.
+    """
     for name in ("head", "colour", "logits"):
         value = getattr(detector, name)
         expected = f"none, since detector.name {detector.name!r} is not an ONNX file"
-        check(onnx or not value, f"detector.{name}", expected, repr(value))
-    default, same = DetectorConfig(), ("background", "weights", "classes", "head", "stride", "input_size", "runtime")
-    changed = [name for name in (*same, "logits", "per_class") if getattr(detector, name) != getattr(default, name)]
+        check(detector.name.endswith(".onnx") or not value, f"detector.{name}", expected, repr(value))
+    default = DetectorConfig()
+    changed = [name for name in _OPTIONAL if getattr(detector, name) != getattr(default, name)]
     options = {name: getattr(detector, name) for name in ("threshold", "iou", "limit", *changed)}
-    return options if detector.colour is None else {**options, "preprocessing": {"channels": detector.colour}}
+    if detector.colour is not None:
+        options["preprocessing"] = {"channels": detector.colour}
+    return options
 
 
 def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
@@ -87,7 +127,7 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
 
 
 def _growth_of(eye: Eye) -> float:
-    """The growth of an eye's fovea, by which shipped models are chosen; they exist only for a `Foveation`."""
+    """Find the growth of an eye's fovea, by which shipped models are chosen; they exist only for a `Foveation`."""
     sensor = eye.sensor
     if not isinstance(sensor, Foveation):
         raise InputError(
@@ -113,11 +153,12 @@ def make_fitted(name: str | None, eye: Eye) -> FovealObservationModel:
 
 def observation_name(eye: Eye) -> str:
     """Name of the observation model that is shipped for an eye: the published one, or ours for the fovea's growth."""
-    detector, settings = eye.detector, eye.sensor.settings()
+    detector = eye.detector
+    settings = eye.sensor.settings()
     for sensor in PUBLISHED_SENSORS:
-        published = eye.reference == SensorConfig().reference and settings == named_sensor(sensor).settings()
+        is_published = eye.reference == SensorConfig().reference and settings == named_sensor(sensor).settings()
         name = published_model(detector.name, sensor, detector.selection.threshold)
-        if published and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
+        if is_published and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
             return name
     name = f"{detector.name}-sharp" if _growth_of(eye) == 1 else detector.name
     return shipped_model(FovealObservationModel, name, "MODEL")

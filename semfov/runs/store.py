@@ -84,11 +84,11 @@ class DetectionStore(SceneStore):
         self.write(digest, {"actions": numbers, **self.pack([looks[action] for action in actions])})
 
     def encode(self, action: Any) -> Sequence[float]:
-        """An action as numbers: itself, or -1 and the corners of a box."""
+        """Write an action as numbers: itself, or -1 and the corners of a box."""
         return (-1, *action) if isinstance(action, tuple) else (action, 0, 0, 0, 0)
 
     def decode(self, row: Sequence[float]) -> Any:
-        """The action of some numbers."""
+        """Read the action of some numbers."""
         return tuple(row[1:]) if row[0] < 0 else int(row[0])
 
     def pack(self, looks: Sequence[Any]) -> dict[str, Tensor]:
@@ -172,7 +172,7 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
 def look_everywhere(
     eye: Eye, image: Callable[[], Tensor], grid: Grid, store: DetectionStore | None, digest: Callable[[], str]
 ) -> Detections:
-    """Detections from every cell of a photograph `(1, 3, H, W)`, read from a store, or computed and stored."""
+    """Detect from every cell of a photograph `(1, 3, H, W)`, read from a store, or computed and stored."""
     looks = RememberedLooks(lambda: photograph_looks(eye, image, grid), store, digest)
     detections = Detections.stack([looks(cell) for cell in range(len(grid))])
     looks.save()

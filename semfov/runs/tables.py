@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 
 def table(rows: list[list[str]]) -> list[str]:
-    """A Markdown table with aligned columns; the first row holds the headings."""
+    """Write a Markdown table with aligned columns; the first row holds the headings."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
@@ -14,12 +14,22 @@ def table(rows: list[list[str]]) -> list[str]:
 
 
 def plus_minus(value: float, error: float, digits: int = 1, *, sign: str = "") -> str:
-    """A value and its standard error, if there is one: `12.3 ± 0.4`; with `sign="+"` the value always has its sign."""
+    """Write a value and its standard error, `12.3 ± 0.4`.
+
+    Args:
+        value: the value.
+        error: its standard error; NaN for none.
+        digits: decimal places.
+        sign: `+` writes the sign of positive values, too.
+
+    Returns:
+        The text.
+    """
     return f"{value:{sign}.{digits}f}" + (f" ± {error:.{digits}f}" if math.isfinite(error) else "")
 
 
 def percent(value: float, error: float) -> str:
-    """A share in percent with its standard error, if there is one."""
+    """Write a share in percent with its standard error, if there is one."""
     return plus_minus(100 * value, 100 * error)
 
 
@@ -29,5 +39,5 @@ def share(count: int, total: int) -> str:
 
 
 def mean_or_dash(values: Sequence[float], digits: int = 1) -> str:
-    """The mean with `digits` decimal places, or a dash where there are no values."""
+    """Write the mean with `digits` decimal places, or a dash where there are no values."""
     return f"{sum(values) / len(values):.{digits}f}" if values else "-"

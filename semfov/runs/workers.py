@@ -71,7 +71,8 @@ def _open_cluster(address: str, *, again: bool = False) -> Iterator[tuple[Execut
             executor.shutdown(wait=False)
 
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # numbers of two settings of glibc's malloc (malloc.h)
+_TRIM_THRESHOLD = -1  # number of a setting of glibc's malloc (malloc.h): free memory above it is returned
+_MMAP_THRESHOLD = -3  # likewise: blocks above it are requested from the system one by one
 
 
 def prepare_worker() -> None:
@@ -116,10 +117,22 @@ def run_tasks(
     made: _Made | None = None,
     count: Callable[[_Task], int] = lambda _: 1,
 ) -> Generator[tuple[_Task, _Result], None, None]:
-    """Run `function(made, task)` for every task, and yield tasks and results in any order; closing it ends the work.
+    """Run `function(made, task)` for every task; closing the generator ends the work.
 
-    Each process makes `made` once, by `make(*settings)`; this one does not where it is given. The bar counts units, of
-    which a task may have several.
+    Args:
+        function: the work on a task, with what the process has made.
+        tasks: the tasks.
+        where: where they run (`Where`).
+        make: makes what the work needs, once in each process.
+        settings: arguments of `make`.
+        title: title of the progress bar.
+        unit: unit of the bar.
+        hidden: whether to hide the bar.
+        made: what the work needs, for this process, where it is made already.
+        count: number of units of a task.
+
+    Yields:
+        Tasks and their results, in any order.
     """
     if not tasks:
         return
@@ -172,7 +185,7 @@ class _Job(NamedTuple):
         with _turn:
             if self.code is not None and package_digest() != self.code:
                 raise SemfovError("a worker has another version of semfov; install the same version on all machines")
-            if [each[:2] for each in _ready] != [(self.make, self.settings)]:
+            if [(make, settings) for make, settings, _ in _ready] != [(self.make, self.settings)]:
                 _ready.clear()
                 if self.folder.is_dir():  # relative paths of the settings are those of the process that asks
                     os.chdir(self.folder)
@@ -230,8 +243,8 @@ def _in_processes(
 ) -> Iterator[tuple[_Task, _Result]]:
     shared = _shared.get()
     try:
-        with ExitStack() as own:
-            pools, executors = shared or (own, {})
+        with ExitStack() as stack:
+            pools, executors = shared or (stack, {})
             if processes not in executors:
                 number = processes if shared else min(processes, len(tasks))
                 executors[processes] = pools.enter_context(_started(number))
@@ -245,7 +258,7 @@ def _in_processes(
 
 @contextmanager
 def _started(processes: int) -> Iterator[Executor]:
-    """Processes of this machine, which end with the block, and at once if it fails."""
+    """Start processes of this machine, which end with the block, and at once if it fails."""
     before = multiprocessing.active_children()
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _prepare) as pool:
         try:
@@ -269,20 +282,22 @@ def _on_cluster(
     tell: Callable[[_Task], object],
 ) -> Iterator[tuple[_Task, _Result]]:
     """Run tasks on a cluster; those that were lost with its scheduler are given to the next one at the same address."""
-    left = dict.fromkeys(tasks)
+    unfinished = dict.fromkeys(tasks)
     for attempt in range(_PATIENCE):
         try:
             with _open_cluster(address, again=attempt > 0) as (executor, places):
-                every, size = [*left], min(_BATCH, max(1, len(left) // (_TURNS * places)))
-                batches = [tuple(every[start : start + size]) for start in range(0, len(every), size)]
+                waiting = list(unfinished)
+                size = min(_BATCH, max(1, len(waiting) // (_TURNS * places)))
+                batches = [tuple(waiting[start : start + size]) for start in range(0, len(waiting), size)]
                 for batch, results in _results(executor, partial(_in_turn, job), batches, lambda batch: None):
                     for task, result in zip(batch, results, strict=True):
                         yield task, result
                         tell(task)
-                        del left[task]
+                        del unfinished[task]
             return
         except _ClusterLost as error:
-            _log.warning("%s: %s; waiting for a scheduler at %s, %d tasks are left", title, error, address, len(left))
+            count = len(unfinished)
+            _log.warning("%s: %s; waiting for a scheduler at %s, %d tasks are left", title, error, address, count)
     raise SemfovError(
         f"{title}: the scheduler at {address} was lost {_PATIENCE} times; run the same command again, and it continues "
         "where this one stopped"
@@ -290,7 +305,7 @@ def _on_cluster(
 
 
 def _in_turn(function: Callable[[_Task], _Result], batch: Sequence[_Task]) -> list[_Result]:
-    """The results of several tasks."""
+    """Compute the results of several tasks."""
     return [function(task) for task in batch]
 
 
@@ -309,6 +324,7 @@ def _deaf_children() -> Iterator[None]:
 
 
 def _prepare() -> None:
+    """Leave Ctrl-C to the main process, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_outlive_nobody, daemon=True).start()

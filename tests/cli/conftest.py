@@ -3,7 +3,7 @@
 import pytest
 from PIL import Image
 
-from semfov.cli import live, main, search
+from semfov.cli import jobs, live, main, search
 from semfov.zoom import GlimpseEvidence
 from tests import small
 
@@ -16,8 +16,9 @@ def agent():
 @pytest.fixture
 def run(agent, monkeypatch, capsys):
     """Runs the command in this process; returns its exit code and what it printed."""
-    for module in (search, live):
+    for module in (jobs, live):
         monkeypatch.setattr(module, "make_agent", lambda options: agent)
+    for module in (jobs, live, search):
         monkeypatch.setattr(module, "detector_classes", lambda options: None)
 
     def run_command(*arguments):

@@ -13,13 +13,14 @@ from PIL import Image
 
 import semfov
 from semfov import load_detector
-from semfov.cli.main import _SUBCOMMANDS, _in_command_words, _told_options, main
+from semfov.cli.commands import SUBCOMMANDS
+from semfov.cli.main import _in_command_words, _told_options, main
 from semfov.cli.options import DetectorOptions
 from semfov.detection.load import loader_options
 from tests.small import write_network
 
 SIDE = 64
-WITH_DETECTOR = [name for name in _SUBCOMMANDS if name != "check"]
+WITH_DETECTOR = [name for name in SUBCOMMANDS if name != "check"]
 HERE = Path(semfov.__file__).parent
 
 

@@ -19,7 +19,7 @@ from semfov import read_image
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.cli.options import FindOptions, SearchOptions
-from semfov.cli.search import _with_target
+from semfov.cli.search import with_target
 from semfov.cli.sources import picture_sources
 from semfov.cli.truth import Truth
 from semfov.data.sources import picture_files
@@ -393,10 +393,10 @@ def test_the_names_of_a_shell_are_those_of_a_folder_and_a_class_may_stand_among_
         shown.append([source.file for source in sources])
     assert shown[0] == shown[1] == shown[2] != []
     options = SearchOptions(pictures=("a.jpg", "Cups", "b.jpg"))
-    assert _with_target(options) == replace(options, pictures=("a.jpg", "b.jpg"), target="Cups")
+    assert with_target(options) == replace(options, pictures=("a.jpg", "b.jpg"), target="Cups")
     for others in (("a.jpg", "cupp"), ("a.jpg", "cup", "fork"), ("cup",)):
         options = FindOptions(pictures=others)
-        assert _with_target(options) is options
+        assert with_target(options) is options
 
 
 def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_path):

@@ -16,9 +16,9 @@ from PIL import Image
 
 import semfov
 from semfov import DataError, InputError, read_image
-from semfov.cli import outcome, search
+from semfov.cli import outcome, written
+from semfov.cli.jobs import FindJob
 from semfov.cli.options import FindOptions
-from semfov.cli.search import _FindJob
 from semfov.gaze.policies import Policy
 from semfov.paths import Record
 from semfov.runs.command import run_command
@@ -74,7 +74,7 @@ def test_a_call_that_was_stopped_continues(agent, flight, tmp_path, monkeypatch)
     ("where", "name"),
     [
         (semfov.ActivePerception, "find_all"), (Record, "to_dict"), (Record, "crops"), (Record, "to_yolo"),
-        (Record, "page_data"), (outcome, "save_figure"), (search, "write_bytes"), (outcome, "_outcome_text"),
+        (Record, "page_data"), (outcome, "save_figure"), (written, "write_bytes"), (outcome, "_outcome_text"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip
@@ -132,7 +132,7 @@ def test_pictures_with_long_names_end_no_command(run, photo, tmp_path):
 
 
 def test_a_full_disk_ends_a_command_that_then_continues(agent, folder, tmp_path, monkeypatch, capsys):
-    find_all, write, seen = agent.find_all, search.write_bytes, []
+    find_all, write, seen = agent.find_all, written.write_bytes, []
 
     def full(path, content):
         if path.endswith("b.txt"):
@@ -140,12 +140,12 @@ def test_a_full_disk_ends_a_command_that_then_continues(agent, folder, tmp_path,
         write(path, content)
 
     monkeypatch.setattr(agent, "find_all", lambda *given, **named: seen.append(given) or find_all(*given, **named))
-    monkeypatch.setattr(search, "write_bytes", full)
+    monkeypatch.setattr(written, "write_bytes", full)
     wanted = {"agent": agent, "passes": 1, "out": tmp_path / "found.jsonl", "labels": tmp_path / "labels"}
     with pytest.raises(DataError, match="make room, and give the same command again"):
         semfov.run(folder, "red", **wanted)
     assert "the same command continues" in capsys.readouterr().err
-    monkeypatch.setattr(search, "write_bytes", write)
+    monkeypatch.setattr(written, "write_bytes", write)
     rows = semfov.run(folder, "red", **wanted)
     assert ["error" in row for row in rows] == [False] * 3
     assert len(seen) == 4  # the second picture twice
@@ -192,7 +192,7 @@ def test_an_argument_that_no_picture_can_be_looked_at_with_is_refused(agent, fol
 
 def test_only_outcomes_of_the_same_agent_are_continued(agent, flight):
     def key(one):
-        return digest_of(_FindJob(FindOptions(pictures=(str(flight),), recursive=True), one).depends_on())
+        return digest_of(FindJob(FindOptions(pictures=(str(flight),), recursive=True), one).depends_on())
 
     before = key(agent)
     agent.find_all(flight / "low" / "b.png", "red", passes=1)

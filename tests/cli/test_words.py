@@ -9,12 +9,14 @@ from pathlib import Path
 import pytest
 
 import semfov
-from semfov.cli import agent, live, options, search, sources, start
-from semfov.cli.main import _SUBCOMMANDS, _completion, _in_command_words, _options_of, main
+from semfov.cli import agent, jobs, live, options, search, sources, start
+from semfov.cli.commands import SUBCOMMANDS
+from semfov.cli.main import _completion, _in_command_words, _options_of, main
 from semfov.cli.outcome import table_lines
 from semfov.cli.results import kind_of
 from semfov.errors import InputError
-from semfov.runs.command import _usual_form, make_parser
+from semfov.runs.arguments import usual_form
+from semfov.runs.command import make_parser
 from tests import small
 
 REFUSED = {
@@ -25,7 +27,7 @@ REFUSED = {
     "search": "target: expected a class, --target cup, got none; `semfov detectors yolox-nano` lists them",
     "find --target cup,zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "find --start 5,5": "start: expected none for find",
-    "find --start abc": "start: expected none for find",
+    "find --start 47": "start: expected none for find",
     "search nosuch.jpg --target cup": "picture: no such file or folder: nosuch.jpg; check the path",
     "explore film.mp4": "picture: expected photographs; `semfov live` takes videos, got film.mp4",
     "explore http://example.org/a.jpg": "picture: expected a file on this machine",
@@ -47,10 +49,9 @@ REFUSED = {
     "live --camera 0 --frames 0": "frames: expected a whole number from 1",
     "search --target cup --passes 0": "passes: expected a whole number from 1 to 1,000,000, got 0",
     "search --target cup --shifts -1": "shifts: expected a whole number from 0 to 10,000, got -1",
-    "search --target cup --seconds 0": "seconds: expected a number above 0",
-    "search --target cup --confirm 50": "confirm: expected a number from 0 to 1, got 50",
-    "search --target cup --give-up -1": "give_up: expected a number from 0 to 1, got -1",
-    "search --target cup --start 5;5": "start: expected a cell as column,row (5,5) or as its number (47), got '5;5'",
+    "search --target cup --seconds -1": "seconds: expected a number from 0, got -1",
+    "search --target cup --confirm 50": "confirm: expected a probability from 0 to 1, got 50",
+    "search --target cup --give-up -1": "give_up: expected a probability from 0 to 1, got -1",
     "search --target cup --seed -1": "seed: expected a whole number from 0",
     "search --target cup --out a.xls": "out: expected a folder, or a file that ends in .coco.json, .json, .jsonl, .csv",
     "search --target cup --report a.pdf": "report: expected a file that ends in .html or .htm, got a.pdf",
@@ -86,6 +87,7 @@ WRONG_USE = {
     "search --xyz": "unknown option --xyz; --help-all lists all options",
     "search --target": "--target: expected a value, got none",
     "search --passes many --target cup": "passes: expected a whole number from 1 to 1,000,000, got 'many'",
+    "search --target cup --start 5;5": "start: expected a cell as column,row (5,5) or as its number (47), got '5;5'",
     "search --sensor wide": "sensor: expected 'published' or 'published-narrow' or",
     "search --agent recomended": "or 'raw', got 'recomended'; did you mean 'recommended'?",
     "search --draw portrait": "draw: expected some of 'scanpath', 'views', 'belief', 'belief_bars', 'animation'",
@@ -95,7 +97,7 @@ WRONG_USE = {
 
 @pytest.fixture(autouse=True)
 def _nothing_is_loaded(monkeypatch):
-    for module in (agent, live, search):
+    for module in (agent, live, jobs):
         monkeypatch.setattr(module, "make_agent", lambda options: pytest.fail("the agent was loaded"))
 
 
@@ -125,7 +127,7 @@ def test_wrong_use_is_refused_in_one_line_with_exit_code_2(command, tmp_path, ca
 def test_alone_it_lists_its_commands(words, capsys):
     assert main(words) == 0
     printed = capsys.readouterr().out
-    assert all(re.search(rf"^  {name} ", printed, re.M) for name in (*_SUBCOMMANDS, "completion"))
+    assert all(re.search(rf"^  {name} ", printed, re.M) for name in (*SUBCOMMANDS, "completion"))
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"semfov {semfov.__version__}\n"
 
@@ -136,7 +138,7 @@ def test_help_tells_that_the_output_may_be_a_file_or_a_folder(name, capsys):
     assert {"FILE", "FOLDER"} <= {*re.findall(r"^  --out (\w+)", capsys.readouterr().out, re.M)}
 
 
-@pytest.mark.parametrize("name", _SUBCOMMANDS)
+@pytest.mark.parametrize("name", SUBCOMMANDS)
 def test_help_is_one_screen_with_options_that_exist(name, capsys):
     """Its examples come first, and --help-all lists every option of the short help."""
     assert main([name, "--help"]) == 0
@@ -158,7 +160,7 @@ def test_options_may_have_dashes_or_underscores(tmp_path, capsys):
             main(["search", *words, "--print-config"])
         assert stopped.value.code == 0
         assert "give_up: 0.2" in capsys.readouterr().out
-    parser = make_parser(_options_of("search"), "", _SUBCOMMANDS["search"][0])
+    parser = make_parser(_options_of("search"), "", ("pictures", "pictures"))
     assert parser.parse_args(["a.jpg", "b.jpg"]).pictures == ["a.jpg", "b.jpg"]
 
 
@@ -201,7 +203,6 @@ def test_texts_of_options_are_read(tmp_path):
     named = options.SearchOptions(detector="torchvision:ssd", classes=(str(tmp_path / "names.txt"),))
     assert agent.detector_options(named)["classes"] == agent.detector_classes(named) == ("cup", "tin can")
     assert agent.several_classes("Cups, fork", ("cup", "fork")) == ["cup", "fork"]
-    assert [options.start_of(text) for text in ("5,7", "47", None)] == [(5, 7), 47, None]
     assert [options.white_of(text) for text in ("300,3000", "4095", "auto")] == [(300.0, 3000.0), 4095.0, "auto"]
     shown = sources._shown_by(options.PictureOptions(white="300,3000", bands="4,3,2"))
     assert shown == {"white": (300.0, 3000.0), "bands": (4, 3, 2)}
@@ -228,8 +229,8 @@ def test_options_are_written_as_in_other_commands():
     given = ["--give-up", "0.2", "--looks", "--draw", "path,views", "--config", "a.yaml", "--config", "b.yaml"]
     usual = ["--give_up", "0.2", "--looks=true", "--draw=[path,views]", "--config", "a.yaml", "--config", "b.yaml"]
     known = ["--give_up", "--looks", "--draw", "--config"]
-    assert _usual_form(given, options.SearchOptions, known) == usual
-    assert _usual_form(["--looks", "--looks"], options.SearchOptions, known) == ["--looks=true", "--looks=true"]
+    assert usual_form(given, options.SearchOptions, known) == usual
+    assert usual_form(["--looks", "--looks"], options.SearchOptions, known) == ["--looks=true", "--looks=true"]
 
 
 def test_a_shell_completes_commands_and_options():

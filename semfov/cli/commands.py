@@ -1,35 +1,37 @@
-"""Texts of the command: its help, one screen for each subcommand."""
+"""The subcommands: what each takes, which function runs it, and its help, one screen for each.
+
+A new one has an entry here, and a module with its options and its function. Nothing of it is imported before it is run,
+so that help and mistakes need no tensors.
+"""
+
+from typing import NamedTuple
 
 from semfov.cli.formats import suffixes_in_words
 
-_OVERVIEW = """\
-semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
 
-  semfov search kitchen.jpg --target cup            is there a cup, and where?
-  semfov find harbour.tif --target person           all people in a large picture, and how many
-  semfov explore street.jpg --report street.html    what is where, as a page with every look
-  semfov gaze poster.jpg --report poster.html       where people look, and in what order
-  semfov live --camera 0 --target cup               one look at each frame, until Ctrl-C
-  semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json
-  semfov detectors                                  detectors that can be named, and their licences
+class Subcommand(NamedTuple):
+    """A subcommand.
 
-Commands:
-  search      search pictures for a class, and decide whether it is there
-  find        find all objects of one class, of several or of all
-  explore     learn what is where, without a target
-  gaze        predict where people look
-  live        search or explore a video, a camera or a network stream
-  app         a page in the browser on which to try all this out, and to look yourself
-  check       say what is suspicious in a file of fixations
-  fit         fit all models to your own detector
-  detectors   list detectors, or the classes of one
-  completion  let bash, zsh or fish complete commands and options
+    Attributes:
+        summary: what it does, in the list of commands.
+        positional: the setting that has no option before it.
+        positional_help: what it is.
+        options: dataclass of its options, as `room.module:Name`.
+        function: what runs it, as `room.module:name`; it takes the options, and returns the exit code.
+        help: one screen of help, which begins with examples.
+        looking: whether it looks at pictures or frames, and shares the words of other programs for its options.
+        writes_rows: whether it writes results to standard output with `--out -`; the function then takes the stream.
+    """
 
-`semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
-`semfov completion bash >> ~/.bashrc` lets the shell complete commands and options (also zsh and fish).
-Without a picture, search, find, explore and gaze take one that comes with semfov: try `semfov search --target boat`.
-Others are example:market, example:lifeboat, example:aeroplane, example:farm and example:sheet.
-"""
+    summary: str
+    positional: str
+    positional_help: str
+    options: str
+    function: str
+    help: str
+    looking: bool = False
+    writes_rows: bool = False
+
 
 _AGENT = """\
   --detector NAME      yolox-nano (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
@@ -52,9 +54,19 @@ _OUTPUT = f"""\
 A picture of several that cannot be read is reported and skipped; the exit code is then 1. If a command with --out is
 stopped, the same command continues with the pictures that are left. --help-all: all options."""
 
-HELP = {
-    "semfov": _OVERVIEW,
-    "search": f"""\
+_PICTURES = "photographs, large pictures, or folders of them (none: one that comes with semfov)"
+_DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
+
+SUBCOMMANDS = {
+    "search": Subcommand(
+        summary="search pictures for a class, and decide whether it is there",
+        positional="pictures",
+        positional_help=_PICTURES,
+        options="cli.options:SearchOptions",
+        function="cli.search:look_at",
+        looking=True,
+        writes_rows=True,
+        help=f"""\
 semfov search: is it there, and where?
 
   semfov search kitchen.jpg --target cup
@@ -74,7 +86,16 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
-    "find": f"""\
+    ),
+    "find": Subcommand(
+        summary="find all objects of one class, of several or of all",
+        positional="pictures",
+        positional_help=_PICTURES,
+        options="cli.options:FindOptions",
+        function="cli.search:look_at",
+        looking=True,
+        writes_rows=True,
+        help=f"""\
 semfov find: all objects, and how many
 
   semfov find harbour.tif --target person
@@ -94,7 +115,16 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
   --batch N            windows that are looked at together
 {_OUTPUT}
 """,
-    "explore": f"""\
+    ),
+    "explore": Subcommand(
+        summary="learn what is where, without a target",
+        positional="pictures",
+        positional_help=_PICTURES,
+        options="cli.options:ExploreOptions",
+        function="cli.search:look_at",
+        looking=True,
+        writes_rows=True,
+        help=f"""\
 semfov explore: what is where
 
   semfov explore street.jpg
@@ -112,29 +142,14 @@ usage: semfov explore [PICTURE ...] [options]
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
-    "check": """\
-semfov check: is a file of fixations what it seems to be?
-
-  semfov check people.csv
-  semfov check tobii.tsv recordings/*.asc
-  semfov check fixations.csv --size 1600,1200 --picture scene.mp4      (Pupil Cloud, whose tables have neither)
-  semfov check fixations.csv --picture PICTURES      (also by what lies under the fixations)
-
-usage: semfov check FILE [FILE ...] [options]
-
-  FILE                 a table of fixations, as semfov, Tobii, Pupil Labs, PsychoPy, PyGaze, Gazepoint, pymovements or
-                       EyeLink Data Viewer write it, an ASC file of EyeLink, or JSON of COCO-Search18 or OSIE
-  --picture FOLDER     the pictures, or one picture (kitchen.jpg), whose sizes are compared with the frames, and are the
-                       frames where the file has none
-  --picture NAME       the picture's name, where the file has none; --subject NAME and --size W,H (the frame) likewise
-  --quiet              errors alone
-
-It tells frames, units, origins and axes that do not fit, letterboxes, repeats, blinks and odd durations. With five
-pictures or more it also compares the fixations with where people look in them: y upwards, mirrored, the size at which
-pictures were shown, wrong names, a calibration that was off; --rules-alone leaves that out. The exit code is 1 if
-anything is suspicious. --help-all: all options.
-""",
-    "gaze": """\
+    ),
+    "gaze": Subcommand(
+        summary="predict where people look",
+        positional="pictures",
+        positional_help=_PICTURES,
+        options="cli.options:GazeOptions",
+        function="cli.gaze:predict_gaze",
+        help="""\
 semfov gaze: where people look in a picture that they view freely
 
   semfov gaze poster.jpg --report poster.html
@@ -157,7 +172,15 @@ If a command with --out of scanpaths or a folder is stopped, the same command co
 It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to
 pages of text, to interfaces or to pictures that are not wider than high. --help-all: all options.
 """,
-    "live": f"""\
+    ),
+    "live": Subcommand(
+        summary="search or explore a video, a camera or a network stream",
+        positional="source",
+        positional_help="video file, or address",
+        options="cli.options:LiveOptions",
+        function="cli.live:look_live",
+        looking=True,
+        help=f"""\
 semfov live: one look at each frame of a video, a camera or a network stream
 
   semfov live --camera 0 --target cup
@@ -184,7 +207,67 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
 
 Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
 """,
-    "fit": """\
+    ),
+    "app": Subcommand(
+        summary="a page in the browser on which to try all this out, and to look yourself",
+        positional="detector",
+        positional_help=_DETECTOR,
+        options="cli.options:AppOptions",
+        function="cli.app:serve",
+        help=f"""\
+semfov app: a page in the browser on which to try the agent out
+
+  semfov app                                           (pip install "semfov[app]")
+  semfov app yolox-nano --port 8000
+  semfov app --models mymodels
+
+usage: semfov app [DETECTOR] [options]
+
+{_AGENT.partition(chr(10))[2]}
+  --host ADDRESS       address to serve the page on (default 127.0.0.1: this machine alone; no password is asked for)
+  --port N             its port (default: the first free one from 7860 on)
+
+Give it a picture or take an example, choose a class, and search, find all objects, explore, or predict where people
+look. Or look yourself: click on the picture, and see what the fovea sees there and what the agent then believes.
+Pictures are kept nowhere, and nothing is sent elsewhere. Ctrl-C ends it.
+""",
+    ),
+    "check": Subcommand(
+        summary="say what is suspicious in a file of fixations",
+        positional="files",
+        positional_help="files of fixations",
+        options="cli.options:CheckOptions",
+        function="cli.fixations:check_fixations",
+        help="""\
+semfov check: is a file of fixations what it seems to be?
+
+  semfov check people.csv
+  semfov check tobii.tsv recordings/*.asc
+  semfov check fixations.csv --size 1600,1200 --picture scene.mp4      (Pupil Cloud, whose tables have neither)
+  semfov check fixations.csv --picture PICTURES      (also by what lies under the fixations)
+
+usage: semfov check FILE [FILE ...] [options]
+
+  FILE                 a table of fixations, as semfov, Tobii, Pupil Labs, PsychoPy, PyGaze, Gazepoint, pymovements or
+                       EyeLink Data Viewer write it, an ASC file of EyeLink, or JSON of COCO-Search18 or OSIE
+  --picture FOLDER     the pictures, or one picture (kitchen.jpg), whose sizes are compared with the frames, and are the
+                       frames where the file has none
+  --picture NAME       the picture's name, where the file has none; --subject NAME and --size W,H (the frame) likewise
+  --quiet              errors alone
+
+It tells frames, units, origins and axes that do not fit, letterboxes, repeats, blinks and odd durations. With five
+pictures or more it also compares the fixations with where people look in them: y upwards, mirrored, the size at which
+pictures were shown, wrong names, a calibration that was off; --rules-alone leaves that out. The exit code is 1 if
+anything is suspicious. --help-all: all options.
+""",
+    ),
+    "fit": Subcommand(
+        summary="fit all models to your own detector",
+        positional="model",
+        positional_help=_DETECTOR,
+        options="fit.settings:FitDetectorConfig",
+        function="fit.detector:fit_folder",
+        help="""\
 semfov fit: fit all models to your own detector
 
   semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels
@@ -209,24 +292,14 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
 It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw
 scores on photographs that were held out. After an interruption the same command continues. --help-all: all options.
 """,
-    "app": f"""\
-semfov app: a page in the browser on which to try the agent out
-
-  semfov app                                           (pip install "semfov[app]")
-  semfov app yolox-nano --port 8000
-  semfov app --models mymodels
-
-usage: semfov app [DETECTOR] [options]
-
-{_AGENT.partition(chr(10))[2]}
-  --host ADDRESS       address to serve the page on (default 127.0.0.1: this machine alone; no password is asked for)
-  --port N             its port (default: the first free one from 7860 on)
-
-Give it a picture or take an example, choose a class, and search, find all objects, explore, or predict where people
-look. Or look yourself: click on the picture, and see what the fovea sees there and what the agent then believes.
-Pictures are kept nowhere, and nothing is sent elsewhere. Ctrl-C ends it.
-""",
-    "detectors": """\
+    ),
+    "detectors": Subcommand(
+        summary="list detectors, or the classes of one",
+        positional="name",
+        positional_help="detector, or folder of models",
+        options="cli.options:DetectorsOptions",
+        function="cli.detectors:show",
+        help="""\
 semfov detectors: detectors that can be named, or the classes of one
 
   semfov detectors                 names, licences, sizes, what is there already, and what models are shipped
@@ -246,5 +319,30 @@ usage: semfov detectors [NAME] [options]
 Weights of the default, yolox-nano, are in the package. Those of others are downloaded when they are first used, into
 $SEMFOV_CACHE or the user's cache folder. A detector without shipped models runs with --agent raw, or after semfov fit.
 """,
+    ),
 }
-"""The help of the command, and that of each subcommand: one screen."""
+"""The subcommands by name, in the order of the list of commands."""
+
+_SUMMARIES = {name: command.summary for name, command in SUBCOMMANDS.items()}
+_SUMMARIES["completion"] = "let bash, zsh or fish complete commands and options"
+
+OVERVIEW = f"""\
+semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
+
+  semfov search kitchen.jpg --target cup            is there a cup, and where?
+  semfov find harbour.tif --target person           all people in a large picture, and how many
+  semfov explore street.jpg --report street.html    what is where, as a page with every look
+  semfov gaze poster.jpg --report poster.html       where people look, and in what order
+  semfov live --camera 0 --target cup               one look at each frame, until Ctrl-C
+  semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json
+  semfov detectors                                  detectors that can be named, and their licences
+
+Commands:
+{chr(10).join(f"  {name:11} {summary}" for name, summary in _SUMMARIES.items())}
+
+`semfov COMMAND --help` shows a screen, `semfov COMMAND --help-all` every option, and `semfov --version` the version.
+`semfov completion bash >> ~/.bashrc` lets the shell complete commands and options (also zsh and fish).
+Without a picture, search, find, explore and gaze take one that comes with semfov: try `semfov search --target boat`.
+Others are example:market, example:lifeboat, example:aeroplane, example:farm and example:sheet.
+"""
+"""The help of the command itself."""

@@ -1,0 +1,297 @@
+"""The kinds of look as objects: what each opens of a picture, the episodes of its tasks, and the settings it takes."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any, ClassVar, Protocol
+
+from semfov.agents.episode import Episode, EpisodeLimits, without_none
+from semfov.agents.fovea import FoveaAgent, FoveaEpisode
+from semfov.agents.head import HeadAgent
+from semfov.agents.picture import OpenedPicture
+from semfov.agents.windows import ZoomAgent
+from semfov.belief.observers.any_of import TargetLike
+from semfov.decision import MOST_CLOSER
+from semfov.errors import InputError, check
+from semfov.paths import Record
+from semfov.settings import (
+    Drawing,
+    ExploreSettings,
+    FindSettings,
+    KindName,
+    LookSettings,
+    SearchSettings,
+    Start,
+    StreamSettings,
+    suitable_kinds,
+)
+from semfov.strategy import classes_named
+
+
+class AgentParts(Protocol):
+    """The parts of an agent, one for each kind of look; a part that the agent cannot have raises `InputError`."""
+
+    @property
+    def fovea(self) -> FoveaAgent: ...
+
+    @property
+    def zoom(self) -> ZoomAgent: ...
+
+    @property
+    def head(self) -> HeadAgent: ...
+
+
+class KindOfLook(ABC):
+    """A kind of look of an agent: it opens a picture in its own form, and runs the episode of each task.
+
+    A subclass is registered under its `name` by being defined (`KINDS_OF_LOOK`).
+
+    Attributes:
+        name: name of the kind, as `how=` has it.
+        described: what looks at a picture, in words.
+        drawings: figures that can be drawn of its records.
+    """
+
+    name: ClassVar[KindName]
+    described: ClassVar[str]
+    drawings: ClassVar[tuple[Drawing, ...]] = ("scanpath", "animation")
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        KINDS_OF_LOOK[cls.name] = cls
+
+    def __init__(self, parts: AgentParts) -> None:
+        self.parts = parts
+
+    @abstractmethod
+    def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
+        """Search a picture for a target (`ActivePerception.search`)."""
+
+    @abstractmethod
+    def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
+        """Find all objects of classes 1..K, or with none of all classes (`ActivePerception.find_all`)."""
+
+    @abstractmethod
+    def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
+        """Explore a picture (`ActivePerception.explore`)."""
+
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> Episode[Any]:
+        """Make the episode that looks at the frames of a stream (`ActivePerception.live`).
+
+        Args:
+            target: class 1..K to search for; None explores.
+            targets: classes 1..K whose objects are all to be found; empty for `target`.
+            settings: the settings of the task.
+
+        Returns:
+            The episode, to which frames are given.
+
+        Raises:
+            InputError: the kind takes no stream, or the settings do not suit the agent.
+        """
+        raise InputError(
+            "how: expected 'fovea', 'windows' or 'auto' for a stream; for a camera that turns use search, and for a "
+            f"panoramic frame search or find_all of semfov.Panorama(frame), got {self.name}"
+        )
+
+    @classmethod
+    def check_settings(cls, settings: LookSettings) -> None:
+        """Raise `InputError` for a setting that means nothing to this kind of look, with what to use instead."""
+        for setting in fields(settings):
+            value = getattr(settings, setting.name)
+            kinds, instead = suitable_kinds(setting)
+            if value is not None and cls.name not in kinds:
+                raise InputError(
+                    f"{setting.name}: expected none for a picture that is looked at by {cls.described}, got {value}; "
+                    f"use {instead}, or how={kinds[0]!r}"
+                )
+
+
+KINDS_OF_LOOK: dict[str, type[KindOfLook]] = {}
+"""The kinds of look by name."""
+
+
+class FoveaKind(KindOfLook):
+    """Looks of a fovea that moves over the cells of a photograph."""
+
+    name = "fovea"
+    described = "a fovea"
+    drawings = ("scanpath", "views", "belief", "belief_bars", "animation")
+    usual_rate = 2.5
+    """Default rate at which the belief fades in a stream, per second."""
+
+    def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
+        fovea = self.parts.fovea
+        record = fovea.search(
+            picture.image(fovea.eye.sensor.like),
+            target,
+            _limits(settings),
+            start=settings.start,
+            seed=settings.seed,
+            boxes=settings.boxes,
+            confirm=settings.confirm,
+            give_up=settings.give_up,
+            closer=MOST_CLOSER if settings.closer is None else settings.closer,
+            shifts=settings.shifts,
+            prior=settings.prior,
+        )
+        return picture.named(record)
+
+    def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
+        fovea = self.parts.fovea
+        image = picture.image(fovea.eye.sensor.like)
+        record = fovea.find_all(image, targets, _limits(settings), shifts=settings.shifts)
+        return _counted_from(picture.named(record), settings.least)
+
+    def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
+        fovea = self.parts.fovea
+        record = fovea.explore(
+            picture.image(fovea.eye.sensor.like),
+            _limits(settings),
+            start=settings.start,
+            seed=settings.seed,
+            shifts=settings.shifts,
+            worth=settings.worth,
+            policy=settings.policy,
+        )
+        return _counted_from(picture.named(record), settings.least)
+
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> Episode[Any]:
+        remedy = "for all objects of several classes use how='windows', and for one of them a class without a list"
+        check(not targets, "target", f"one class, or None; {remedy}", targets)
+        return FoveaEpisode(
+            self.parts.fovea,
+            target,
+            rate=self.usual_rate if settings.rate is None else settings.rate,
+            start=settings.start,
+            seed=settings.seed,
+            confirm=settings.confirm,
+            give_up=settings.give_up,
+            closer=MOST_CLOSER if settings.closer is None else settings.closer,
+            prior=settings.prior,
+            color=settings.color,
+        )
+
+
+class WindowKind(KindOfLook):
+    """Looks at windows of a picture of any size, the first of them the whole picture."""
+
+    name = "windows"
+    described = "windows"
+    usual_rate = 0.75
+    """Default rate at which looks are forgotten in a stream, per second: a look counts for 0.9 s."""
+
+    def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
+        return self.parts.zoom.search(
+            picture.large,
+            _one_class(target),
+            passes=settings.passes,
+            seconds=settings.seconds,
+            on_look=settings.on_look,
+            confirm=settings.confirm,
+            give_up=settings.give_up,
+            closer=settings.closer,
+            prior=settings.prior,
+        )
+
+    def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
+        target = targets[0] if len(targets) == 1 else list(targets) or None
+        return self.parts.zoom.find_all(picture.large, target, batch=settings.batch, **_of_objects(settings))
+
+    def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
+        return self.parts.zoom.explore(picture.large, **_of_objects(settings))
+
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> Episode[Any]:
+        return self.parts.zoom.episode(
+            target,
+            targets,
+            rate=self.usual_rate if settings.rate is None else settings.rate,
+            follows=True,
+            confirm=settings.confirm,
+            give_up=settings.give_up,
+            closer=settings.closer,
+            prior=settings.prior,
+            color=settings.color,
+        )
+
+
+class HeadKind(KindOfLook):
+    """Looks of an eye in a head that turns in a scene."""
+
+    name = "head"
+    described = "a head that turns"
+
+    def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
+        return self.parts.head.search(
+            picture.world,
+            _one_class(target),
+            passes=settings.passes,
+            seconds=settings.seconds,
+            on_look=settings.on_look,
+            start=_first_action(settings.start),
+            confirm=settings.confirm,
+            give_up=settings.give_up,
+            prior=settings.prior,
+            seed=settings.seed,
+            **without_none(duration=settings.duration),
+        )
+
+    def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
+        chosen = without_none(worth=settings.worth, duration=settings.duration)
+        record = self.parts.head.find_all(
+            picture.world,
+            targets or None,
+            passes=settings.passes,
+            seconds=settings.seconds,
+            on_look=settings.on_look,
+            **chosen,
+        )
+        return _counted_from(record, settings.least)
+
+    def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
+        chosen = without_none(worth=settings.worth, duration=settings.duration)
+        record = self.parts.head.explore(
+            picture.world,
+            passes=settings.passes,
+            seconds=settings.seconds,
+            on_look=settings.on_look,
+            start=_first_action(settings.start),
+            seed=settings.seed,
+            **chosen,
+        )
+        return _counted_from(record, settings.least)
+
+
+def _limits(settings: LookSettings) -> EpisodeLimits:
+    """Begin the time of an episode, and take its limits from the settings."""
+    return EpisodeLimits(settings.passes, settings.seconds, settings.on_look)
+
+
+def _counted_from(record: Record, least: float | None) -> Record:
+    """Count the objects of a record from a probability or score on; None leaves the record as it is."""
+    return record if least is None else replace(record, least=least)
+
+
+def _of_objects(settings: FindSettings | ExploreSettings) -> Mapping[str, Any]:
+    """List the settings of windows that look for all objects."""
+    return without_none(
+        passes=settings.passes,
+        seconds=settings.seconds,
+        on_look=settings.on_look,
+        worth=settings.worth,
+        least=settings.least,
+    )
+
+
+def _first_action(start: Start) -> int | None:
+    """Take the first action of a head, which has no columns and rows."""
+    if isinstance(start, tuple):
+        raise InputError(f"start: expected the number of an action for a head (semfov.head.views.Views), got {start}")
+    return start
+
+
+def _one_class(target: TargetLike) -> str | int:
+    """Take the class that is searched for where only one can be."""
+    classes = classes_named(target)
+    check(len(classes) == 1, "target", "one class for a search by windows or a head; find_all takes several", target)
+    return classes[0]

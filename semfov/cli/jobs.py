@@ -1,0 +1,333 @@
+"""What the commands search, find and explore do with a picture: jobs that any process can make from the options."""
+
+import io
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout, suppress
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import torch
+from tqdm import tqdm
+
+from semfov.agent import ActivePerception
+from semfov.agents.kinds import KINDS_OF_LOOK
+from semfov.agents.picture import PictureLike
+from semfov.belief.grid import Grid
+from semfov.cli.agent import detector_classes, make_agent, several_classes
+from semfov.cli.options import ALL_DRAWINGS, ExploreOptions, FindOptions, PictureOptions, SearchOptions
+from semfov.cli.outcome import PictureOutcome
+from semfov.cli.results import STDOUT, kind_of
+from semfov.cli.sources import PictureSource, example_source, picture_sources
+from semfov.cli.truth import Truth
+from semfov.data import WordVectors, class_index, spread
+from semfov.data.examples import example_with
+from semfov.data.large import picture_size
+from semfov.errors import InputError, SemfovError, check
+from semfov.head.scenes import World
+from semfov.io.files import check_writable, sha256
+from semfov.io.manifest import FILE as MANIFEST
+from semfov.io.pretrained import Pretrained
+from semfov.io.ranges import CheckedSettings
+from semfov.paths import Record
+from semfov.report.template import page_path
+from semfov.runs.config import WHERE
+from semfov.settings import Drawing, ExploreSettings, FindSettings, SearchSettings
+
+_Options = TypeVar("_Options", bound=PictureOptions)
+
+
+class PictureJob(ABC, Generic[_Options]):
+    """Looks at pictures as the options say; any process can make it from the options.
+
+    Attributes:
+        task: settings that the options give to the agent, as its keywords.
+        every: whether all objects are wanted, which begins with the whole picture.
+        drawings: figures that can be drawn of the looks of a fovea.
+        sources: the pictures.
+        title: what is done, in words.
+        target: class that is searched for, or the first of those to find; None for all.
+        targets: the classes that results are about; None for all.
+        weights: probability that each class is meant by the target of a search; None for other tasks.
+    """
+
+    task: ClassVar[type[CheckedSettings]]
+    every: ClassVar[bool] = False
+    drawings: ClassVar[tuple[Drawing, ...]] = ALL_DRAWINGS
+
+    def __init__(self, options: _Options, agent: ActivePerception | None = None) -> None:
+        self.options = options
+        self.title = ""
+        self.target: str | None = None
+        self.targets: Sequence[str] | None = None
+        self.weights: dict[str, float] | None = None
+        self.sources = picture_sources(options)
+        self.several = len(self.sources) > 1
+        self._check_names()
+        self.truth = None if options.annotations is None else Truth(options.annotations)
+        if self.truth is not None:
+            for source in self.sources:
+                self.truth.image_id(source.name)
+        if self.every:
+            first = "none for find, which begins with the whole picture"
+            check(options.start is None, "start", first, repr(options.start))
+        _check_outputs(options)
+        # What is wrong with the target is told before the agent is loaded, where its classes are known by then.
+        self.aim(detector_classes(options) if agent is None else agent.classes[1:])
+        self.agent = make_agent(options) if agent is None else agent
+        classes = self.agent.classes[1:]
+        self.aim(classes)
+        if self.truth is not None:
+            self.truth.categories(self.targets or classes)
+        if not self.sources:
+            name = "sheet" if self.every else example_with(self.target, classes)
+            self.sources = [example_source(name, classes, self.target)]
+
+    def _check_names(self) -> None:
+        """Raise `InputError` where files that are named as their pictures would have the same name."""
+        counts = Counter(str(source.place.with_suffix("")) for source in self.sources)
+        repeated = ", ".join([place for place, times in counts.items() if times > 1][:3])
+        for name, folder in (("crops", self.options.crops), ("labels", self.options.labels)):
+            expected = f"pictures of different names with --{name}, whose files have their names"
+            check(not repeated or folder is None, name, expected, repeated)
+
+    def aim(self, classes: Sequence[str] | None) -> None:
+        """Take the target from the options; before the names of the classes are known it is not checked.
+
+        Args:
+            classes: the detector's classes; None if they are known only after it is loaded.
+        """
+        self.title = "exploration"
+
+    def depends_on(self) -> dict[str, Any]:
+        """List what outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
+        agent = self.agent
+        folder = self.options.models
+        options = self.options.plain()
+        return {
+            "options": {name: value for name, value in options.items() if name not in (*WHERE, "quiet")},
+            "eye": agent.eye.settings(),
+            "classes": agent.classes,
+            "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
+            # Agents that Python makes are told apart by the settings of their parts.
+            "parts": [
+                (place, type(part).__qualname__, _plain_attributes(part)) for place, part in agent.named_modules()
+            ],
+            "weights": self.weights,
+            "folder": None if folder is None else sha256(folder / MANIFEST),
+            "annotations": None if self.truth is None else self.truth.digest,
+        }
+
+    @abstractmethod
+    def look(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
+        """Look at a picture.
+
+        Args:
+            picture: the opened picture.
+            settings: the settings of the task, as keywords of the agent.
+            source: where the picture is from.
+
+        Returns:
+            The record.
+        """
+
+    def outcome(self, number: int) -> PictureOutcome | SemfovError:
+        """Look at a picture, and make its text, row and figures.
+
+        Args:
+            number: number of the picture.
+
+        Returns:
+            The outcome. An error is returned, not raised, where other pictures can still be looked at.
+        """
+        source = self.sources[number]
+        began = time.perf_counter()
+        try:
+            with torch.inference_mode():
+                picture = source.opened(self.options.how)
+                if self.truth is not None:
+                    self.truth.image_id(source.name, picture_size(source.picture()))
+                settings = {setting.name: getattr(self.options, setting.name) for setting in fields(self.task)}
+                if isinstance(picture, World):
+                    settings["how"] = "auto"
+                settings["on_look"] = self._progress(source.name)
+                record = self.look(picture, settings, source)
+                seconds = time.perf_counter() - began
+                return PictureOutcome.of(record, picture, source, self.options, seconds, self.truth)
+        except Exception as error:
+            # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
+            return source.fault(error, several=self.several)
+
+    def _progress(self, name: str) -> Callable[[Record], object] | None:
+        """Make the bar of passes of one picture on a terminal, as a function that is called after each look."""
+        if self.several or self.options.quiet or not sys.stderr.isatty():
+            return None
+        bar = tqdm(desc=Path(name).name, unit="pass", total=self.options.passes, leave=False, dynamic_ncols=True)
+        return lambda record: bar.update(record.passes - bar.n)
+
+    def check_drawings(self) -> None:
+        """Raise `InputError` where a picture is looked at in a way that has no figure of a kind that is wanted."""
+        for source in self.sources if self.options.draw else ():
+            try:
+                kind = self.agent.kind_of_look(source.picture(), self.options.how, every=self.every)
+            except Exception:
+                continue  # it is told when the picture is looked at
+            possible = [drawing for drawing in KINDS_OF_LOOK[kind].drawings if drawing in self.drawings]
+            impossible = ", ".join(drawing for drawing in self.options.draw or () if drawing not in possible)
+            expected = f"{' or '.join(possible)} for {source.name}, which is looked at by {kind!r}"
+            check(not impossible, "draw", expected, impossible)
+
+
+class SearchJob(PictureJob[SearchOptions]):
+    """Searches pictures for a class."""
+
+    task = SearchSettings
+    drawings = (*ALL_DRAWINGS, "belief_bars")
+
+    def aim(self, classes: Sequence[str] | None) -> None:
+        """Find the classes that the target may mean, each with a weight."""
+        options = self.options
+        if not options.target:
+            name = options.detector if options.models is None else options.models
+            raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
+        if classes is not None and self.weights is None:
+            self.weights = meant_classes(options, classes)
+            self.target = next(iter(self.weights))
+            self.targets = [self.target]
+            self.title = f"search for “{self.target}”"
+
+    def look(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
+        """Search a picture."""
+        weights = self.weights or {}
+        several = len(weights) > 1
+        foveal = several or self.options.start is not None or self.options.shifts is not None
+        is_fovea = self.agent.kind_of_look(picture, settings["how"], foveal=foveal) == "fovea"
+        if several and not is_fovea:
+            print(
+                f"large pictures and scenes are searched only for the most likely class: {self.target}",
+                file=sys.stderr,
+            )
+        if is_fovea and settings["start"] is None:
+            settings = {**settings, "start": self._start_off_target(source)}
+        return self.agent.search(picture, weights if several and is_fovea else next(iter(weights)), **settings)
+
+    def _start_off_target(self, source: PictureSource) -> int | None:
+        """Draw a first cell off the target of an example; None for other pictures, whose target is not known."""
+        scene = source.scene
+        if scene is None or scene.boxes is None:
+            return None
+        height, width = scene.image.shape[-2:]
+        grid = Grid(self.agent.columns, self.agent.rows, (width, height))
+        free_cells = (~grid.footprint(scene.boxes).any(0)).nonzero()[:, 0]
+        if not len(free_cells):
+            return None
+        generator = torch.Generator().manual_seed(self.options.seed)
+        return int(free_cells[torch.randint(len(free_cells), (1,), generator=generator)])
+
+
+class FindJob(PictureJob[FindOptions]):
+    """Finds all objects in pictures."""
+
+    task = FindSettings
+    every = True
+
+    def aim(self, classes: Sequence[str] | None) -> None:
+        """Take the classes to find; None for all."""
+        self.targets = several_classes(self.options.target, classes)
+        self.target = None if self.targets is None else self.targets[0]
+        self.title = "all objects" if not self.targets else f"all objects: {', '.join(self.targets)}"
+
+    def look(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
+        """Find all objects in a picture."""
+        return self.agent.find_all(picture, self.targets, **settings)
+
+
+class ExploreJob(PictureJob[ExploreOptions]):
+    """Explores pictures."""
+
+    task = ExploreSettings
+
+    def look(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
+        """Explore a picture."""
+        return self.agent.explore(picture, **settings)
+
+
+def make_again(kind: type[PictureJob[Any]], options: PictureOptions) -> PictureJob[Any]:
+    """Make a job in a process that works for another one.
+
+    Args:
+        kind: the class of the job.
+        options: its options.
+
+    Returns:
+        The job.
+    """
+    with redirect_stdout(io.StringIO()):  # the process that was called has said it
+        return kind(options)
+
+
+def _plain_attributes(part: torch.nn.Module) -> dict[str, object]:
+    """List the numbers and words among the attributes of a part."""
+    return {name: value for name, value in vars(part).items() if type(value) in (bool, int, float, str)}
+
+
+def _check_outputs(options: PictureOptions) -> None:
+    """Raise an error for outputs that cannot be written or do not go together, before anything is loaded."""
+    out = options.out
+    if out is not None and out != STDOUT:
+        check_writable(out, folder=kind_of(out) is None)
+    if options.report is not None:
+        check_writable(page_path(options.report))
+    for folder in (options.crops, options.labels):
+        if folder is not None:
+            check_writable(folder, folder=True)
+    is_coco = out is not None and kind_of(out) == ".coco.json"
+    check(options.annotations is None or is_coco, "annotations", "--out FILE.coco.json beside it", out)
+    check(not options.draw or out not in (None, STDOUT), "draw", "--out FOLDER beside --draw", "none")
+
+
+def meant_classes(options: SearchOptions, classes: Sequence[str]) -> dict[str, float]:
+    """Find the classes that the target of a search may mean.
+
+    Args:
+        options: the options, with the target and the word vectors.
+        classes: the detector's classes.
+
+    Returns:
+        The weight of each class that may be meant, the most likely first.
+
+    Raises:
+        InputError: the target is no class, and there are no word vectors by which it means some.
+    """
+    target = options.target or ""
+    try:
+        return {classes[class_index(target, classes, "target") - 1]: 1.0}
+    except InputError as error:
+        if options.embeddings is None:
+            return _any_of_classes(options, classes, error)
+    vectors = WordVectors.read(options.embeddings, [target, *classes])
+    weights = spread(target, classes, vectors)
+    print(f"“{target}” may mean: {', '.join(f'{name} {weight:.2f}' for name, weight in weights.items())}")
+    if vectors.missing:
+        print(f"  words without a vector in {options.embeddings}: {', '.join(vectors.missing)}")
+    return weights
+
+
+def _any_of_classes(options: SearchOptions, classes: Sequence[str], error: InputError) -> dict[str, float]:
+    """Read a target that is no class as several classes for a fovea; else raise the error with what it can be."""
+    names: list[str] = []
+    with suppress(InputError):
+        names = [classes[class_index(name.strip(), classes) - 1] for name in (options.target or "").split(",")]
+    if len(names) > 1:
+        if options.how == "fovea" or options.start is not None or options.shifts is not None:
+            return dict.fromkeys(names, 1.0)
+        raise InputError(
+            f"{error}; a search is for one class, `semfov find` takes several, and --how fovea any of them"
+        ) from None
+    if "did you mean" in str(error):
+        raise error
+    raise InputError(f"{error}; a description needs --embeddings, a file of word vectors") from None

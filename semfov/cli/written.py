@@ -1,0 +1,120 @@
+"""The files that a command writes about its pictures: results, figures, crops, labels and a page."""
+
+from pathlib import Path
+from typing import Any, TextIO
+
+from semfov.cli.jobs import PictureJob
+from semfov.cli.outcome import PictureOutcome
+from semfov.cli.results import STDOUT, ResultsFile, kind_of, results_format, tell_written, unfinished
+from semfov.errors import SemfovError
+from semfov.io.files import plain_name, write_bytes
+from semfov.report import write_page
+from semfov.runs.results import SceneResults
+
+_KEPT = ("ended", "text", "row", "episode", "names")
+"""Attributes of an outcome from which it is made again, without its files."""
+
+
+class PictureFiles:
+    """Files that a command writes about its pictures.
+
+    Attributes:
+        rows: the rows of the pictures so far, by number; those that were left out have an `error`.
+        finished: the outcomes that the same command takes up after an interruption; None for one picture.
+    """
+
+    def __init__(self, job: PictureJob[Any], stream: TextIO) -> None:
+        self.job = job
+        self.rows: dict[int, dict[str, Any]] = {}
+        self.finished: SceneResults | None = None
+        self._written = list[Path]()
+        self._episodes: dict[int, dict[str, Any]] = {}
+        self._results: ResultsFile | None = None
+        self._folder: Path | None = None
+        out = job.options.out
+        if out is None:
+            return
+        kind = kind_of(out)
+        form = results_format(out, searched=job.title.startswith("search"), truth=job.truth)
+        form.check_files([source.file for source in job.sources])
+        file = out if kind is not None else out / "results.json"
+        self._results = ResultsFile(file, form, stream)
+        self._folder = out if kind is None else out.with_name(out.name.partition(".")[0])
+        if job.several and out != STDOUT:
+            self.finished = unfinished(file, job.depends_on(), job.sources)
+
+    def finished_before(self) -> dict[int, PictureOutcome]:
+        """Read the outcomes of an interrupted command with the same options and models, by number."""
+        if self.finished is None:
+            return {}
+        stored = self.finished.items(len(self.job.sources))
+        return {number: PictureOutcome(**values["records"][0]) for number, values in stored}
+
+    def write_figures(self, number: int, outcome: PictureOutcome | SemfovError) -> PictureOutcome | SemfovError:
+        """Write the crops, the labels and the figures of a picture.
+
+        Args:
+            number: number of the picture.
+            outcome: its outcome. If an earlier command finished the picture, the files exist already.
+
+        Returns:
+            The outcome, or why the files cannot be written.
+        """
+        if isinstance(outcome, SemfovError):
+            return outcome
+        source = self.job.sources[number]
+        try:
+            for path, content in outcome.files.items():
+                write_bytes(path, content)
+            if self._folder is not None:
+                name = plain_name(Path(source.name).name)
+                folder = self._folder / f"{number:03d}-{name}" if self.job.several else self._folder
+                for file, content in outcome.figures.items():
+                    write_bytes(folder / file, content)
+                self._written += [folder / file for file in outcome.names]
+        except Exception as error:
+            return source.fault(error, several=self.job.several)
+        return outcome
+
+    def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
+        """Write the row of a picture, and keep it for the same command.
+
+        Args:
+            number: number of the picture.
+            outcome: its outcome.
+            before: whether an earlier command finished it, and has kept it.
+        """
+        self.rows[number] = outcome.row["picture"]
+        if self._results is not None:
+            self._results.add(number, outcome.row)
+        if outcome.episode is not None:
+            self._episodes[number] = outcome.episode
+        if self.finished is not None and not before:
+            self.finished.save(number, [{name: getattr(outcome, name) for name in _KEPT}], {})
+
+    def skip(self, number: int, reason: str) -> None:
+        """Note a picture that is left out, and the reason."""
+        self.rows[number] = {"picture": self.job.sources[number].name, "error": reason}
+        if self._results is not None:
+            self._results.add(number, {"picture": self.rows[number]})
+
+    def finish(self, *, complete: bool) -> None:
+        """Write the results and the page of all pictures so far, and list what was written.
+
+        Args:
+            complete: whether all pictures were looked at.
+        """
+        options = self.job.options
+        written: list[object] = []
+        if self._results is not None:
+            self._results.write()
+            if complete and any("error" not in row for row in self.rows.values()):
+                self._results.print_judgement()
+            if self._results.path != STDOUT:
+                written.append(self._results.path)
+        written += self._written
+        if self._episodes:
+            episodes = [self._episodes[number] for number in sorted(self._episodes)]
+            written.append(write_page(options.report, f"semfov: {self.job.title}", episodes))
+        written += [folder for folder in (options.crops, options.labels) if folder is not None]
+        tell_written(written, self.finished, None if complete else f"{len(self.rows)} of {len(self.job.sources)}")

@@ -1,0 +1,188 @@
+"""Arguments of a command line as users write them: brought into the parser's form, or refused in one line."""
+
+import re
+from collections import deque
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import fields
+from difflib import get_close_matches
+from keyword import iskeyword
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Literal, Union, get_args, get_origin, get_type_hints
+
+from semfov.errors import check
+from semfov.io.ranges import NOUNS, CheckedSettings
+
+_FLAGS = ("true", "false", "yes", "no", "True", "False")
+"""Words that may follow a flag as its value."""
+
+
+def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options: Container[str]) -> list[str]:
+    """Bring arguments into the form that the parser understands.
+
+    Names of options may have dashes, a flag needs no value, several words or numbers no brackets, and `none` is the
+    empty list.
+
+    Args:
+        arguments: the words of the command line.
+        config: dataclass of the settings.
+        options: the options of the parser, with underscores, such as `--give_up`.
+
+    Returns:
+        The words for the parser. Those that it does not know stay as they are.
+
+    Raises:
+        InputError: an option that takes one value is given twice, or one that takes a file is given no name.
+    """
+    hints = setting_types(config)
+    usual: list[str] = []
+    words = deque(arguments)
+    while words:
+        word = words.popleft()
+        if word == "--":
+            return [*usual, word, *words]
+        name, has_value, text = word.partition("=")
+        option = _in_python(name)
+        if not word.startswith("--") or option not in options:
+            usual.append(word)
+            continue
+        hint = hints.get(option.removeprefix("--"))
+        _check_given_once(option, hint, usual)
+        value = text if has_value else _value_after(hint, words)
+        if hint is Path:
+            following = words[0] if value is None and words else value
+            check(following != "", option.removeprefix("--"), "the name of a file or folder", "an empty one")
+        usual.append(option if value is None else f"{option}={_in_brackets(hint, value)}")
+    return usual
+
+
+def _in_python(name: str) -> str:
+    """Write the name of an option with underscores, and as its setting is called where Python has the word itself."""
+    option = "--" + name[2:].replace("-", "_")
+    return f"{option}_" if iskeyword(option[2:]) else option  # --try is `try_`
+
+
+def _check_given_once(option: str, hint: object, before: Iterable[str]) -> None:
+    """Raise `InputError` for an option that is given again; flags and `--config` may be."""
+    if hint is bool or option == "--config":
+        return
+    given_before = any(word.partition("=")[0] == option for word in before)
+    remedy = "; where it takes several, as a,b" if hint is str or _is_list(hint) else ""
+    check(not given_before, option.removeprefix("--"), "once", f"it again{remedy}")
+
+
+def _value_after(hint: object, words: deque[str]) -> str | None:
+    """Take the value of an option from the words after it; None leaves it to the parser."""
+    if hint is bool:
+        return words.popleft() if words and words[0] in _FLAGS else "true"
+    takes_several = _is_list(hint) or _may_be_tuple(hint)
+    if takes_several and words and not words[0].startswith("--"):
+        return words.popleft()
+    return None
+
+
+def _in_brackets(hint: object, value: str) -> str:
+    """Put several words or numbers in brackets, which users leave out."""
+    if value.startswith("["):
+        return value
+    if _is_list(hint):
+        return "[]" if value in ("none", "") else f"[{value}]"
+    return f"[{value}]" if _may_be_tuple(hint) and "," in value else value
+
+
+def mistake(message: str, config: type[CheckedSettings], options: Iterable[str], help_option: str) -> str:
+    """Say in one line what is wrong with the arguments, with the names that may be meant.
+
+    Args:
+        message: the message of the parser.
+        config: dataclass of the settings.
+        options: the options of the parser.
+        help_option: the option that lists them all.
+
+    Returns:
+        The line.
+    """
+    unknown = re.match(r"unrecognized arguments: (.*)", message, re.DOTALL)
+    if unknown:
+        return _unknown_argument(unknown[1], options, help_option)
+    missing = re.match(r"argument (--\S+): expected one argument", message)
+    if missing:
+        return f"{missing[1].replace('_', '-')}: expected a value, got none"
+    setting = re.search(r'Parser key "([\w.]+)"', message)
+    got = re.search(r"(?:Given|Got) value: (.*)", message)
+    hint = setting_types(config).get(setting[1]) if setting else None
+    expected = _expected(hint)
+    if setting is None or got is None or expected is None:
+        return " ".join(message.split())
+    value = got[1].strip()
+    matches = get_close_matches(value, _words_of(hint), n=1, cutoff=0.5)
+    suggestion = f"; did you mean {matches[0]!r}?" if matches else ""
+    return f"{setting[1]}: expected {expected}, got {value!r}{suggestion}"
+
+
+def _unknown_argument(text: str, options: Iterable[str], help_option: str) -> str:
+    """Say what is wrong with arguments that the parser does not know."""
+    option = next((word.partition("=")[0] for word in text.split() if word.startswith("-")), None)
+    if option is None:
+        return f"unexpected argument {text!r}; put a name with spaces in quotes, and commas in a list"
+    names = [name[2:].replace("_", "-") for name in options]
+    matches = get_close_matches(option.lstrip("-").replace("_", "-"), names, n=1, cutoff=0.6)
+    remedy = f"did you mean --{matches[0]}?" if matches else f"{help_option} lists all options"
+    return f"unknown option {option}; {remedy}"
+
+
+def setting_types(config: type[CheckedSettings]) -> dict[str, object]:
+    """Find the types of settings.
+
+    Args:
+        config: dataclass of the settings.
+
+    Returns:
+        The types by dotted names, without None where another one is left.
+    """
+    types: dict[str, object] = {}
+    hints = get_type_hints(config, include_extras=True)
+    for setting in fields(config):
+        hint = hints[setting.name]
+        if get_origin(hint) in (Union, UnionType):
+            alternatives = [option for option in get_args(hint) if option is not type(None)]
+            hint = alternatives[0] if len(alternatives) == 1 else hint
+        types[setting.name] = hint
+        if isinstance(hint, type) and issubclass(hint, CheckedSettings):
+            types |= {f"{setting.name}.{name}": inner for name, inner in setting_types(hint).items()}
+    return types
+
+
+def _is_list(hint: object) -> bool:
+    """Tell whether a type is a list of words, paths or numbers of any length."""
+    item, *more = get_args(hint) or (None,)
+    item = get_args(item)[0] if get_origin(item) is Annotated else item
+    is_plain = item in (str, Path, float) or get_origin(item) is Literal
+    return get_origin(hint) is tuple and more == [Ellipsis] and is_plain
+
+
+def _may_be_tuple(hint: object) -> bool:
+    """Tell whether a type is one value or a tuple of several, as a cell by its number or its column and row."""
+    base = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    return get_origin(base) in (Union, UnionType) and any(get_origin(option) is tuple for option in get_args(base))
+
+
+def _words_of(hint: object) -> list[str]:
+    """List the words that a setting may be."""
+    if get_origin(hint) is Literal:
+        return [str(word) for word in get_args(hint)]
+    return _words_of(get_args(hint)[0]) if _is_list(hint) else []
+
+
+def _expected(hint: object) -> str | None:
+    """Say what a setting must be; None for types that need more words."""
+    words = _words_of(hint)
+    if words:
+        return f"some of {', '.join(map(repr, words))}" if _is_list(hint) else " or ".join(map(repr, words))
+    if get_origin(hint) is Annotated:
+        base, *annotations = get_args(hint)
+        nouns = [annotation.noun for annotation in annotations if annotation.noun is not None]
+        return " ".join([nouns[0] if nouns else NOUNS[base], *map(repr, annotations)])
+    if hint is bool:
+        return "true or false"
+    return NOUNS[hint] if hint is int or hint is float else None
