@@ -48,7 +48,7 @@ from semfov.settings import (
     documented_by,
 )
 from semfov.strategy import Strategy, classes_named
-from semfov.words import missing
+from semfov.words import AGENT, missing
 from semfov.zoom import GlimpseEvidence, WindowEye
 
 _Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes
