@@ -258,7 +258,7 @@ class _Evidence:
 def _looked_up(particular: _Array, places: _Array) -> _Array:
     """Take d at places `(n, 2)` in shares of the sides; 0 beyond the picture."""
     cells = np.floor(places * _SIDE).astype(np.int64)
-    inside = ((cells >= 0) & (cells < _SIDE)).all(1)
+    inside = np.all((cells >= 0) & (cells < _SIDE), axis=1)
     columns, rows = np.where(inside[:, None], cells, 0).T
     return np.where(inside, particular[rows, columns], 0.0)
 
