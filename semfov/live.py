@@ -90,6 +90,7 @@ class LivePerception:
         """
         got = "None (OpenCV gives None after the last frame, and where it cannot read one)"
         check(frame is not None, "frame", "a picture", got)
+        # Episodes take frames whose white is that of their type.
         if self._white is not None:
             frame = as_image(frame, argument="frame", white=self._white)
         picture = OpenedPicture.of(frame)

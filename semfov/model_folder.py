@@ -139,6 +139,7 @@ class ModelFolder:
         source, fitted_options = self.detector_source(detector, weights)
         loaded = load_detector(source, **{**fitted_options, **options})
         digest = self.manifest.detector["sha256"]
+        # Another file may hold the same network, such as the one that was shipped before.
         if NETWORKS.get(loaded.digest, loaded.digest) != NETWORKS.get(digest, digest):
             raise DataError(
                 f"detector: expected the network that {self.path} was fitted to (sha256 {digest[:12]}…), got {source} "

@@ -163,6 +163,7 @@ class SearchSettings(DecisionSettings, LookSettings, StartSettings):
     0.9
     """
 
+    # Tensors are compared element by element, so that settings with them could not be compared as a whole.
     boxes: Tensor | Sequence[Sequence[float]] | None = field(
         default=None, compare=False, metadata=_only_for("fovea", instead="passes")
     )
@@ -269,6 +270,7 @@ def help_of(kind: type[CheckedSettings]) -> dict[str, str]:
     '    seed: seed of the generator that draws the start and breaks ties.'
     """
     entries: dict[str, str] = {}
+    # From the base down, so that what a class says of an inherited setting replaces what its base says.
     for base in reversed(kind.__mro__):
         section = cleandoc(base.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
         entries |= {match[1]: match[0] for match in _ENTRY.finditer(section)}

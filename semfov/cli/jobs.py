@@ -70,6 +70,7 @@ class PictureJob(ABC, Generic[_Options]):
         self._check_names()
         self.truth = None if options.annotations is None else Truth(options.annotations)
         if self.truth is not None:
+            # A picture that the annotations lack is told now, and not after hours.
             for source in self.sources:
                 self.truth.image_id(source.name)
         if self.every:
@@ -152,7 +153,7 @@ class PictureJob(ABC, Generic[_Options]):
                 if self.truth is not None:
                     self.truth.image_id(source.name, picture_size(source.picture()))
                 settings = {setting.name: getattr(self.options, setting.name) for setting in fields(self.task)}
-                if isinstance(picture, World):
+                if isinstance(picture, World):  # a scene is looked at by a head, whatever it was opened as
                     settings["how"] = "auto"
                 settings["on_look"] = self._progress(source.name)
                 record = self.look(picture, settings, source)
@@ -164,6 +165,7 @@ class PictureJob(ABC, Generic[_Options]):
 
     def _progress(self, name: str) -> Callable[[Record], object] | None:
         """Make the bar of passes of one picture on a terminal, as a function that is called after each look."""
+        # Several pictures have one bar together.
         if self.several or self.options.quiet or not sys.stderr.isatty():
             return None
         bar = tqdm(desc=Path(name).name, unit="pass", total=self.options.passes, leave=False, dynamic_ncols=True)

@@ -162,6 +162,7 @@ def _as_settings(options: Mapping[str, Any], kind: type[PictureOptions]) -> dict
     for name, value in options.items():
         if value is not None and Path in get_args(hints[name]):
             values[name] = Path(value)
+    # A tuple of one figure or one cell is written in Python as the command has it.
     if isinstance(values.get("draw"), str):
         values["draw"] = (values["draw"],)
     if isinstance(values.get("start"), str):

@@ -39,7 +39,9 @@ class PictureFiles:
         form.check_files([source.file for source in job.sources])
         file = out if kind is not None else out / "results.json"
         self._results = ResultsFile(file, form, stream)
+        # Beside a file, figures have a folder of its name: found.coco.json and found/.
         self._folder = out if kind is None else out.with_name(out.name.partition(".")[0])
+        # One picture takes seconds, and what was written to a stream is gone.
         if job.several and out != STDOUT:
             self.finished = unfinished(file, job.depends_on(), job.sources)
 

@@ -50,6 +50,7 @@ class Range:
         if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
             return False
         try:
+            # A whole number stays one: 10**400 is out of any range, and no float.
             number = int(value) if isinstance(value, Integral) else float(value)
         except (OverflowError, ValueError):
             return False
@@ -122,6 +123,7 @@ def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: 
             continue
         value = values[field.name]
         hint = hints[field.name]
+        # Settings within settings have checked themselves, unless a parser has not made them yet.
         if not is_dataclass(hint):
             _check_value(hint, value, prefix + field.name)
         elif nested and not is_dataclass(value) and value is not None:

@@ -41,6 +41,7 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
         word = words.popleft()
         if word == "--":
             return [*usual, word, *words]
+        # Everything else is left to the parser, with its messages.
         name, has_value, text = word.partition("=")
         option = _in_python(name)
         if not word.startswith("--") or option not in options:
@@ -50,6 +51,7 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
         _check_given_once(option, hint, usual)
         value = text if has_value else _value_after(hint, words)
         if hint is Path:
+            # As `--out "$FOLDER"` is where the variable is not set; it would be the present folder.
             following = words[0] if value is None and words else value
             check(following != "", option.removeprefix("--"), "the name of a file or folder", "an empty one")
         usual.append(option if value is None else f"{option}={_in_brackets(hint, value)}")

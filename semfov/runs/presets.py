@@ -125,6 +125,7 @@ def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
     if choice.samples is not None:
         _check_takes_samples(choice, task)
     _check_scores(choice, task)
+    # A learned belief is fitted with its own footprint, memory and tempering.
     if choice.scores in ("learned", "fitted") or choice.policy == TARGET_EVIDENCE:
         _check_own_belief(choice)
     return choice
