@@ -20,8 +20,8 @@ from torch import Tensor
 
 from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_summary
-from semfov.agents.episode import EpisodeLimits
-from semfov.agents.windows import WindowEpisode
+from semfov.agents.episode import EpisodeLimits, Goal
+from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
 from semfov.data.classes import class_index
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.protocols import choose_classes
@@ -35,6 +35,7 @@ from semfov.runs.seeds import generator_for
 from semfov.runs.settings import Count, Seed, Share, Whole
 from semfov.runs.setup import check_sources, make_detector, make_scenes
 from semfov.runs.tables import table
+from semfov.settings import DecisionSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import WindowLooks
@@ -123,9 +124,10 @@ class PriorRun(SceneRun):
 
     def _search(self, source: WindowLooks, target: int, prior: float | None) -> ResultRecord:
         """Search the photograph for a class, and record the decision."""
-        limits = EpisodeLimits(WindowEpisode.usual_passes)
+        limits = EpisodeLimits(PASSES)
         names = ("background", *self.scenes.classes)
-        path = WindowEpisode(names, self.evidence, target, limits=limits, prior=prior).open(source).run()
+        task = WindowTask(Goal.of(names, target), self.evidence, DecisionSettings(prior=prior))
+        path = WindowEpisode(task, source, limits).run()
         decision = path.decision
         assert decision is not None
         return {"outcome": decision.outcome, "probability": decision.probability, "passes": path.passes}

@@ -1,7 +1,8 @@
 """Small models, beliefs, looks and detectors: seeded random numbers, or a rule that a test can state."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from semfov.belief.observers import Look, Semantic
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import Policy
+from semfov.paths.fovea import FoveaLook, FoveaLooks
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
 
 CLASSES = ("cat", "cup", "person")
@@ -200,19 +202,57 @@ def detections(scores: Tensor, boxes: Tensor) -> Detections:
 
 
 def scanpath(
-    grid: Grid, cells: Tensor, classes: tuple[str, ...] = ("background", "cat", "cup"), **given: object
+    grid: Grid,
+    cells: Tensor,
+    classes: tuple[str, ...] = ("background", "cat", "cup"),
+    detections: Sequence[Detections] | None = None,
+    seconds: Sequence[Mapping[str, float]] = (),
+    **given: object,
 ) -> Scanpath:
     """A scanpath with random probabilities and values and without detections, unless they are given."""
-    looks, generator = len(cells), torch.Generator().manual_seed(0)
+    count, generator = len(cells), torch.Generator().manual_seed(0)
     settings = {
         "target": None,
-        "fixations": grid.centres[cells],
-        "detections": (Detections.empty(1, len(classes) - 1),) * looks,
-        "probabilities": torch.rand(looks, len(grid), len(classes), generator=generator),
-        "values": torch.rand(looks, len(grid), generator=generator),
+        "probabilities": torch.rand(count, len(grid), len(classes), generator=generator),
+        "values": torch.rand(count, len(grid), generator=generator),
         "found": False,
-    }
-    return Scanpath(grid=grid, classes=classes, cells=cells, **settings | given)
+    } | given
+    seen = (Detections.empty(1, len(classes) - 1),) * count if detections is None else detections
+    belief = settings.get("posterior"), settings.get("presence")
+    looks = fovea_looks(grid, cells, seen, settings["values"], *belief, seconds)
+    return Scanpath(grid=grid, classes=classes, looks=looks, **settings)
+
+
+def with_looks(record: Any, **columns: Sequence[object]) -> Any:
+    """A record whose looks have other values of some fields, one for each look."""
+    looks = []
+    for number, look in enumerate(record.looks):
+        looks.append(replace(look, **{name: values[number] for name, values in columns.items()}))
+    return replace(record, looks=tuple(looks))
+
+
+def fovea_looks(
+    grid: Grid,
+    cells: Tensor,
+    detections: Sequence[Detections],
+    values: Tensor,
+    posterior: Tensor | None = None,
+    presence: Tensor | None = None,
+    seconds: Sequence[Mapping[str, float]] = (),
+) -> tuple[FoveaLook, ...]:
+    """Fixations of the centres of cells, from their columns."""
+    made = FoveaLooks(grid)
+    for number, cell in enumerate(cells.tolist()):
+        made.fixate(
+            cell,
+            grid.centres[cell].tolist(),
+            detections[number],
+            seconds[number] if seconds else {},
+            float(values[number - 1, cell]) if number else None,
+            None if posterior is None else posterior[number],
+            None if presence is None else float(presence[number]),
+        )
+    return tuple(made.looks)
 
 
 class Blobs(Detector):

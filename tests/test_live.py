@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence, TargetEvidence
-from semfov.agents.fovea import FoveaEpisode
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import open_stream
 from semfov.episode import Forgetting
 from semfov.gaze.policies import Policy
+from semfov.settings import StreamSettings
 from tests.films import encode
 from tests.refusals import refused
 from tests.small import Coloured, tensors
@@ -206,7 +206,8 @@ def test_each_frame_has_a_decision():
     assert gone[-1].outcome != "found"
     assert gone[-1].probability < 0.5
     assert agent_with(Semantic(3)).live("green").step(scene(8)).decision is None
-    assert FoveaEpisode(agent_with(Deciding(3)).fovea, 2, rate=2.5, confirm=1.0).thresholds == Thresholds(1.0, 0.01)
+    stream = agent_with(Deciding(3)).fovea.stream(2, StreamSettings(rate=2.5, confirm=1.0))
+    assert stream.plan.thresholds == Thresholds(1.0, 0.01)
 
 
 @pytest.mark.parametrize("how", ["fovea", "windows"])

@@ -21,7 +21,7 @@ from examples.look_graph import OPSET
 from semfov import FovealObservationModel
 from semfov.agents.head import _CONFIRM
 from semfov.agents.kinds import FoveaKind, WindowKind
-from semfov.agents.windows import LIKELY
+from semfov.agents.window_episode import LIKELY
 from semfov.belief import Verification
 from semfov.data.inputs import FRAME
 from semfov.decision import MOST_CLOSER

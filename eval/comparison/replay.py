@@ -12,7 +12,7 @@ from semfov.belief.observers import LearnedMap, Observer, Semantic
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath
-from semfov.paths.scanpath import Trace
+from semfov.paths.trace import Trace
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import make_learned
 
@@ -41,7 +41,9 @@ def replay(run: ComparedLooking, index: int, record: ResultRecord) -> Scanpath:
         model = if_shipped(partial(make_learned, MapEvidence), run.config.belief.map_model, run.eye)
         beside = Semantic(len(run.scenes.classes) + 1, tempering=0.5) if model is None else LearnedMap(model)
     with torch.no_grad():
-        scanpath = Trace(grid, ("background", *run.scenes.classes), cue, beside, steps=steps).scanpath()
-    found = record.get("found_at", -1) >= 0
-    # The time to read the store is not the duration of the episode.
-    return replace(scanpath, target=record.get("target"), found=found, seconds=())
+        trace = Trace(grid, ("background", *run.scenes.classes), cue, beside)
+        for step in steps:
+            # The time to read the store is not the duration of the episode.
+            trace.add(replace(step, seconds={}))
+        scanpath = trace.scanpath()
+    return replace(scanpath, target=record.get("target"), found=record.get("found_at", -1) >= 0)

@@ -16,8 +16,8 @@ from eval.comparison.model_folder import if_shipped
 from eval.comparison.settings import ComparedConfig
 from eval.comparison.telling import class_frequencies
 from eval.decide.plain import plain_looks
-from semfov.agents.episode import EpisodeLimits
-from semfov.agents.windows import WindowEpisode
+from semfov.agents.episode import EpisodeLimits, Goal
+from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
@@ -43,6 +43,7 @@ from semfov.runs.results import ResultRecord
 from semfov.runs.settings import Range, Share
 from semfov.runs.setup import make_learned, make_observation
 from semfov.runs.store import RememberedLooks
+from semfov.settings import DecisionSettings
 from semfov.strategy import Strategy
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -184,19 +185,9 @@ class DecisionRun(ComparedLooking):
         """What the agent that looks at windows makes of a search."""
         config, target = self.config, search.target
         assert self.windows is not None
-        path = (
-            WindowEpisode(
-                ("background", *self.eye.detector.classes),
-                self.windows,
-                target,
-                limits=EpisodeLimits(WindowEpisode.usual_passes),
-                confirm=config.confirm,
-                give_up=config.give_up,
-                closer=None if config.closer else 0,
-            )
-            .open(source)
-            .run()
-        )
+        goal = Goal.of(("background", *self.eye.detector.classes), target)
+        decisions = DecisionSettings(config.confirm, config.give_up, None if config.closer else 0)
+        path = WindowEpisode(WindowTask(goal, self.windows, decisions), source, EpisodeLimits(PASSES)).run()
         decision = path.decision
         assert decision is not None
         box = decision.box if decision.outcome == "found" else None

@@ -14,7 +14,8 @@ from eval.stream.drift import Drift
 from eval.stream.flights import COURSES, CourseName, Frame, film, flight, mot_film, within
 from eval.stream.plain import PlainRule
 from eval.stream.ways import AllSlices, Live, RoundRobin, Way, WholeFrame
-from semfov.agents.windows import LIKELY, ZoomAgent
+from semfov.agents.window_episode import LIKELY
+from semfov.agents.windows import ZoomAgent
 from semfov.data.classes import class_index
 from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
@@ -25,6 +26,7 @@ from semfov.runs.progress import track
 from semfov.runs.results import ResultRecord
 from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Whole
 from semfov.runs.setup import check_sources, make_detector, make_scenes
+from semfov.settings import StreamSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 
@@ -130,7 +132,7 @@ class StreamRun:
     def _ways(self) -> list[Way]:
         """The ways of looking, each with an empty memory."""
         eye, target, config = self.eye, self.target, self.config
-        episode = partial(self.agent.episode, None, (target,), rate=config.rate, follows=True)
+        episode = partial(self.agent.stream, None, (target,), StreamSettings(rate=config.rate))
         makers: dict[WayName, Callable[[], Way]] = {
             "whole": lambda: WholeFrame(eye, target),
             "slices": lambda: AllSlices(eye, target),

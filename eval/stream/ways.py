@@ -6,7 +6,7 @@ from itertools import cycle
 
 from eval.stream.flights import Frame
 from eval.zoom.objects import suppressed
-from semfov.agents.windows import WindowEpisode
+from semfov.agents.window_episode import WindowStream
 from semfov.detection.objects import Objects
 from semfov.motion import CameraMotion, CameraStep
 from semfov.zoom.carrying import inside_frame
@@ -96,7 +96,7 @@ class RoundRobin(Way):
 class Live(Way):
     """The agent, for all objects of the class: those that it lists, and all candidates."""
 
-    def __init__(self, eye: WindowEye, target: int, episode: WindowEpisode, *, poses: bool = False) -> None:
+    def __init__(self, eye: WindowEye, target: int, episode: WindowStream, *, poses: bool = False) -> None:
         super().__init__(eye, target)
         self.episode, self.poses = episode, poses
 

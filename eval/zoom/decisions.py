@@ -9,13 +9,14 @@ import torch
 
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.run import overlap
-from semfov.agents.episode import EpisodeLimits
-from semfov.agents.windows import WindowEpisode
+from semfov.agents.episode import EpisodeLimits, Goal
+from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
+from semfov.settings import DecisionSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.looks import Window, WindowLooks
 
@@ -54,8 +55,8 @@ def decide_all(
     records: list[ResultRecord] = []
     ways = {OURS: closer} if evidence.verification is None else {OURS: closer, UNVERIFIED: 0}
     for target, (way, most) in product(targets, ways.items()):
-        episode = WindowEpisode(classes, evidence, target, limits=EpisodeLimits(passes), closer=most)
-        path = episode.open(source).run()
+        task = WindowTask(Goal.of(classes, target), evidence, DecisionSettings(closer=most))
+        path = WindowEpisode(task, source, EpisodeLimits(passes)).run()
         decision = path.decision
         assert decision is not None
         there = annotation.boxes[annotation.labels == target]

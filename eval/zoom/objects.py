@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from eval.bootstrap import Bootstrap
-from semfov.agents.windows import LIKELY
+from semfov.agents.window_episode import LIKELY
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects

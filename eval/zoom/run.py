@@ -18,7 +18,8 @@ from eval.zoom.decisions import decide_all
 from eval.zoom.objects import AFTER, Returned, merged, object_record, suppressed, sure_boxes
 from eval.zoom.observed import ObservedRates, make_zoom_observation
 from eval.zoom.orders import adaptive_slices, in_order, oracle, quad_tree, shuffled, sparse
-from semfov.agents.windows import WindowEpisode
+from semfov.agents.episode import Goal
+from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
@@ -156,13 +157,13 @@ class ZoomRun(WindowLooking, SceneRun):
                 "quad-tree, best first": quad_tree(lattice, target, most=False),
             }
         seen = {name: looked(look_by_look(source, order, None)) for name, order in orders.items()}
-        episode = WindowEpisode(("background", *self.scenes.classes), self.evidence, None, targets, worth=0.0)
-        episode.open(source)
+        goal = Goal.of(("background", *self.scenes.classes), None, targets)
+        episode = WindowEpisode(WindowTask(goal, self.evidence, worth=0.0), source)
         paths: dict[int, ZoomPath] = {}
         while episode.passes < config.passes and episode.look() is not None:
             if episode.passes in self.numbers:
                 paths[episode.passes] = episode.record()
-        seen[SEMFOV] = episode.window_looks
+        seen[SEMFOV] = [look.shown for look in episode.looks]
         if "objects" in config.measures:
             paths = {number: paths.get(number) or episode.record() for number in self.numbers}
             yield from self._objects(index, seen, paths)

@@ -1,14 +1,19 @@
-"""An episode under way: limited, look by look, with its decision and its record at any time."""
+"""Episodes under way, whose looks, decision and record can be asked for at any time: of a picture, and of a stream.
+
+An `Episode` has a goal, and the looks, the decision and the record so far. A `PictureEpisode` looks when it is asked,
+and `run` looks until the decision or a limit. A `StreamEpisode` looks once at each frame that `step` is given, and its
+`moment` is what is known then. Each kind of look has its own (`semfov.agents.fovea_episode`, `window_episode`, `head`).
+"""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Generic, Literal, TypeVar
 
 import torch
 from numpy.typing import ArrayLike
-from torch import nn
+from torch import Tensor, nn
 
 from semfov.data.inputs import FRAME, ImageLike
 from semfov.decision import Decision
@@ -16,14 +21,11 @@ from semfov.episode import Forgetting
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.motion import Motion
 from semfov.paths import Ending, Moment, Record, RecordedLook
+from semfov.settings import MOST_PASSES, OnLook
 
 _Module = TypeVar("_Module", bound=nn.Module)
 _Record = TypeVar("_Record", bound=Record)
-
-MOST_PASSES = 1_000_000  # largest number of passes that can be asked for
-
-OnLook = Callable[[Any], object]
-"""Function that is called after each look with the record so far; the episode ends if it returns False."""
+_Moment = TypeVar("_Moment", bound=Moment)
 
 
 @dataclass(frozen=True)
@@ -43,72 +45,128 @@ class EpisodeLimits:
         check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
 
     def reached(self, passes: int, record: Callable[[], Any]) -> Literal["stopped", "passes", "seconds"] | None:
-        """The limit that is reached after a look. Call it once after each look."""
+        """Find the limit that is reached after a look. Call it once after each look."""
         if self.on_look is not None and self.on_look(record()) is False:
             return "stopped"
         if self.passes is not None and passes >= self.passes:
             return "passes"
-        if self.seconds is not None and perf_counter() - self._began >= self.seconds:
+        if self.seconds is not None and self.elapsed() >= self.seconds:
             return "seconds"
         return None
 
+    def elapsed(self) -> float:
+        """Seconds since the limits were made, when the episode began: its clock."""
+        return perf_counter() - self._began
+
     def room(self, passes: int) -> float:
-        """Number of passes that are left after some; infinite without a limit."""
+        """Count the passes that remain after some; infinite without a limit."""
         return float("inf") if self.passes is None else self.passes - passes
 
 
-class Episode(ABC, Generic[_Record]):
-    """A search or an exploration under way: it looks when it is asked to, and tells its decision and its record.
+@dataclass(frozen=True)
+class Goal:
+    """What an episode looks for.
 
-    `run` looks until the decision or a limit, which makes the record of a picture. In a stream each look is given its
-    frame, and `moment` tells what is known after it. `ending` is the reason for the end, and `criterion` what a search
-    needs for the decision `found`, in words, after the first look.
+    Attributes:
+        classes: names of the classes, background first.
+        target: class 1..K that looks are chosen for; None for all classes.
+        targets: classes 1..K whose objects are all to be found, if they are several; otherwise empty.
+        searches: whether one object of the target is searched for, and a decision is made.
     """
 
-    def __init__(
-        self,
-        classes: tuple[str, ...],
-        target: int | None,
-        targets: tuple[int, ...] = (),
-        limits: EpisodeLimits | None = None,
-        rate: float | None = None,
-    ) -> None:
-        self.classes, self.searches = classes, target is not None
-        self.target = targets[0] if len(targets) == 1 else target
-        self.targets = targets if len(targets) > 1 else ()
-        self.limits = EpisodeLimits() if limits is None else limits
-        self.forgetting = None if rate is None else Forgetting(rate)
-        self.passed = FRAME
-        self.pose: Motion | ArrayLike | None = None
-        self.passes = 0
-        self.ending: Ending | None = None
-        self.criterion: str | None = None
-        self._size: tuple[int, int] | None = None
+    classes: tuple[str, ...]
+    target: int | None
+    targets: tuple[int, ...] = ()
+    searches: bool = False
 
+    @classmethod
+    def of(cls, classes: Sequence[str], target: int | None = None, targets: Sequence[int] = ()) -> "Goal":
+        """Make the goal of a search for a target, or of finding all objects of some classes, or of all."""
+        one = targets[0] if len(targets) == 1 else target
+        return cls(tuple(classes), one, tuple(targets) if len(targets) > 1 else (), searches=target is not None)
+
+    @property
+    def sought(self) -> tuple[int, ...]:
+        """The classes that are looked for; none stands for all."""
+        return self.targets or (() if self.target is None else (self.target,))
+
+    def describe(self) -> str:
+        """Describe what is done in a few words."""
+        names = ", ".join(f"“{self.classes[number]}”" for number in self.sought)
+        if not names:
+            return "exploring"
+        return f"searching for {names}" if self.searches else f"finding all {names}"
+
+
+class Episode(ABC, Generic[_Record]):
+    """Base of what is under way: a search, finding all objects, or an exploration.
+
+    Looks, decision, record and criterion hold at any time: before the first look, after any, and after the end.
+
+    Attributes:
+        goal: what is looked for.
+    """
+
+    goal: Goal
+
+    @property
     @abstractmethod
-    def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
-        """Look once, with one pass of the detector."""
+    def passes(self) -> int:
+        """Number of passes of the detector so far."""
+
+    @property
+    @abstractmethod
+    def looks(self) -> tuple[RecordedLook, ...]:
+        """The looks that count so far, as the record has them."""
 
     @property
     @abstractmethod
     def decision(self) -> Decision | None:
-        """The decision of a search as it stands; None where nothing is decided."""
+        """The decision of a search as it stands; None where nothing is decided, and before the first look."""
+
+    @property
+    @abstractmethod
+    def criterion(self) -> str | None:
+        """What a search needs for the decision `found`, in words; None where nothing is decided."""
 
     @abstractmethod
     def record(self) -> _Record:
-        """The record of the looks so far."""
+        """Make the record of the looks so far."""
 
     def moment(self) -> Moment:
-        """What is known at the present frame of a stream."""
+        """Make the record of the present frame of a stream."""
         raise InputError(f"frame: expected an episode that takes frames, got a {type(self).__name__}")
 
-    @torch.inference_mode()
-    def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> Moment:
-        """Look at the next frame of a stream (`look`), and tell what is known then."""
-        check_number(passed, "passed", 0, 1e9)
-        self.passed, self.pose = passed, pose
-        self.look(frame)
-        return self.moment()
+    def describe(self) -> str:
+        """Describe what is done in a few words."""
+        return self.goal.describe()
+
+
+class PictureEpisode(Episode[_Record]):
+    """Base of the episodes of a picture, or of a scene that stands still.
+
+    Attributes:
+        limits: where the episode ends, unless it decides before.
+        ending: reason for the end; None as long as it goes on.
+    """
+
+    def __init__(self, goal: Goal, limits: EpisodeLimits | None = None) -> None:
+        self.goal = goal
+        self.limits = EpisodeLimits() if limits is None else limits
+        self.ending: Ending | None = None
+
+    @property
+    def passes(self) -> int:
+        """Number of passes of the detector so far: of all looks, closer ones included."""
+        return len(self.looks)
+
+    @abstractmethod
+    def look(self) -> RecordedLook | None:
+        """Look once, with one pass of the detector; returns None if no look is left."""
+
+    @abstractmethod
+    def _end(self, limit: Ending | None) -> None:
+        """Decide at the end, which a limit makes, or the last look, and give its reason."""
 
     def run(self) -> _Record:
         """Look until the decision, a limit, or the last look, and make the record."""
@@ -118,23 +176,61 @@ class Episode(ABC, Generic[_Record]):
         self._end(limit)
         return self.record()
 
-    @abstractmethod
-    def _end(self, limit: Ending | None) -> None:
-        """Decide at the end, which a limit makes, or the last look, and give its reason."""
 
-    def describe(self) -> str:
-        """What is done in a few words."""
-        numbers = self.targets or (() if self.target is None else (self.target,))
-        names = ", ".join(f"“{self.classes[number]}”" for number in numbers)
-        if not numbers:
-            return "exploring"
-        return f"searching for {names}" if self.searches else f"finding all {names}"
+class StreamEpisode(Episode[_Moment]):
+    """Base of the episodes of a stream, each frame of which is given to `step`. They have no end.
+
+    Attributes:
+        forgetting: how evidence fades with time.
+    """
+
+    def __init__(self, goal: Goal, rate: float) -> None:
+        self.goal = goal
+        self.forgetting = Forgetting(rate)
+        self._size: tuple[int, int] | None = None  # `(width, height)` of the frames, from the first one on
+        self._passes = 0
+
+    @property
+    def passes(self) -> int:
+        """Number of passes of the detector so far, one for each frame."""
+        return self._passes
+
+    @torch.inference_mode()
+    def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> _Moment:
+        """Look at the next frame, and make its record.
+
+        Args:
+            frame: the frame, in the size of the first one.
+            passed: seconds since the frame before.
+            pose: where the camera is, as for `semfov.live.LivePerception.step`.
+        """
+        check_number(passed, "passed", 0, 1e9)
+        self._look_at(frame, passed, pose)
+        return self.moment()
+
+    @abstractmethod
+    def _look_at(self, frame: ImageLike, passed: float, pose: Motion | ArrayLike | None) -> None:
+        """Spend a frame on a look."""
+
+    @abstractmethod
+    def moment(self) -> _Moment:
+        """Make the record of the present frame, after the first one."""
+
+    def record(self) -> _Moment:
+        """Make the record of what counts at the present frame: its moment."""
+        return self.moment()
 
     def _check_size(self, size: tuple[int, int]) -> None:
         """Raise `InputError` unless a frame has the size `(width, height)` of the first one."""
-        first = self._size = self._size or size
-        expected = f"{first[0]} × {first[1]} pixels, the size of the first frame"
-        check(size == first, "frame", expected, f"{size[0]} × {size[1]}")
+        self._size = self._size or size
+        width, height = self._size
+        expected = f"{width} × {height} pixels, the size of the first frame"
+        check(size == self._size, "frame", expected, f"{size[0]} × {size[1]}")
+
+
+def no_frame_yet() -> InputError:
+    """Make the error of a stream that is asked for its moment before its first frame."""
+    return InputError("moment: expected a frame before it, got none; call step with a frame first")
 
 
 def only_for(kind: str, suits: str, instead: str, **arguments: object) -> None:
@@ -154,35 +250,51 @@ def without_none(**values: Any) -> dict[str, Any]:
 
 
 def on_cpu(module: _Module) -> _Module:
-    """A module on the CPU, without moving the given one, which other parts of the agent may share.
+    """Copy a module to the CPU, without moving the one that is given, which other parts of the agent may share.
 
     Its tensors are copied from a GPU together, since each copy waits for it. All else is shared.
+
+    Args:
+        module: the module.
+
+    Returns:
+        The copy; the module itself if all its tensors are on the CPU.
     """
-    tensors = {id(each): each for each in (*module.parameters(), *module.buffers())}
-    away = {key: each for key, each in tensors.items() if each.device.type != "cpu"}
-    if not away:
+    tensors = {id(tensor): tensor for tensor in (*module.parameters(), *module.buffers())}
+    elsewhere = {key: tensor for key, tensor in tensors.items() if tensor.device.type != "cpu"}
+    if not elsewhere:
         return module
     copies: dict[int, Any] = {}
-    for dtype in {each.dtype for each in away.values()}:
-        some = {key: each for key, each in away.items() if each.dtype == dtype}
-        together = torch.cat([each.detach().flatten() for each in some.values()]).cpu()
-        parts = together.split([each.numel() for each in some.values()])
-        for (key, each), part in zip(some.items(), parts, strict=True):
-            here = part.view(each.shape)
-            copies[key] = nn.Parameter(here, each.requires_grad) if isinstance(each, nn.Parameter) else here
+    for dtype in {tensor.dtype for tensor in elsewhere.values()}:
+        group = {key: tensor for key, tensor in elsewhere.items() if tensor.dtype == dtype}
+        joined = torch.cat([tensor.detach().flatten() for tensor in group.values()]).cpu()
+        parts = joined.split([tensor.numel() for tensor in group.values()])
+        for (key, tensor), part in zip(group.items(), parts, strict=True):
+            copies[key] = _shaped_as(tensor, part)
     return _with_tensors(module, copies)
 
 
+def _shaped_as(tensor: Tensor, values: Tensor) -> Tensor:
+    """Give values the shape of a tensor; those of a parameter become one."""
+    shaped = values.view(tensor.shape)
+    return nn.Parameter(shaped, tensor.requires_grad) if isinstance(tensor, nn.Parameter) else shaped
+
+
 def _with_tensors(module: _Module, copies: dict[int, Any]) -> _Module:
-    """A module with others in the places of its tensors; both, and modules that were copied, by identity."""
-    made = object.__new__(type(module))
-    copies[id(module)] = made
-    made.__dict__.update(module.__dict__)
+    """Copy a module with other tensors.
+
+    Args:
+        module: the module.
+        copies: by `id`, what takes the place of its tensors; modules that were copied are added.
+    """
+    copy = object.__new__(type(module))
+    copies[id(module)] = copy
+    copy.__dict__.update(module.__dict__)
     for kind in ("_parameters", "_buffers"):
-        given = getattr(module, kind).items()
-        made.__dict__[kind] = {name: copies.get(id(each), each) for name, each in given}
-    parts = module._modules.items()
-    made.__dict__["_modules"] = {
-        name: each if each is None else copies.get(id(each)) or _with_tensors(each, copies) for name, each in parts
-    }
-    return made
+        tensors = getattr(module, kind)
+        copy.__dict__[kind] = {name: copies.get(id(tensor), tensor) for name, tensor in tensors.items()}
+    parts: dict[str, nn.Module | None] = {}
+    for name, part in module._modules.items():
+        parts[name] = part if part is None else copies.get(id(part)) or _with_tensors(part, copies)
+    copy.__dict__["_modules"] = parts
+    return copy

@@ -8,16 +8,16 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.agents.episode import MOST_PASSES, Episode, EpisodeLimits, OnLook, on_cpu
+from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, on_cpu
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.prior import Prior
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index, class_numbers
-from semfov.data.inputs import Color, ImageLike
+from semfov.data.inputs import Color
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
 from semfov.detection.load import load_detector
-from semfov.errors import check, check_number, check_whole
+from semfov.errors import check_number, check_whole
 from semfov.eye import Eye
 from semfov.head.belief import SceneObserver
 from semfov.head.camera import SceneLike, open_scene
@@ -26,9 +26,11 @@ from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond,
 from semfov.head.views import Views
 from semfov.io.compatibility import learned_for
 from semfov.io.pretrained import shipped_model
-from semfov.paths import Ending, HeadPath, RecordedLook
+from semfov.paths import Ending, HeadPath
+from semfov.paths.head import HeadLook, head_look
 from semfov.paths.stimulus import reduced_copy
 from semfov.sensor.foveation import Foveation
+from semfov.settings import MOST_PASSES, OnLook
 
 _SIGMA = 100.0  # width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels
 _PASSES = 40  # default of the largest number of looks
@@ -86,7 +88,7 @@ class HeadAgent(nn.Module):
         return cls(eye, *models).eval().requires_grad_(False)
 
     def views(self, scene: SceneLike, color: Color = "rgb") -> Views:
-        """The views and fixations that are possible in a scene.
+        """List the views and fixations that are possible in a scene.
 
         Args:
             scene: the scene (`semfov.head.open_scene`).
@@ -158,7 +160,7 @@ class HeadAgent(nn.Module):
         observer = SceneObserver(Target(evidence, prior=known), views, prior=never_seen)
         sure = _CONFIRM if confirm is None else confirm
         thresholds = Thresholds(sure, never_seen if give_up is None else give_up, sure)
-        return _HeadEpisode(
+        return HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=start, duration=duration, seed=seed,
         ).run()  # fmt: skip
@@ -204,7 +206,7 @@ class HeadAgent(nn.Module):
         check_number(worth, "worth", 0, float("inf"))
         evidence = on_cpu(self.map_evidence)
         gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
-        return _HeadEpisode(
+        return HeadEpisode(
             self, observer, gain, None, indices,
             worth=worth, limits=limits, start=start, duration=duration, seed=seed,
         ).run()  # fmt: skip
@@ -226,10 +228,22 @@ class HeadAgent(nn.Module):
         return self.find_all(scene, None, **options)
 
 
-class _HeadEpisode(Episode[HeadPath]):
-    """Looks of an eye in a head that turns: at the fixations with the largest expected gain per second."""
+class HeadEpisode(PictureEpisode[HeadPath]):
+    """Looks of an eye in a head that turns in a scene: at the fixations with the largest expected gain per second.
 
-    decision: Decision | None = None
+    Args:
+        agent: the agent.
+        observer: the belief about the scene.
+        gain: expected gain of a look.
+        target: class 1..K to search for; None finds all objects.
+        targets: classes 1..K whose objects are all to be found; none: of all classes.
+        worth: least expected gain for which a look is worth it.
+        thresholds: thresholds of the decision of a search; None decides nothing.
+        limits: where the episode ends, unless it decides before.
+        start: first action (`Views`); None looks straight ahead.
+        duration: time limit of the scene in seconds.
+        seed: of the generator that breaks ties.
+    """
 
     def __init__(
         self,
@@ -246,83 +260,120 @@ class _HeadEpisode(Episode[HeadPath]):
         duration: float = _DURATION,
         seed: int = 0,
     ) -> None:
-        super().__init__(agent.classes, target, targets, limits)
+        super().__init__(Goal.of(agent.classes, target, targets), limits)
         check_number(duration, "duration", 0, float("inf"))
         check_whole(seed, "seed", 0, 2**63 - 1)
-        self.views = views = observer.views
+        views = observer.views
         first = views.ahead if start is None else start
         check_whole(first, "start", 0, len(views.grid) - 1)
-        self.thresholds, self.duration, self.least = thresholds, duration, agent.eye.detector.least
+        self.views = views
+        self.thresholds = thresholds
+        self.duration = duration
+        self.least = agent.eye.detector.least
         self._detector = agent.eye.detector.name
         self._steps = look_around(
-            views, live(agent.eye, views), observer, lambda action: PerSecond(gain, views.world.speeds, action), first,
-            target=self.target, passes=MOST_PASSES, duration=duration, worth=worth, seed=seed,
-        )  # fmt: skip
-        self._made, self._maps = list[HeadStep](), list[Tensor]()
+            views,
+            live(agent.eye, views),
+            observer,
+            lambda action: PerSecond(gain, views.world.speeds, action),
+            first,
+            target=self.goal.target,
+            passes=MOST_PASSES,
+            duration=duration,
+            worth=worth,
+            seed=seed,
+        )
+        self._last: HeadStep | None = None
+        self._looks: list[HeadLook] = []
+        self._maps: list[Tensor] = []  # the map of the scene after each look, `(S,)`
+        self._decision: Decision | None = None
 
-    def look(self, frame: ImageLike | None = None) -> RecordedLook | None:
+    @property
+    def looks(self) -> tuple[HeadLook, ...]:
+        return tuple(self._looks)
+
+    @property
+    def decision(self) -> Decision | None:
+        return self._decision
+
+    @property
+    def criterion(self) -> str | None:
+        if self.thresholds is None:
+            return None
+        return f"p is {self.thresholds.confirm:g} and the gaze is at the place"
+
+    @torch.inference_mode()
+    def look(self) -> HeadLook | None:
         """Turn the eye, or eye and head, and look."""
-        check(frame is None, "frame", "None: a head looks around in the scene that it was given", type(frame).__name__)
-        with torch.inference_mode():
-            step = next(self._steps, None)
-            if step is None:
-                return None
-            self.passes += 1
-            self._made.append(step)
-            belief, target = step.belief, self.target
-            if target is not None:
-                cells = belief.probability(target)[0]
-            else:  # of any object, where the cell was seen
-                cells = (1 - belief.class_probabilities()[0, :, 0]).masked_fill(belief.owner[0] < 0, 0.0)
-            self._maps.append(cells)
-            if self.thresholds is not None and target is not None:
-                self.decision = _decide_look(self.views, step, target, self.thresholds)
-                self.ending = "decision" if self.decision.outcome != "undecided" else None
-            views, pose = self.views, self.views.poses[step.action // self.views.cells]
-            x, y = views.world.pixels_of(views.gaze[[step.action]])[0].tolist()
-            width, height = views.world.size
-            region = views.world.boxes(torch.tensor([[0.0, 0.0, width, height]]), pose)[0].tolist()
-            boxes = views.world.boxes(step.detections.boxes[0], pose)[None].to(step.detections.boxes)
-            value = step.gain if math.isfinite(step.gain) else None
-            seen = replace(step.detections, boxes=boxes)
-            return RecordedLook(self.passes - 1, (x, y), tuple(region), seen, step.seconds, value)
+        step = next(self._steps, None)
+        if step is None:
+            return None
+        self._last = step
+        target = self.goal.target
+        self._maps.append(_scene_map(step, target))
+        if self.thresholds is not None and target is not None:
+            self._decision = _decide_look(self.views, step, target, self.thresholds)
+            self.ending = "decision" if self._decision.outcome != "undecided" else None
+        look = head_look(
+            self.views, step.action, step.detections, self._maps[-1], len(self._looks), step.seconds, step.gain
+        )
+        self._looks.append(look)
+        return look
 
     def _end(self, limit: Ending | None) -> None:
-        step = self._made[-1]
+        step = self._last
+        assert step is not None
         usual: Ending = "duration" if step.seconds + step.ahead > self.duration else "worth"
-        if len(self._made) == len(self.views.grid):
+        if len(self._looks) == len(self.views.grid):
             usual = "cells"
         self.ending = self.ending or limit or usual
 
     def record(self) -> HeadPath:
-        steps, decision, picture = self._made, self.decision, self.views.world.image()
+        decision = self.decision
+        picture = self.views.world.image()
         return HeadPath(
             views=self.views,
-            target=self.target,
-            classes=self.classes,
+            target=self.goal.target,
+            classes=self.goal.classes,
             least=self.least,
-            actions=tuple(step.action for step in steps),
-            seconds=tuple(step.seconds for step in steps),
-            detections=tuple(step.detections for step in steps),
-            maps=torch.stack(self._maps),
-            values=tuple(step.gain for step in steps),
+            looks=self.looks,
+            maps=torch.stack(self._maps) if self._maps else torch.zeros(0, len(self.views.world.scene)),
             found=decision is not None and decision.outcome == "found",
             decision=decision,
             ending=self.ending,
-            targets=self.targets,
+            targets=self.goal.targets,
             photograph=None if picture is None else reduced_copy(picture),
             detector=self._detector,
             duration=self.duration if math.isfinite(self.duration) else None,
         )
 
 
+def _scene_map(step: HeadStep, target: int | None) -> Tensor:
+    """Probability `(S,)` of the target, or of any object where the cell was seen, in each cell of the scene."""
+    belief = step.belief
+    if target is not None:
+        return belief.probability(target)[0]
+    return (1 - belief.class_probabilities()[0, :, 0]).masked_fill(belief.owner[0] < 0, 0.0)
+
+
 def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Thresholds) -> Decision:
-    """Decide after a look, by the rule of all searches (`semfov.decision.settle`); only the present gaze can find."""
-    belief, cell = step.belief, views.gaze_cell[step.action]
+    """Decide after a look, by the rule of all searches (`semfov.decision.settle`); only the present gaze can find.
+
+    Args:
+        views: the views and fixations that are possible.
+        step: the look, and the belief after it.
+        target: class 1..K.
+        thresholds: thresholds of the search.
+
+    Returns:
+        The decision; its cell and its box are those of the scene.
+    """
+    belief = step.belief
+    cell = views.gaze_cell[step.action]
     cells = belief.probability(target).double()
-    looked = place_known(cells[:, cell, None], torch.ones(1, 1, dtype=torch.bool), thresholds.place)
-    left = belief.chance(target).masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
-    outcome = int(settle(belief.presence(target).double(), looked, left, thresholds))
+    located = place_known(cells[:, cell, None], torch.ones(1, 1, dtype=torch.bool), thresholds.place)
+    hit_chance = belief.chance(target).masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
+    outcome = int(settle(belief.presence(target).double(), located, hit_chance, thresholds))
     decision = conclude(outcome, belief, [step.detections], views.view_grid, target, step.action % views.cells)
     if decision.outcome != "found":
         return decision

@@ -5,13 +5,14 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any, ClassVar, Protocol
 
-from semfov.agents.episode import Episode, EpisodeLimits, without_none
-from semfov.agents.fovea import FoveaAgent, FoveaEpisode
+from semfov.agents.episode import StreamEpisode, without_none
+from semfov.agents.fovea import RATE as FOVEA_RATE
+from semfov.agents.fovea import FoveaAgent
 from semfov.agents.head import HeadAgent
 from semfov.agents.picture import OpenedPicture
+from semfov.agents.windows import RATE as WINDOW_RATE
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.observers.any_of import TargetLike
-from semfov.decision import MOST_CLOSER
 from semfov.errors import InputError, check
 from semfov.paths import Record
 from semfov.settings import (
@@ -75,7 +76,7 @@ class KindOfLook(ABC):
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
         """Explore a picture (`ActivePerception.explore`)."""
 
-    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> Episode[Any]:
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
         """Make the episode that looks at the frames of a stream (`ActivePerception.live`).
 
         Args:
@@ -117,60 +118,27 @@ class FoveaKind(KindOfLook):
     name = "fovea"
     described = "a fovea"
     drawings = ("scanpath", "views", "belief", "belief_bars", "animation")
-    usual_rate = 2.5
+    usual_rate = FOVEA_RATE
     """Default rate at which the belief fades in a stream, per second."""
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
         fovea = self.parts.fovea
-        record = fovea.search(
-            picture.image(fovea.eye.sensor.like),
-            target,
-            _limits(settings),
-            start=settings.start,
-            seed=settings.seed,
-            boxes=settings.boxes,
-            confirm=settings.confirm,
-            give_up=settings.give_up,
-            closer=MOST_CLOSER if settings.closer is None else settings.closer,
-            shifts=settings.shifts,
-            prior=settings.prior,
-        )
-        return picture.named(record)
+        return picture.named(fovea.search(picture.image(fovea.eye.sensor.like), target, settings))
 
     def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
         fovea = self.parts.fovea
-        image = picture.image(fovea.eye.sensor.like)
-        record = fovea.find_all(image, targets, _limits(settings), shifts=settings.shifts)
+        record = fovea.find_all(picture.image(fovea.eye.sensor.like), targets, settings)
         return _counted_from(picture.named(record), settings.least)
 
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
         fovea = self.parts.fovea
-        record = fovea.explore(
-            picture.image(fovea.eye.sensor.like),
-            _limits(settings),
-            start=settings.start,
-            seed=settings.seed,
-            shifts=settings.shifts,
-            worth=settings.worth,
-            policy=settings.policy,
-        )
+        record = fovea.explore(picture.image(fovea.eye.sensor.like), settings)
         return _counted_from(picture.named(record), settings.least)
 
-    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> Episode[Any]:
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
         remedy = "for all objects of several classes use how='windows', and for one of them a class without a list"
         check(not targets, "target", f"one class, or None; {remedy}", targets)
-        return FoveaEpisode(
-            self.parts.fovea,
-            target,
-            rate=self.usual_rate if settings.rate is None else settings.rate,
-            start=settings.start,
-            seed=settings.seed,
-            confirm=settings.confirm,
-            give_up=settings.give_up,
-            closer=MOST_CLOSER if settings.closer is None else settings.closer,
-            prior=settings.prior,
-            color=settings.color,
-        )
+        return self.parts.fovea.stream(target, settings)
 
 
 class WindowKind(KindOfLook):
@@ -178,7 +146,7 @@ class WindowKind(KindOfLook):
 
     name = "windows"
     described = "windows"
-    usual_rate = 0.75
+    usual_rate = WINDOW_RATE
     """Default rate at which looks are forgotten in a stream, per second: a look counts for 0.9 s."""
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
@@ -201,18 +169,8 @@ class WindowKind(KindOfLook):
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
         return self.parts.zoom.explore(picture.large, **_of_objects(settings))
 
-    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> Episode[Any]:
-        return self.parts.zoom.episode(
-            target,
-            targets,
-            rate=self.usual_rate if settings.rate is None else settings.rate,
-            follows=True,
-            confirm=settings.confirm,
-            give_up=settings.give_up,
-            closer=settings.closer,
-            prior=settings.prior,
-            color=settings.color,
-        )
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
+        return self.parts.zoom.stream(target, targets, settings)
 
 
 class HeadKind(KindOfLook):
@@ -260,11 +218,6 @@ class HeadKind(KindOfLook):
             **chosen,
         )
         return _counted_from(record, settings.least)
-
-
-def _limits(settings: LookSettings) -> EpisodeLimits:
-    """Begin the time of an episode, and take its limits from the settings."""
-    return EpisodeLimits(settings.passes, settings.seconds, settings.on_look)
 
 
 def _counted_from(record: Record, least: float | None) -> Record:

@@ -17,13 +17,14 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from semfov.agent import ActivePerception
-from semfov.agents.fovea import FoveaEpisode
+from semfov.agents.fovea_episode import FoveaEpisode, GazePlan
 from semfov.belief.grid import Grid
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import AppOptions
 from semfov.data import Scene, class_index, read_image
 from semfov.data.examples import EXAMPLES, example_scene
 from semfov.data.images import PhotographPicture
+from semfov.decision.stopping import StoppingCriterion
 from semfov.errors import DataError, InputError, SemfovError, check, check_data
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import detections_in_words
@@ -143,9 +144,10 @@ class _Doorkeeper:
 
 def _look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Sequence[int]) -> "_OwnLooks":
     """Look at given cells of a picture `(3, H, W)` one after the other, in a search for a target."""
-    episode = FoveaEpisode(agent.fovea, class_index(target, agent.classes[1:], "target"), closer=0, cells=cells)
+    plan = GazePlan(agent.fovea, class_index(target, agent.classes[1:], "target"), cells=cells)
     with torch.inference_mode():
-        episode.open(image[None].to(agent.eye.sensor.like))
+        like = agent.eye.sensor.like
+        episode = FoveaEpisode(plan, image[None].to(like), criterion=lambda grid: StoppingCriterion())
         while episode.look() is not None:
             pass
         of_agent = agent.search(image, target, how="fovea", start=cells[0], shifts=len(cells) - 1, closer=0)

@@ -1,8 +1,55 @@
-"""Decisions of searches: the rule, the evidence that it rests on, and closer looks at places."""
+"""Decisions of searches: is the target there, and where; when a search ends, and how.
+
+Three numbers describe a search after each look, with one name each everywhere:
+
+- `presence`: the probability that the picture holds the target;
+- `place`: the probability that the target is at one place, after a closer look at it;
+- `hit_chance`: the chance that the best remaining look shows the target, if no look so far has.
+
+What is compared with what, by what is looked at. With closer looks (`Verifier`) places decide, without them presence
+does (`settle`):
+
+    what                     fovea                       large picture               photograph by windows
+    -----------------------  --------------------------  --------------------------  ---------------------------
+    hit_chance < give_up:    of the best cell that was   of the best window that     of the best place that was
+    no look is worth a pass  not fixated                 was not looked at           not examined, times (1 - the
+                                                                                     largest place so far)
+    >= confirm, with         place of a closer look      as a fovea                  as a fovea
+    closer looks
+    >= confirm, without      presence, if a fixated      presence, if a detection    as a large picture
+                             cell is nearly the most     shows the target
+                             probable one
+    a closer look is due     at a cell from              at a box from the confirm   where the hit chance of
+                             Thresholds.place on, if a   of the presence on; at the  that place >= give_up
+                             fixated cell is nearly the  last look from
+                             most probable one, or at    Thresholds.place on
+                             the last look
+    a place ends the search  if it is sure: from half-   as a fovea                  never: the next place may
+    at once                  way between confirm and 1                               be surer
+                             on, after MOST_CLOSER
+                             closer looks from confirm
+    the search is over       hit_chance < give_up, or    as a fovea                  as a fovea
+                             all closer looks were made
+    at a limit               closer looks that are due   it ends as it is            as a large picture
+                             are made with the passes
+                             that remain; it is over
+    outcome, if over         found with a place, or presence, from confirm on; else absent if presence < 1/2, else
+                             undecided
+    outcome, if not over     found on the same terms, else undecided
+    ending of the record     "decision" if it is over or found; else the limit, or "cells" / "shifts" of a fovea and
+                             "windows" where none is left
+
+Without learned evidence a search has no probabilities: a detection whose score is at least `confirm` is `found`
+(ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.
+"""
 
 from semfov.decision.candidates import SAME, CandidateCells, CandidatePlace, CandidatePlaces
 from semfov.decision.rule import (
+    ABSENT,
+    FOUND,
+    GO_ON,
     OUTCOMES,
+    UNDECIDED,
     CloseUp,
     Decision,
     Outcome,
@@ -12,17 +59,22 @@ from semfov.decision.rule import (
     confirms,
     decide,
     detects,
+    final_outcome,
+    found_at_once,
     gains_less,
     place_known,
     settle,
-    verified,
 )
 from semfov.decision.verifier import MOST_CLOSER, Verifier
 
 __all__ = [
+    "ABSENT",
+    "FOUND",
+    "GO_ON",
     "MOST_CLOSER",
     "OUTCOMES",
     "SAME",
+    "UNDECIDED",
     "CandidateCells",
     "CandidatePlace",
     "CandidatePlaces",
@@ -36,8 +88,9 @@ __all__ = [
     "confirms",
     "decide",
     "detects",
+    "final_outcome",
+    "found_at_once",
     "gains_less",
     "place_known",
     "settle",
-    "verified",
 ]

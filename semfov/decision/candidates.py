@@ -11,6 +11,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.prior import Prior
+from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import closer_features
 from semfov.data.inputs import FRAME
 from semfov.decision.rule import CloseUp, cell_of, place_known
@@ -29,7 +30,14 @@ LookAt = Callable[[Tensor], Detections]
 
 
 class CandidatePlace(NamedTuple):
-    """A place that seems to hold the target; box `(4,)`."""
+    """A place that seems to hold the target, and that a closer look may be made at.
+
+    Attributes:
+        box: box `(4,)` of a detection there.
+        evidence: the evidence of that detection: its score, for cells times its share in the cell.
+        probability: that the target is there, before the closer look.
+        cell: the cell, where places are cells.
+    """
 
     box: Tensor
     evidence: float
@@ -37,83 +45,123 @@ class CandidatePlace(NamedTuple):
     cell: int | None = None
 
 
-class CandidatePlaces(ABC, Generic[LookType]):
-    """Base of the places that seem to hold the target of one search, the most evident first, each listed once."""
+class ExaminedPlace(NamedTuple):
+    """A place that is not examined again.
 
-    by_worth = False
-    """Whether all closer looks worth a pass are made, and the best place alone tells what the picture holds."""
+    Attributes:
+        time: seconds of the stream at which it was examined.
+        boxes: `(2, 4)`, the box that the closer look was made at, and that of the target in it.
+        cells: `(X·Y,)` boolean, the cells that the boxes cover; `(0,)` where places are no cells.
+    """
+
+    time: float
+    boxes: Tensor
+    cells: Tensor
+
+
+class CandidatePlaces(ABC, Generic[LookType]):
+    """Base of the places that seem to hold the target of one search, the most evident first, each listed once.
+
+    Invariant: after `see`, the numbers and the place that is `due` are those after the last look. In a stream, looks
+    and examined places of which less than half the evidence is left are forgotten (`wait`).
+
+    Attributes:
+        detections: detections of the last look, a batch of one.
+        target: class that closer looks are made for, 1..K; in a search for several classes the most probable one.
+        presence: probability that the picture holds the target, after the last look, with the `prior`.
+        prior: how often the target is there. All probabilities are those with this prior.
+        grid: the cells, where places are cells.
+        forgetting: how evidence fades in a stream.
+    """
+
+    exhaustive = False
+    """Whether closer looks are made as long as one has enough chance of a hit, however sure the places so far are. Then
+    the best place alone tells what the picture holds."""
 
     detections: Detections
-    """Detections of the last look, a batch of one."""
-
     target: int
-    """Class that closer looks are made for, 1..K; in a search for several classes the most probable one."""
-
     presence: float
-    """Probability that the picture holds the target, after the last look, with the `prior`."""
-
     prior: Prior
-    """How often the target is there. All probabilities are those with this prior."""
-
     grid: Grid | None = None
-    """The cells, where places are cells."""
 
-    _left: float
-    _fixation: int | None = None
-    _number: int | None = None
-    """The look after which the last closer look was made, or the one that it is."""
+    _fixation: int | None = None  # the fixation after which the last closer look was made
+    _number: int | None = None  # the number of the last closer look, where it has one of its own
 
     def __init__(self, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
         self.prior = Prior() if prior is None else prior
-        self._now = 0.0  # seconds of a stream
-        # Each with its time: what looks show, boxes `(2, 4)` and cells `(X·Y,)` of examined places, and their
-        # probabilities.
-        self._looks: list[tuple[float, Any]] = []
-        self._examined: list[tuple[float, Tensor, Tensor]] = []
-        self._known: list[tuple[float, float]] = []
+        self._now = 0.0  # seconds of the stream
+        self._looks: list[tuple[float, Any]] = []  # time, and what a kind of places keeps of a look
+        self._examined: list[ExaminedPlace] = []
+        self._places: list[tuple[float, float]] = []  # time and probability of each closer look
 
     @abstractmethod
     def see(self, look: LookType) -> None:
         """Take in a look of the search."""
 
     @property
-    def left(self) -> float:
-        """Value of the best look that is left, after the last look."""
-        return self._left
+    @abstractmethod
+    def hit_chance(self) -> float:
+        """Chance that the best remaining look shows the target, if no look so far has."""
 
     @abstractmethod
-    def due(self, least: float, *, last: bool) -> CandidatePlace | None:
-        """Find the place that is to be looked at closely now."""
+    def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
+        """Find the place that is to be looked at closely now.
 
-    def seen(self, candidate: CandidatePlace) -> bool:
-        """Whether an earlier look shows a candidate as closely, so that it is examined without a pass."""
+        Args:
+            thresholds: least probability of a place (`place`), and least chance of a hit (`give_up`).
+            last: whether no other look of the search follows.
+
+        Returns:
+            The place; None if no place is due.
+        """
+
+    def is_shown(self, candidate: CandidatePlace) -> bool:
+        """Tell whether an earlier look shows a candidate as closely, so that it is examined without a pass."""
         return False
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
-        """What the look at a candidate shows that it is examined by."""
+        """Look closely at a candidate; returns the detections, a batch of one, by which it is examined."""
         return close_up(candidate.box)
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
-        """Do not list a candidate again, nor others at its place; box `(4,)`."""
-        boxes, covered = torch.stack([candidate.box, box]), torch.zeros(0).bool()
+        """Do not list a candidate again, nor others at its place; box `(4,)` of the target in the closer look."""
+        boxes = torch.stack([candidate.box, box])
+        covered = torch.zeros(0).bool()
         if self.grid is not None:
             covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
             covered[candidate.cell] = True
-        self._examined.append((self._now, boxes, covered))
+        self._examined.append(ExaminedPlace(self._now, boxes, covered))
 
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
-        """Make the record of the last closer look; box `(4,)`."""
-        self._known.append((self._now, place))
+        """Keep what the last closer look says.
+
+        Args:
+            box: `(4,)`, box of the target.
+            place: probability that the target is there.
+            presence: probability that the picture holds the target.
+
+        Returns:
+            The closer look, for the record of the search.
+        """
+        self._places.append((self._now, place))
         return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._number)
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
-        """Look closely at a candidate, unless a look showed it so, and dismiss it; → `(7,)`."""
+        """Look closely at a candidate, unless a look showed it so, and dismiss it.
+
+        Args:
+            candidate: the place.
+            close_up: looks closely at a box.
+
+        Returns:
+            The features `(7,)` of the look (`closer_features`), and the box `(4,)` of the target in it.
+        """
         # The regressions read the probabilities of the searches that they were fitted to.
-        before = self.prior.inverse
+        fitted = self.prior.inverse
         features, box = closer_features(
-            before(self.presence),
-            before.place(candidate.probability, self.presence),
+            fitted(self.presence),
+            fitted.place(candidate.probability, self.presence),
             candidate.evidence,
             self.look_at(candidate, close_up),
             candidate.box,
@@ -123,32 +171,41 @@ class CandidatePlaces(ABC, Generic[LookType]):
         return features, box
 
     def wait(self, passed: float = FRAME) -> None:
-        """Let seconds pass: forget looks, and list places again, of which less than half the evidence is left."""
+        """Let seconds pass, and forget looks and examined places of which less than half the evidence is left."""
         self._now += passed
         oldest = self._now - self.forgetting.span
         self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= oldest]
-        self._examined = [place for place in self._examined if place[0] >= oldest]
-        self._known = [known for known in self._known if known[0] >= oldest]
+        self._examined = [place for place in self._examined if place.time >= oldest]
+        self._places = [(time, place) for time, place in self._places if time >= oldest]
 
     def follow(self, motion: Motion | None) -> None:
         """Carry examined places along with the camera, or forget them where a frame fits none before."""
         if motion is None:
-            self._looks, self._examined, self._known = [], [], []
+            self._looks = []
+            self._examined = []
+            self._places = []
             return
-        self._examined = [(time, motion.boxes(boxes), cells) for time, boxes, cells in self._examined]
+        self._examined = [place._replace(boxes=motion.boxes(place.boxes)) for place in self._examined]
 
     def cell(self, box: Tensor) -> int | None:
-        """The cell that a box `(4,)` covers most; None where places are no cells."""
+        """Find the cell that a box `(4,)` covers most; None where places are no cells."""
         return None if self.grid is None else cell_of(box, self.grid)
 
-    def _again(self, boxes: Tensor) -> Tensor:
-        """Which of boxes `(N, 4)` are of places that were examined, `(N,)` boolean."""
-        examined = torch.cat([boxes.new_zeros(0, 4), *(pair for _, pair, _ in self._examined)])
+    def _are_examined(self, boxes: Tensor) -> Tensor:
+        """Tell which of boxes `(N, 4)` are of places that were examined, `(N,)` boolean."""
+        examined = torch.cat([boxes.new_zeros(0, 4), *(place.boxes for place in self._examined)])
         return (box_iou(boxes, examined) >= SAME).any(-1)
 
     @abstractmethod
     def probability(self, look: CloseUp) -> float:
         """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
+
+
+class _LookAtCells(NamedTuple):
+    """What is kept of a look of a fovea: its detections, and a function that makes their footprints `(1, L, X·Y)`."""
+
+    detections: Detections
+    footprint: Callable[[], Tensor]
 
 
 class CandidateCells(CandidatePlaces[Step]):
@@ -163,45 +220,73 @@ class CandidateCells(CandidatePlaces[Step]):
         self, grid: Grid, target: int, forgetting: Forgetting | None = None, prior: Prior | None = None
     ) -> None:
         super().__init__(forgetting, prior)
-        self.grid, self._target = grid, target
+        self.grid = grid
+        self._target = target
+        self._hit_chance = 1.0
 
     grid: Grid
     _step: Step
+    _next = 0  # number of the next look, closer looks included
 
     def see(self, look: Step) -> None:
-        self._step, self._fixation, self.detections = look, look.shift, look.detections
+        self._step = look
+        self._next += 1
+        self._fixation = look.shift
+        self.detections = look.detections
         self.target = class_meant(look.belief, self._target)
         self.presence = float(look.belief.presence(self._target))
-        # Computed when a place is chosen for the first time.
+        # Footprints are computed when a place is chosen for the first time.
         footprint = cache(partial(self.grid.footprint, look.detections.boxes, "soft"))
-        self._looks.append((self._now, (look.detections, footprint)))
-        # Largest probability of a cell that was not fixated, given that no fixated cell holds the target.
-        self._left = float(look.belief.chance(self._target).masked_fill(look.visited, 0).amax())
+        self._looks.append((self._now, _LookAtCells(look.detections, footprint)))
+        self._hit_chance = float(look.belief.chance(self._target).masked_fill(look.visited, 0).amax())
 
-    def due(self, least: float, *, last: bool) -> CandidatePlace | None:
-        """The most evident place, if a fixated cell is nearly as probable as any, or no other look follows."""
+    @property
+    def hit_chance(self) -> float:
+        """Largest probability of a cell that was not fixated, given that no fixated cell holds the target."""
+        return self._hit_chance
+
+    def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
+        """Find the most evident place, if a fixated cell is nearly as probable as any, or no other look follows."""
         cells = self._step.belief.probability(self._target)[0]
-        for _, _, covered in self._examined:
-            cells = cells.masked_fill(covered, 0)
-        if not (last or bool(place_known(cells, self._step.visited[0], least))):
+        for place in self._examined:
+            cells = cells.masked_fill(place.cells, 0)
+        if not (last or bool(place_known(cells, self._step.visited[0], thresholds.place))):
             return None
-        boxes = torch.cat([detections.boxes[0] for _, (detections, _) in self._looks])
+        boxes = torch.cat([seen.detections.boxes[0] for _, seen in self._looks])
         if not len(boxes):
             return None
-        # Faded scores of the detections of all looks, 0 for objects that were examined.
-        keep = self.forgetting.keep
-        faded = [
-            seen.mask[0] * (seen.scores[0, :, self.target] * keep ** (self._now - time))
-            for time, (seen, _) in self._looks
-        ]
-        scores = torch.cat(faded) * ~self._again(boxes) if self._examined else torch.cat(faded)
-        evidence = scores[:, None] * torch.cat([footprint()[0] for _, (_, footprint) in self._looks])
+        evidence = self._evidence(boxes)
         value = cells * evidence.amax(0)
         cell = int(value.argmax())
-        if float(value[cell]) <= 0 or float(cells[cell]) < least:
+        if float(value[cell]) <= 0 or float(cells[cell]) < thresholds.place:
             return None
         best = int(evidence[:, cell].argmax())
         return CandidatePlace(boxes[best], float(evidence[best, cell]), float(cells[cell]), cell)
+
+    def _evidence(self, boxes: Tensor) -> Tensor:
+        """Evidence of each detection of all looks in each cell: its faded score times its footprint.
+
+        Args:
+            boxes: `(N, 4)`, boxes of the detections of all looks.
+
+        Returns:
+            `(N, X·Y)`, 0 for objects that were examined.
+        """
+        keep = self.forgetting.keep
+        faded = [
+            seen.detections.mask[0] * (seen.detections.scores[0, :, self.target] * keep ** (self._now - time))
+            for time, seen in self._looks
+        ]
+        scores = torch.cat(faded)
+        if self._examined:
+            scores = scores * ~self._are_examined(boxes)
+        return scores[:, None] * torch.cat([seen.footprint()[0] for _, seen in self._looks])
+
+    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
+        """Look closely at a candidate, in the next look of the search."""
+        self._number = self._next
+        self._next += 1
+        return super().look_at(candidate, close_up)
 
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is in the cell of a closer look."""

@@ -20,13 +20,23 @@ Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 """Outcomes by their number in `decide`; the first is that of searches that run out of gaze shifts."""
 
+GO_ON, FOUND, ABSENT, UNDECIDED = range(len(OUTCOMES))
+
 _NEARLY = 0.9  # share of the largest probability of any cell from which on a fixated cell counts as the target's
-_ABSENT = 0.5  # probability of the picture below which the target of a search without a find is absent
+_ABSENT = 0.5  # presence below which the target of a search without a find is absent
 
 
 @dataclass(frozen=True)
 class Decision(OtherWords):
-    """Decision of a search; box `(4,)`."""
+    """Decision of a search.
+
+    Attributes:
+        outcome: `found`, `absent`, or `undecided`.
+        probability: that the picture holds the target; without learned evidence the best score of a detection.
+        cell: cell of the found target, where places are cells.
+        box: box `(4,)` of the found target, if a detection shows it.
+        place: probability that the target is there; None where only its presence was judged.
+    """
 
     outcome: Outcome
     probability: float
@@ -39,7 +49,17 @@ class Decision(OtherWords):
 
 @dataclass(frozen=True)
 class CloseUp:
-    """A closer look at a place that seems to hold the target; box `(4,)`."""
+    """A closer look at a place that seemed to hold the target, and what it says.
+
+    Attributes:
+        fixation: number of the fixation after which it was made; None for windows.
+        target: class 1..K that was looked for.
+        cell: cell that the box covers most, where places are cells.
+        box: box `(4,)` of the target, or the examined one where the look does not show the target.
+        place: probability that the target is there, after the look.
+        presence: probability that the picture holds the target, after the look.
+        number: number of the look that it is, where closer looks are numbered as all others are.
+    """
 
     fixation: int | None
     target: int
@@ -56,33 +76,58 @@ class CloseUp:
 
 
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
-    """Decide by thresholds which searches end with this step; target `(A,)` → `(A,)`.
+    """Decide by the belief alone which searches of a fovea end with a step (`settle`).
 
-    A search has found its target if the image holds the target with enough probability, and a fixated cell is nearly as
-    probable as the most probable one (`_NEARLY`) and probable enough itself. A search gives up if no remaining cell is
-    probable enough to be worth a look, given that no fixated cell holds the target (`Belief.chance`). The target is
-    then absent, unless the image holds it with a probability of at least `_ABSENT`.
+    The place is located by a fixated cell (`place_known`). The hit chance is the largest probability of a cell that was
+    not fixated, given that no fixated cell holds the target (`Belief.chance`).
+
+    Args:
+        step: the step of A searches.
+        target: class 1..K, or one for each search, `(A,)`.
+        thresholds: thresholds of the belief.
+
+    Returns:
+        `(A,)`, numbers of `OUTCOMES`, `GO_ON` for a search that goes on.
     """
-    looked = place_known(step.belief.probability(target), step.visited, thresholds.place)
-    left = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)
-    return settle(step.belief.presence(target), looked, left, thresholds)
+    located = place_known(step.belief.probability(target), step.visited, thresholds.place)
+    hit_chance = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)
+    return settle(step.belief.presence(target), located, hit_chance, thresholds)
 
 
-def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Thresholds) -> Tensor:
-    """Apply the thresholds of `decide` to the probabilities of searches.
+def settle(presence: Tensor, located: Tensor, hit_chance: Tensor, thresholds: Thresholds) -> Tensor:
+    """Decide which searches end, without closer looks.
 
-    Shapes: presence `(A,)`, looked `(A,)`, left `(A,)` → `(A,)`.
+    A search has found its target if the picture holds it with enough probability, and a look has shown where it is. It
+    gives up if no remaining look has enough chance of a hit. The target is then absent, unless the picture holds it
+    with a probability of one half or more.
+
+    Args:
+        presence: `(A,)`, probability that the picture holds the target.
+        located: `(A,)` boolean, whether a look has shown the target's place.
+        hit_chance: `(A,)`, chance that the best remaining look shows the target, if no look so far has.
+        thresholds: `confirm` for the presence, and `give_up` for the hit chance.
+
+    Returns:
+        `(A,)`, numbers of `OUTCOMES`, `GO_ON` for a search that goes on.
     """
-    rest = torch.where(left < thresholds.give_up, torch.where(presence < _ABSENT, 2, 3), 0)
-    return torch.where((presence >= thresholds.confirm) & looked, 1, rest)
+    is_found = (presence >= thresholds.confirm) & located
+    without_find = torch.where(presence < _ABSENT, ABSENT, UNDECIDED)
+    unfound = torch.where(hit_chance < thresholds.give_up, without_find, GO_ON)
+    return torch.where(is_found, FOUND, unfound)
 
 
 def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
-    """Whether a fixated cell is nearly as probable as the most probable one, and at least as probable as `place`.
+    """Tell whether a fixated cell is nearly as probable as the most probable one, and at least as probable as `place`.
 
     All cells of a large object are about equally probable, and there is no need to fixate each of them.
 
-    Shapes: cells `(..., X·Y)`, visited `(..., X·Y)`.
+    Args:
+        cells: `(..., X·Y)`, probability that the target is in each cell.
+        visited: `(..., X·Y)` boolean, cells that were fixated.
+        place: least probability of the fixated cell.
+
+    Returns:
+        `(...)` boolean.
     """
     fixated = cells.masked_fill(~visited, 0).amax(-1)
     return (fixated >= _NEARLY * cells.amax(-1)) & (fixated >= place)
@@ -91,45 +136,80 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
 def conclude(
     outcome: int, belief: Belief, looks: Sequence[Detections], grid: Grid, target: int, cell: int | None = None
 ) -> Decision:
-    r"""Make the decision of one search that ended.
+    r"""Make the decision of one search of a fovea without closer looks.
 
     The cell of a found target is the one with the strongest evidence of belief and detections together,
 
     .. math:: x = \arg\max_x P(t \in x) \max_l s_{lt} w_l(x)
 
     where l runs over the detections of all looks, with scores s and `soft` footprints w.
+
+    Args:
+        outcome: number of the outcome (`OUTCOMES`).
+        belief: the belief of the search, a batch of one.
+        looks: detections of the looks, batches of one.
+        grid: the cells.
+        target: class 1..K.
+        cell: the cell of the target; None takes the one with the strongest evidence.
+
+    Returns:
+        The decision. Its box is that of the detection with the strongest evidence in the cell, if there is one.
     """
-    probability = float(belief.presence(target))
+    presence = float(belief.presence(target))
     if OUTCOMES[outcome] != "found":
-        return Decision(OUTCOMES[outcome], probability)
-    # Evidence of each look: score times footprint, of each detection in each cell.
-    evidence = [
-        grid.footprint(look.boxes, "soft")[0] * (look.mask[0] * look.scores[0, :, target])[:, None] for look in looks
-    ]
+        return Decision(OUTCOMES[outcome], presence)
     cells = belief.probability(target)[0]
+    evidence = [_evidence_of_cells(look, grid, target) for look in looks]
     if cell is None:
         strongest = torch.cat([cells.new_zeros(1, len(grid)), *evidence]).amax(0)
         cell = int((cells * strongest if bool(strongest.any()) else cells).argmax())
-    best, box = 0.0, None
+    return Decision("found", presence, cell, _most_evident_box(looks, evidence, cell), float(cells[cell]))
+
+
+def _evidence_of_cells(look: Detections, grid: Grid, target: int) -> Tensor:
+    """Evidence `(L, X·Y)` of each detection of a look that the target is in each cell: score times footprint."""
+    scores = look.mask[0] * look.scores[0, :, target]
+    return grid.footprint(look.boxes, "soft")[0] * scores[:, None]
+
+
+def _most_evident_box(looks: Sequence[Detections], evidence: Sequence[Tensor], cell: int) -> Tensor | None:
+    """Box `(4,)` of the detection with the strongest evidence in a cell; None if no detection has any there."""
+    highest = 0.0
+    box = None
     for look, values in zip(looks, evidence, strict=True):
-        if len(values) and float(values[:, cell].max()) > best:
-            best, box = float(values[:, cell].max()), look.boxes[0, int(values[:, cell].argmax())]
-    return Decision("found", probability, cell, box, float(cells[cell]))
+        if len(values) and float(values[:, cell].max()) > highest:
+            highest = float(values[:, cell].max())
+            box = look.boxes[0, int(values[:, cell].argmax())]
+    return box
 
 
-def verified(places: Sequence[float], presence: float, confirm: float, *, over: bool) -> int:
-    """Decide a search after closer looks.
+def found_at_once(places: Sequence[float], confirm: float) -> bool:
+    """Tell whether one place ends a search at once: it is sure, from halfway between `confirm` and 1 on.
 
-    It has found its target if a place is sure: halfway between `confirm` and 1, or more. When it is over, it has found
-    it if a place is probable enough; otherwise the target is absent if the picture holds it with a probability below
-    `_ABSENT`.
+    Args:
+        places: probabilities that the target is at each place, after closer looks.
+        confirm: probability of a place from which on a search that is over has found its target.
     """
-    best = max(places, default=0.0)
-    if places and best >= (confirm if over else (1 + confirm) / 2):
-        return OUTCOMES.index("found")
-    if not over:
-        return 0
-    return OUTCOMES.index("absent") if presence < _ABSENT else len(OUTCOMES) - 1
+    return bool(places) and max(places) >= (1 + confirm) / 2
+
+
+def final_outcome(places: Sequence[float], presence: float, confirm: float) -> int:
+    """Decide a search with closer looks that is over.
+
+    It has found its target if one place is probable enough. Otherwise the target is absent, unless the picture holds it
+    with a probability of one half or more.
+
+    Args:
+        places: probabilities that the target is at each place, after closer looks; there may be none.
+        presence: probability that the picture holds the target.
+        confirm: least probability of a place for `found`.
+
+    Returns:
+        The number of one of `OUTCOMES`: `FOUND`, `ABSENT` or `UNDECIDED`.
+    """
+    if places and max(places) >= confirm:
+        return FOUND
+    return ABSENT if presence < _ABSENT else UNDECIDED
 
 
 def check_thresholds(confirm: float | None, give_up: float | None, closer: int | None = None) -> None:
@@ -163,5 +243,5 @@ def gains_less(step: Step, *, gain: Callable[[Belief, Tensor], Tensor], least: f
 
 
 def cell_of(box: Tensor, grid: Grid) -> int:
-    """The cell that a box `(4,)` covers most (its `soft` footprint)."""
+    """Find the cell that a box `(4,)` covers most (its `soft` footprint)."""
     return int(grid.footprint(box[None], "soft")[0].argmax())

@@ -12,7 +12,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, follow_target
 from semfov.data.inputs import FRAME
 from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, LookAt, LookType
-from semfov.decision.rule import OUTCOMES, CloseUp, Decision, verified
+from semfov.decision.rule import FOUND, GO_ON, OUTCOMES, CloseUp, Decision, final_outcome, found_at_once
 from semfov.episode import Step
 from semfov.errors import check, check_whole
 from semfov.motion import Motion
@@ -37,8 +37,9 @@ class Verifier(Generic[LookType]):
 
     After each look the verifier names the place that is to be looked at closely (`candidate`), the most evident one, if
     it is probable enough. The search ends at once with a place that is sure, after `MOST_CLOSER` closer looks with one
-    that is probable enough, and with the best one when no look is worth a pass, or `most` closer looks were made
-    (`verified`). In a photograph that is looked at by windows no place ends it (`by_worth`), as the next may be surer.
+    from `confirm` on, and with the best one when it is over: when no look is worth a pass, or `most` closer looks were
+    made (the table in `semfov.decision`). Where all places are examined (`CandidatePlaces.exhaustive`) none ends it at
+    once, as the next may be surer.
 
     Closer looks may follow a look at once (`look_closely`), or take frames of their own in a stream (`look`). Their
     probabilities then fade towards the belief. With the rate r of the candidates' `Forgetting`, after a seconds
@@ -48,6 +49,14 @@ class Verifier(Generic[LookType]):
     where B is the present probability by the belief: of the target in the cell of the place, or in the image. That of a
     place never rises above :math:`P_0`. After :math:`\ln 2 / r` seconds the place may be examined again, and after
     twice as many the verdict is forgotten. If r is not 0, the boxes of the verdicts follow the detections of each look.
+
+    Attributes:
+        places: the places that closer looks are chosen from.
+        thresholds: `confirm` for places, `place` and `give_up` for candidates.
+        most: largest number of closer looks that count at one time.
+        criterion: what the decision `found` needs, in words.
+        verdicts: the closer looks that are not forgotten, in order, each with its age.
+        candidate: the place that is to be looked at closely now; None if there is none, and before the first look.
     """
 
     def __init__(
@@ -62,13 +71,15 @@ class Verifier(Generic[LookType]):
         check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
         assert thresholds is not None
         check_whole(most, "most", 1, 100)
-        self.model, self.places, self.close_up = model, places, close_up
-        self.thresholds, self.most = thresholds, most
+        self.model = model
+        self.places = places
+        self.close_up = close_up
+        self.thresholds = thresholds
+        self.most = most
         self.criterion = f"a closer look gives p {thresholds.confirm:g} there"
-        """What the decision `found` needs, in words."""
         self.verdicts: list[_Verdict] = []
         self.candidate: CandidatePlace | None = None
-        self._last = False
+        self._is_last = False  # whether no look of the search follows the last one
 
     @property
     def looks(self) -> list[CloseUp]:
@@ -100,7 +111,8 @@ class Verifier(Generic[LookType]):
                 if box is not verdict.look.box:
                     moved = replace(verdict.look, box=box, cell=self.places.cell(box))
                     self.verdicts[number] = verdict._replace(look=moved)
-        self._choose(last=last)
+        self._is_last = last
+        self._choose()
 
     def look(self) -> CloseUp:
         """Look closely at the candidate, and choose the next one."""
@@ -111,21 +123,23 @@ class Verifier(Generic[LookType]):
         prior = self.places.prior
         look = self.places.record(box, prior.place(fitted_place, fitted_presence), prior(fitted_presence))
         # A place that was free to be examined again has a new verdict now.
-        self.verdicts = [
-            old
-            for old in self.verdicts
-            if old.age <= self.places.forgetting.span
-            or (old.look.cell != look.cell and float(box_iou(old.look.box[None], look.box[None])) < SAME)
-        ]
+        self.verdicts = [verdict for verdict in self.verdicts if not self._is_replaced(verdict, look)]
         self.verdicts.append(_Verdict(look))
-        self._choose(last=self._last)
+        self._choose()
         return look
 
     def look_closely(self, room: float = math.inf) -> list[CandidatePlace]:
-        """Make all closer looks that are due; returns the places that took a pass."""
+        """Make all closer looks that are due.
+
+        Args:
+            room: number of passes that remain.
+
+        Returns:
+            The places that took a pass.
+        """
         examined: list[CandidatePlace] = []
         while self.candidate is not None and len(examined) < room:
-            if not self.places.seen(self.candidate):
+            if not self.places.is_shown(self.candidate):
                 examined.append(self.candidate)
             self.look()
         return examined
@@ -137,76 +151,125 @@ class Verifier(Generic[LookType]):
         return torch.full_like(step.cell, self.outcome())
 
     @property
-    def over(self) -> bool:
+    def is_over(self) -> bool:
         """Whether no look of the search is worth a pass, or all closer looks were made."""
-        return self.places.left < self.thresholds.give_up or len(self._recent) >= self.most
+        return self._gives_up or len(self._recent) >= self.most
 
     def outcome(self) -> int:
-        """Decide whether the search ends."""
-        return self._verified([self._chance(each) for each in self.verdicts], over=self.over)
+        """Decide whether the search ends with the last look: a number of `OUTCOMES`, or `GO_ON`."""
+        if self.is_over:
+            return self._final_outcome()
+        return FOUND if self._is_found_at_once(self.verdicts) else GO_ON
+
+    def decision(self) -> Decision:
+        """Make the decision as it stands. As long as the search goes on, it is `found` or `undecided`."""
+        return self._decision(is_over=self.candidate is None and self.is_over)
+
+    def decision_at_end(self) -> Decision:
+        """Make the decision of a search that ends as it is, also if a closer look is due."""
+        return self._decision(is_over=self.is_over)
 
     def conclude(self, room: float = math.inf) -> Decision:
-        """Make the decision of a search that is over."""
-        if not self.outcome():
-            self._choose(last=True)
-            self.look_closely(room)
-        return self.decision(over=True)
+        """End the search: make the closer looks that are still due, and decide as if no look were worth a pass.
 
-    def decision(self, *, over: bool | None = None) -> Decision:
-        """Make the decision as it stands after the last look."""
-        over = self.candidate is None and self.over if over is None else over
-        chances, presence = [self._chance(each) for each in self.verdicts], self.presence
-        outcome = OUTCOMES[verified(chances, presence, self.thresholds.confirm, over=True)]
-        if outcome != "found":
-            return Decision(outcome if over else "undecided", presence)
-        place, best = max(chances), self.best
-        return Decision("found", max(presence, place), best.cell, best.box, place)
+        Args:
+            room: number of passes that remain.
+        """
+        if self.outcome() == GO_ON:
+            self._is_last = True
+            self._choose()
+            self.look_closely(room)
+        return self._decision(is_over=True)
 
     @property
     def presence(self) -> float:
         """Probability that the picture holds the target: after the closer looks, or that without them."""
         without = self.places.presence
-        recent = sorted(self._recent, key=self._chance)[-1:] if self.places.by_worth else self._recent
-        return max((self._faded(each.look.presence, without, each.age) for each in recent), default=without)
+        telling = self._recent
+        if self.places.exhaustive:
+            telling = sorted(telling, key=self._place)[-1:]
+        return max((self._faded(verdict.look.presence, without, verdict.age) for verdict in telling), default=without)
 
     @property
     def best(self) -> CloseUp:
         """The closer look with the largest probability of the place; there must be one."""
-        return max(self.verdicts, key=self._chance).look
+        return max(self.verdicts, key=self._place).look
 
-    def _choose(self, *, last: bool) -> None:
+    def _decision(self, *, is_over: bool) -> Decision:
+        """Make the decision; a place from `confirm` on is found at any time, the rest is decided when it is over."""
+        presence = self.presence
+        outcome = OUTCOMES[self._final_outcome()]
+        if outcome != "found":
+            return Decision(outcome if is_over else "undecided", presence)
+        best = self.best
+        place = max(self._place(verdict) for verdict in self.verdicts)
+        return Decision("found", max(presence, place), best.cell, best.box, place)
+
+    def _final_outcome(self) -> int:
+        """Decide as if the search were over."""
+        places = [self._place(verdict) for verdict in self.verdicts]
+        return final_outcome(places, self.presence, self.thresholds.confirm)
+
+    def _is_found_at_once(self, verdicts: Sequence[_Verdict]) -> bool:
+        """Whether one of the places ends the search, though it is not over."""
+        if self.places.exhaustive:
+            return False
+        places = [self._place(verdict) for verdict in verdicts]
+        if len(self._recent) >= MOST_CLOSER:
+            return bool(places) and max(places) >= self.thresholds.confirm
+        return found_at_once(places, self.thresholds.confirm)
+
+    def _choose(self) -> None:
         """Choose the place that is to be looked at closely."""
-        self._last = last
         recent = self._recent
-        sure = self._verified([self._chance(each) for each in recent], over=False) > 0
-        last = last or self.places.left < self.thresholds.give_up
-        enough = len(recent) >= self.most or sure
-        self.candidate = None if enough else self.places.due(self.thresholds.place, last=last)
+        if len(recent) >= self.most or self._is_found_at_once(recent):
+            self.candidate = None
+        else:
+            self.candidate = self.places.due(self.thresholds, last=self._is_last or self._gives_up)
 
-    def _verified(self, chances: Sequence[float], *, over: bool) -> int:
-        """The outcome by the probabilities of some places (`verified`)."""
-        if self.places.by_worth and not over:
-            return 0
-        enough = len(self._recent) >= MOST_CLOSER
-        outcome = verified(chances, self.presence, self.thresholds.confirm, over=over or enough)
-        return outcome if over or OUTCOMES[outcome] == "found" else 0
+    @property
+    def _gives_up(self) -> bool:
+        """Whether no look of the search is worth a pass."""
+        return self.places.hit_chance < self.thresholds.give_up
 
     @property
     def _recent(self) -> list[_Verdict]:
         """The closer looks of which at least half of the evidence is left."""
         return [verdict for verdict in self.verdicts if verdict.age <= self.places.forgetting.span]
 
-    def _chance(self, verdict: _Verdict) -> float:
+    def _is_replaced(self, verdict: _Verdict, look: CloseUp) -> bool:
+        """Whether a closer look has a new verdict on the place of an old one, of which less than half is left."""
+        if verdict.age <= self.places.forgetting.span:
+            return False
+        in_its_cell = verdict.look.cell == look.cell
+        return in_its_cell or float(box_iou(verdict.look.box[None], look.box[None])) >= SAME
+
+    def _place(self, verdict: _Verdict) -> float:
         """Probability that the target is still at the place of a closer look."""
-        look, keep = verdict.look, self.places.forgetting.keep
-        if keep**verdict.age == 1:
+        look = verdict.look
+        if self.places.forgetting.keep**verdict.age == 1:
             return look.place
         return min(look.place, self._faded(look.place, self.places.probability(look), verdict.age))
 
-    def _faded(self, before: float, now: float, age: float) -> float:
-        """A probability that fades towards that of the belief."""
+    def _faded(self, fresh: float, without: float, age: float) -> float:
+        """Let a probability after a closer look fade towards that without closer looks.
+
+        Args:
+            fresh: probability right after the look.
+            without: present probability by the belief alone.
+            age: seconds since the look.
+
+        Returns:
+            The probability whose log odds are the mean of both, weighted by the evidence that is left.
+        """
         weight = self.places.forgetting.keep**age
         if weight == 1:
-            return before
-        odds, present = (math.log(p / (1 - p)) for p in (min(max(p, _FLOOR), 1 - _FLOOR) for p in (before, now)))
-        return 1 / (1 + math.exp(-(weight * odds + (1 - weight) * present)))
+            return fresh
+        logit = weight * _log_odds(fresh) + (1 - weight) * _log_odds(without)
+        return 1 / (1 + math.exp(-logit))
+
+
+def _log_odds(probability: float) -> float:
+    """Log odds of a probability, kept off 0 and 1."""
+    inside = min(max(probability, _FLOOR), 1 - _FLOOR)
+    return math.log(inside / (1 - inside))

@@ -14,15 +14,15 @@ from semfov.belief.observers import Look, Observer, Semantic
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes
 from semfov.envs.scenery import Scenery
-from semfov.episode import EpisodeLook, Looks, Step, StoredLooks
+from semfov.episode import EpisodeLook, Looks, StoredLooks
 from semfov.episode.loop import attend
 from semfov.episode.memory import Memory
 from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import check, check_whole
 from semfov.metrics.episodes import right_cells
 from semfov.paths import Scanpath
-from semfov.paths.scanpath import Trace
 from semfov.paths.stimulus import Stimulus, reduced_copy
+from semfov.paths.trace import Trace
 from semfov.viz.animation import render
 from semfov.viz.look import plot_fixation
 
@@ -95,7 +95,7 @@ class CellGazes(Gazes):
         self.size = torch.zeros(count, 2)
         # The cells of the goal, or the right classes of all cells.
         self._right = torch.zeros(count, cells, *maps, dtype=torch.bool)
-        self._steps: list[Step] = []
+        self._trace: Trace | None = None  # of the first episode, where its pictures are wanted
         self._stimulus: Stimulus | None = None
 
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
@@ -160,13 +160,19 @@ class CellGazes(Gazes):
         return render([plot_fixation(path, -1, image, view, boxes=boxes)])[0]
 
     def scanpath(self) -> Scanpath:
-        """The looks of the first episode, which are kept for pictures."""
+        """Make the record of the looks of the first episode, which are kept for pictures."""
+        assert self._trace is not None
+        with torch.inference_mode():
+            return self._trace.scanpath()
+
+    def _new_trace(self) -> Trace:
+        """Make the trace of the first episode, before its first look."""
         episode = self.episodes[0]
         grid, classes = self.scenery.grid(episode.scene), self.scenery.classes
+        if not self.searching:
+            return Trace(grid, classes, None, None)
         # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
-        cue, beside = (episode.cue, Semantic(len(classes))) if self.searching else (None, None)
-        with torch.inference_mode():
-            return Trace(grid, classes, cue, beside, steps=self._steps).scanpath()
+        return Trace(grid, classes, episode.cue, Semantic(len(classes)))
 
     @torch.inference_mode()
     def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
@@ -183,7 +189,8 @@ class CellGazes(Gazes):
         self.looks.enter(rows, scenes, self.targets[rows] if self.searching else None)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
         self.cell[rows] = torch.tensor([episode.start for episode in episodes])
-        self._steps, self._stimulus = [], None
+        self._trace = self._new_trace() if self.pictures else None
+        self._stimulus = None
         self._see(rows, rows, Memory.empty(self.looks, self.observer, len(rows)))
 
     @torch.inference_mode()
@@ -205,14 +212,12 @@ class CellGazes(Gazes):
         else:
             hits = right_cells(self._all_or(rows).class_probabilities(), right).sum(-1)
             self.result[rows] = hits / right.any(-1).sum(-1)
-        if not self.pictures:
-            return
-        detections, cell, point = self.detections(_FIRST), self.cell[:1].clone(), self.points(_FIRST)
-        look = EpisodeLook(None, lambda: detections, {})  # type: ignore[arg-type]
-        visited = self.memory.visited
-        values = torch.zeros(visited.shape)
-        step = Step(len(self._steps), _FIRST, cell, point, look, self.memory.belief, visited, values, cell, point, {})
-        self._steps.append(step)
+        if self._trace is not None:
+            # Actions are chosen without values, and stored looks have no times.
+            values = torch.zeros(1, self.memory.visited.shape[1])
+            self._trace.fixate(
+                self.cell[:1].clone(), self.points(_FIRST), self.detections(_FIRST), self._all_or(_FIRST), values, {}
+            )
 
     def _view(self, row: int) -> Tensor:
         view = self.scenery.view(self.episodes[row].scene)
@@ -222,5 +227,5 @@ class CellGazes(Gazes):
         return self.scenery.eye.pictures(view, point)[..., top : top + high, left : left + wide]
 
     def _all_or(self, rows: Tensor) -> Belief:
-        """The belief of some rows, without a copy where these are all."""
+        """Take the belief of some rows, without a copy where these are all."""
         return self.memory.belief if len(rows) == len(self.episodes) else self.memory.belief[rows]

@@ -67,7 +67,7 @@ class Gazes(ABC):
 
     @abstractmethod
     def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
-        """The episode that the options of a reset ask for, or one at random."""
+        """Choose the episode that the options of a reset ask for, or one at random."""
 
     @abstractmethod
     def action(self, action: Any) -> Tensor:
@@ -131,7 +131,7 @@ class Gazes(ABC):
 
     @abstractmethod
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
-        """The belief of the rows `(n,)` as planes over the scene, `(n, C, Y, X)`."""
+        """Lay out the belief of the rows `(n,)` as planes over the scene, `(n, C, Y, X)`."""
 
     @abstractmethod
     def places(self, rows: Tensor) -> Tensor:
@@ -143,7 +143,7 @@ class Gazes(ABC):
 
     @abstractmethod
     def detections(self, rows: Tensor) -> Detections:
-        """Detections of the present looks, a batch of n."""
+        """Take the detections of the present looks, a batch of n."""
 
     @abstractmethod
     def draw(self) -> NDArray[np.uint8]:
@@ -155,4 +155,4 @@ class Gazes(ABC):
 
     @abstractmethod
     def _view(self, row: int) -> Tensor:
-        """The image that the eye sees in a row, `(1, 3, h, w)`."""
+        """Show the image that the eye sees in a row, `(1, 3, h, w)`."""

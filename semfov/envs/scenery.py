@@ -58,7 +58,7 @@ class _Surroundings:
         self._chosen = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A copy opens the same scenes again."""
+        """Tell pickle that a copy opens the same scenes again."""
         return self.opened, ()
 
     def image(self, scene: int) -> Tensor:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interpolate
 
-from semfov.agents.windows import WindowEpisode
+from semfov.agents.episode import Goal
+from semfov.agents.window_episode import GivenWindows
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes
 from semfov.envs.scenery import ZoomScenery
@@ -35,7 +36,7 @@ class WindowGaze(Gazes):
 
     coordinates = 3
     scenery: ZoomScenery
-    looking: WindowEpisode
+    looking: GivenWindows
 
     def __init__(self, scenery: ZoomScenery, task: str, *, grid: tuple[int, int] = (10, 10), **options: Any) -> None:
         self.task, self.shape = task, (grid[1], grid[0])
@@ -73,8 +74,8 @@ class WindowGaze(Gazes):
         return reward, terminated, truncated
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
-        """The probability that closer looks find an object, and how closely each place was looked at."""
-        lattice, belief = self.source.lattice, self.looking.belief
+        """Lay out the probability that closer looks find an object, and how closely each place was looked at."""
+        lattice, belief = self.source.lattice, self.looking.session.belief
         assert belief is not None
         expected = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
         most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
@@ -100,7 +101,7 @@ class WindowGaze(Gazes):
         return free
 
     def detections(self, rows: Tensor) -> Detections:
-        return next(look for look in self.looking.window_looks if look.window == self.window).detections
+        return next(look for look in self.looking.looks if look.shown.window == self.window).detections
 
     def draw(self) -> NDArray[np.uint8]:
         image = self.scenery.image(self.episodes[0].scene)[None]
@@ -114,8 +115,8 @@ class WindowGaze(Gazes):
         (episode,) = episodes
         self.targets[rows] = episode.target
         self.source = self.scenery.looks_at(episode.scene)
-        self.looking = WindowEpisode(self.scenery.classes, self.scenery.evidence, episode.target or None)
-        self.looking.open(self.source, told=True)
+        goal = Goal.of(self.scenery.classes, episode.target or None)
+        self.looking = GivenWindows(goal, self.scenery.evidence, self.source)
         self.done = set()
         self._see(Window.overview(self.source.lattice))
 
@@ -127,9 +128,10 @@ class WindowGaze(Gazes):
         """Look at a window, unless it was looked at, and rate the looks."""
         self.window = window
         if window not in self.done:
-            self.looking.look(window=window)
+            self.looking.look(window)
             self.done.add(window)
-        (scene, target), looks = self.episodes[0], self.looking.window_looks
+        scene, target = self.episodes[0]
+        looks = [look.shown for look in self.looking.looks]
         result = self.scenery.found(looks, scene, target) if target else self.scenery.share(looks, scene)
         self.result = torch.tensor([result], dtype=torch.float64)
 
@@ -140,7 +142,7 @@ class WindowGaze(Gazes):
 
 
 def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
-    """The window of the lattice that is nearest to an action."""
+    """Find the window of the lattice that is nearest to an action."""
     level = round(float(action[2]) * (lattice.levels - 1))
     places, pitch, window = lattice.places(level), lattice.pitch, lattice.window(level)
     column, row = (
@@ -153,7 +155,7 @@ def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
 
 
 def _action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
-    """The action that looks at a window; → `(x, y, magnification)`."""
+    """Find the action that looks at a window; → `(x, y, magnification)`."""
     x, y, _ = window.fixation
     level = window.level / max(lattice.levels - 1, 1)
     return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)

@@ -136,7 +136,7 @@ class StoredLooks(Looks):
         self._classes = [] if targets is None else targets.unique().tolist()
 
     def of(self, episodes: Tensor | slice) -> Self:
-        """The same looks for some of the episodes.
+        """Select the looks of some of the episodes.
 
         Args:
             episodes: their numbers.
@@ -172,7 +172,7 @@ class StoredLooks(Looks):
         return torch.searchsorted(targets.new_tensor(self._classes), targets) * len(self.grid)
 
     def rows(self, observer: Observer) -> int:
-        """Number of rows of `weighed`.
+        """Count the rows of `weighed`.
 
         Args:
             observer: the observer.

@@ -66,10 +66,24 @@ def attend(
     fixation: Tensor,
     forgetting: Forgetting | None = None,
 ) -> tuple[EpisodeLook, Memory]:
-    """Make one look in each episode and update its state. `rollout` and the environments share this step."""
+    """Make one look in each of A episodes, and update their state. `rollout` and the environments share this step.
+
+    Args:
+        looks: the source of looks.
+        observer: turns looks into a belief.
+        memory: the state of the episodes.
+        episodes: `(A,)`, numbers of the episodes.
+        cell: `(A,)`, fixated cells.
+        fixation: `(A, 2)`, fixated points.
+        forgetting: fading of belief and inhibition of return; None for scenes that do not change.
+
+    Returns:
+        The looks, and the state after them.
+    """
     look = looks.see(observer, episodes, cell, fixation)
     watch = Stopwatch(look.seconds)
-    belief, age = memory.belief, memory.age
+    belief = memory.belief
+    age = memory.age
     if forgetting is not None:
         age = age + look.passed
         belief = observer.fade(belief, look.evidence, forgetting.keep**look.passed, forgetting.visited(age))
@@ -130,27 +144,52 @@ def rollout(
     """
     if not len(start):
         return
-    acquire = (lambda episodes, cell: acquisition) if isinstance(acquisition, AcquisitionFunction) else acquisition
+    acquire = acquisition
+    if isinstance(acquisition, AcquisitionFunction):
+        acquire = _always(acquisition)
     centres = looks.grid.centres.to(looks.like)
-    episodes, cell, fixation = torch.arange(len(start), device=start.device), start, centres[start]
+    episodes = torch.arange(len(start), device=start.device)
+    cell = start
+    fixation = centres[start]
     memory = Memory.empty(looks, observer, len(start))
     for shift in range(most):
         look, memory = attend(looks, observer, memory, episodes, cell, fixation, forgetting)
-        belief, visited = memory.belief, memory.visited
         watch = Stopwatch(look.seconds)
-        values = acquire(episodes, cell)(belief, visited)
-        next_fixation, next_cell = choice(shift, episodes, values, visited, centres)
+        values = acquire(episodes, cell)(memory.belief, memory.visited)
+        next_fixation, next_cell = choice(shift, episodes, values, memory.visited, centres)
         watch.lap("choose")
         step = Step(
-            shift, episodes, cell, fixation, look, belief, visited, values, next_cell, next_fixation, watch.seconds
+            shift=shift,
+            episodes=episodes,
+            cell=cell,
+            fixation=fixation,
+            look=look,
+            belief=memory.belief,
+            visited=memory.visited,
+            values=values,
+            next_cell=next_cell,
+            next_fixation=next_fixation,
+            seconds=watch.seconds,
         )
         yield step
-        over = visited.all(-1)
-        going = ~over if ends is None else ~(over | ends(step))
+        over = memory.visited.all(-1)
+        if ends is not None:
+            over = over | ends(step)
+        going = ~over
         if not going.any():
             return
         if window is not None and (shift + 1) % window == 0:
-            memory, next_fixation = replace(memory, belief=belief.detach()), next_fixation.detach()
-        cell, fixation = next_cell, next_fixation
+            memory = replace(memory, belief=memory.belief.detach())
+            next_fixation = next_fixation.detach()
+        cell = next_cell
+        fixation = next_fixation
         if not going.all():
-            episodes, cell, fixation, memory = episodes[going], cell[going], fixation[going], memory[going]
+            episodes = episodes[going]
+            cell = cell[going]
+            fixation = fixation[going]
+            memory = memory[going]
+
+
+def _always(acquisition: AcquisitionFunction) -> Callable[[Tensor, Tensor], AcquisitionFunction]:
+    """Make the function that gives one acquisition function for all episodes and cells."""
+    return lambda episodes, cell: acquisition

@@ -82,6 +82,6 @@ class Memory:
         return Memory(self.belief[index], self.visited[index], self.age[index])
 
     def put(self, index: Tensor, other: "Memory") -> "Memory":
-        """The state with that of some episodes `(n,)` replaced; both must have had a look."""
+        """Replace the state of some episodes `(n,)`; both must have had a look."""
         visited, age = self.visited.index_copy(0, index, other.visited), self.age.index_copy(0, index, other.age)
         return Memory(self.belief.put(index, other.belief), visited, age)

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
-from semfov.decision import OUTCOMES, Verifier, verified
+from semfov.decision import FOUND, Verifier, final_outcome, found_at_once
 from semfov.decision.candidates import LookType
 from semfov.errors import DataError
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, TargetSearch, photograph_searches
@@ -79,10 +79,10 @@ class VerifiedSearch(NamedTuple):
         """Return the end of the search at a threshold."""
         chances = [chance for chance, _ in self.places]
         for number, end in enumerate(self.ends, 1):
-            if verified(chances[:number], self.presence, confirm, over=False):
+            if found_at_once(chances[:number], confirm):
                 _, right = self.places[number - 1]
                 return SearchEnd(right, end)
-        if OUTCOMES[verified(chances, self.presence, confirm, over=True)] != "found":
+        if final_outcome(chances, self.presence, confirm) != FOUND:
             return SearchEnd(None, self.looks)
         _, right = self.places[chances.index(max(chances))]
         return SearchEnd(right, self.looks)
@@ -187,6 +187,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
 
 def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:
     """Look closely at the most evident places after some numbers of looks; yields features `(7,)` and box `(4,)`."""
+    least = Thresholds(confirm=1.0, give_up=_LEAST_CHANCE, place=_LEAST_CHANCE)
     for looks in search.after:
         if looks > len(search):
             return
@@ -194,7 +195,7 @@ def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, T
         for index in range(looks):
             candidates.see(search.look(index, index + 1))
         for _ in range(_PLACES):
-            candidate = candidates.due(_LEAST_CHANCE, last=True)
+            candidate = candidates.due(least, last=True)
             if candidate is None:
                 break
             yield candidates.examine(candidate, search.close_up)
@@ -246,8 +247,8 @@ def _verify_search(
         present=search.present,
         spare=search.spare,
         places=tuple((look.place, search.right(look.box)) for look in verifier.looks),
-        ends=() if places.by_worth else tuple(ends),
-        presence=verifier.decision(over=True).probability,
+        ends=() if places.exhaustive else tuple(ends),
+        presence=verifier.conclude(room=0).probability,
         looks=looks,
         unverified=search.unverified_end(thresholds),
     )

@@ -145,7 +145,7 @@ def _explore(
         window_looks.append(step.look)
         remaining.append(step.belief.remaining())
         # Nothing was promised before the look at the whole.
-        promised.append(promised[-1] + step.worth if promised else 0.0)
+        promised.append(promised[-1] + step.value if promised else 0.0)
     numbers = {min(number, len(window_looks)) for number in (*_AFTER, passes, *_EXPECTING, _FURTHER * passes)}
     return Exploration.of(target, window_looks, numbers, looks.lattice, annotation, remaining, promised)
 

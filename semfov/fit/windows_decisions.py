@@ -119,7 +119,8 @@ class WindowSearches(NamedTuple):
         rows: list[tuple[Tensor, ...]] = []
         for search in _search_pictures(model, pictures, opened, config, title):
             known = [
-                _Known(facts.best, facts.case(step.ahead), facts.detected, step.ahead) for step, facts in search.steps
+                _Known(facts.best, facts.case(step.next_value), facts.detected, step.next_value)
+                for step, facts in search.steps
             ]
             known += [known[-1]._replace(worth=0.0)] * (config.passes - len(known))
             rows.append(
@@ -218,8 +219,8 @@ class _MosaicSearch(TargetSearch[SearchLook]):
         self.window_looks: list[WindowLook] = []
         self.boxes: list[Tensor | None] = []
         for number, (step, facts) in enumerate(search.steps, 1):
-            presence = facts.presence(step.ahead)
-            self.steps.append(SearchLook(step.look.detections, number, presence, facts.best, step.ahead))
+            presence = facts.presence(step.next_value)
+            self.steps.append(SearchLook(step.look.detections, number, presence, facts.best, step.next_value))
             self.window_looks.append(step.look)
             self.boxes.append(facts.box if facts.detected else None)
 
@@ -242,7 +243,7 @@ class _MosaicSearch(TargetSearch[SearchLook]):
     def outcome(self, index: int, thresholds: Thresholds) -> int:
         after = self.steps[index]
         detected = self.boxes[index] is not None
-        presence, known, worth = (torch.tensor([value]) for value in (after.presence, detected, after.left))
+        presence, known, worth = (torch.tensor([value]) for value in (after.presence, detected, after.hit_chance))
         return int(settle(presence, known, worth, thresholds))
 
     def found_right(self, index: int) -> bool:

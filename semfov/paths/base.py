@@ -45,11 +45,10 @@ class Record(Conversion):
     Attributes:
         classes: names of the classes, background first.
         target: class index 1..K that was searched for; None for all classes.
-        detections: detections of each look, batches of one.
+        looks: the looks in their order, as the episode made them.
         found: whether a search found its target.
         closer: closer looks of a search, in order.
         ending: reason for the end; None if it is not known, and for a frame of a stream.
-        seconds: time at the end of each look, on the clock of the episode; empty if the times are not known.
         decision: decision of a search; None for exploration, and for a search without one.
         targets: class indices 1..K of a search for several classes; otherwise empty.
         least: score from which on objects count, in windows their probability (`words.threshold`).
@@ -141,7 +140,7 @@ class Record(Conversion):
         Returns:
             The fixations, with the target of a search and whether it was found.
         """
-        points = torch.tensor([look.fixation for look in self], dtype=torch.float64).view(-1, 2).numpy()
+        points = torch.tensor([look.fixation for look in self.fixated], dtype=torch.float64).view(-1, 2).numpy()
         found = None if self.target is None else self.found
         return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
 

@@ -1,7 +1,7 @@
 """The record of an episode of eye and head: where both looked, what was seen and what was believed."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.windowed import LargePicture
+from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.detection.placement import resize
 from semfov.errors import InputError, check
@@ -77,7 +78,8 @@ class HeadWords(Words):
             outcome = f"{record.target_name}: {record.decision.outcome} ({certainty})"
         looks = f"{len(record)} look{'s' if len(record) != 1 else ''}"
         turns = f"{record.turns} turn{'s' if record.turns != 1 else ''} of the head"
-        return f"{outcome} in {record.seconds[-1]:.1f} s of eye and head: {looks}, {turns}"
+        seconds = record.seconds[-1] if record.looks else 0.0
+        return f"{outcome} in {seconds:.1f} s of eye and head: {looks}, {turns}"
 
     def why_it_ended(self) -> str:
         """Explain in one sentence why it ended, with the time limit of the scene where that ended it."""
@@ -100,6 +102,71 @@ class HeadWords(Words):
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
+class HeadLook(RecordedLook):
+    """One look of an eye in a head that turns.
+
+    Attributes:
+        action: number of the pose and cell (`Views`).
+        in_view: its detections, a batch of one, with boxes in pixels of its view.
+    """
+
+    action: int
+    in_view: Detections
+
+
+def head_look(
+    views: Views, action: int, in_view: Detections, map_after: Tensor, number: int, seconds: float, value: float
+) -> HeadLook:
+    """Make the complete look of a head; its region is the smallest box around what it shows.
+
+    Args:
+        views: the views and fixations that were possible.
+        action: number of the pose and cell.
+        in_view: its detections, with boxes in pixels of the view.
+        map_after: `(S,)`, probability of the target, or of any object, in each cell of the scene after the look.
+        number: number of the look.
+        seconds: time at its end, on the clock of eye and head.
+        value: expected gain per second for which it was chosen; infinite for the first.
+    """
+    world = views.world
+    pose = views.poses[action // views.cells]
+    pan, tilt, degrees = pose.tolist()
+    x, y = world.pixels_of(views.gaze[[action]])[0].tolist()
+    frame = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
+    x1, y1, x2, y2 = world.boxes(frame, pose)[0].tolist()
+    boxes = world.boxes(in_view.boxes[0], pose)[None].to(in_view.boxes)
+    cells = cell_columns(world.scene, int(views.gaze_cell[action]), map_after)
+    return HeadLook(
+        number=number,
+        fixation=(x, y),
+        region=(x1, y1, x2, y2),
+        detections=replace(in_view, boxes=boxes),
+        seconds=seconds,
+        value=value if math.isfinite(value) else None,
+        more={"action": action, "pan": pan, "tilt": tilt, "field": degrees, **cells},
+        action=action,
+        in_view=in_view,
+    )
+
+
+def head_looks(
+    views: Views,
+    actions: Sequence[int],
+    in_views: Sequence[Detections],
+    maps: Tensor,
+    seconds: Sequence[float],
+    values: Sequence[float] = (),
+) -> tuple[HeadLook, ...]:
+    """Make the looks of a head from their columns (`head_look`); values that are not known are infinite."""
+    values = values or [math.inf] * len(actions)
+    columns = zip(actions, in_views, maps, seconds, values, strict=True)
+    return tuple(
+        head_look(views, action, in_view, map_after, number, time, value)
+        for number, (action, in_view, map_after, time, value) in enumerate(columns)
+    )
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class HeadPath(Record):
     """The record of an episode: where eye and head looked, what was seen and what was believed.
 
@@ -108,13 +175,11 @@ class HeadPath(Record):
     Attributes:
         views: the views and fixations that were possible. Those of a path from a file have the geometry of the scene,
             without its picture.
-        actions: number of the pose and cell of each look (`Views`).
-        seconds: time at the end of each look, on the clock of eye and head (`semfov.head.Speeds`).
-        detections: detections of each look, a batch of one, with boxes in pixels of its view.
+        looks: the looks; their times are on the clock of eye and head (`semfov.head.Speeds`), and their values are the
+            expected gains per second for which they were chosen.
         maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
             exploration.
         duration: time limit of the scene in seconds, on the clock of `seconds`; None for none.
-        values: expected gain per second for which each look was chosen, infinite for the first; empty if not known.
         found: whether the last look found the target; the `cell` of the decision is then one of the scene.
 
     Example::
@@ -125,16 +190,29 @@ class HeadPath(Record):
     """
 
     views: Views
-    actions: tuple[int, ...]
-    seconds: tuple[float, ...]
+    looks: tuple[HeadLook, ...]
     maps: Tensor
-    values: tuple[float, ...] = ()
     duration: float | None = None
 
     kind = HEAD
     _words = HeadWords
     _format = _FORMAT
     _columns = (*COLUMNS, "pan", "tilt")
+
+    @property
+    def actions(self) -> tuple[int, ...]:
+        """Number of the pose and cell of each look (`Views`)."""
+        return tuple(look.action for look in self.looks)
+
+    @property
+    def detections(self) -> tuple[Detections, ...]:
+        """Detections of each look, a batch of one, with boxes in pixels of its view."""
+        return tuple(look.in_view for look in self.looks)
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Expected gain per second for which each look was chosen; infinite for the first, and if it is not known."""
+        return tuple(math.inf if look.value is None else look.value for look in self.looks)
 
     @property
     def turns(self) -> int:
@@ -152,9 +230,10 @@ class HeadPath(Record):
         """
         distances, cut = [], []
         width, height = self.views.world.size
-        for number, detections in enumerate(self.detections):
-            boxes, field = detections.boxes[0], float(self.pose(number)[2])
-            point = self.views.view_grid.centres[self.actions[number] % self.views.cells]
+        for look in self.looks:
+            boxes = look.in_view.boxes[0]
+            field = float(self.pose(look.number)[2])
+            point = self.views.view_grid.centres[look.action % self.views.cells]
             distances.append(distances_to(boxes, point) * field / width)
             border = boxes.new_tensor([2.0, 2.0, width - 2.0, height - 2.0])  # a box this near to it counts as cut
             cut.append((boxes[:, :2] <= border[:2]).any(-1) | (boxes[:, 2:] >= border[2:]).any(-1))
@@ -172,7 +251,7 @@ class HeadPath(Record):
         return float(self.size[0]) if self.views.world.closed else None
 
     def object_rows(self) -> list[dict[str, Any]]:
-        """The table of objects, with `pan` to the right and `tilt` up of the middle of each box, in degrees."""
+        """List the objects, with `pan` to the right and `tilt` up of the middle of each box, in degrees."""
         rows = super().object_rows()
         world = self.views.world
         points = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2) - 0.5
@@ -189,7 +268,7 @@ class HeadPath(Record):
         Returns:
             `(3,)`, pan to the right, tilt up, and field of view, in degrees.
         """
-        return self.views.poses[self.actions[look] // self.views.cells]
+        return self.views.poses[self.looks[look].action // self.views.cells]
 
     def gaze(self, look: int) -> Tensor:
         """Point of the scene that the eye fixated in a look.
@@ -200,7 +279,7 @@ class HeadPath(Record):
         Returns:
             `(D,)`, a unit direction in a panorama, or pixels of a flat scene.
         """
-        return self.views.gaze[self.actions[look]]
+        return self.views.gaze[self.looks[look].action]
 
     def direction(self, look: int) -> tuple[float, float]:
         """Direction in which the eye looked, as a head would turn to it.
@@ -224,31 +303,12 @@ class HeadPath(Record):
         Returns:
             The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
         """
-        detections = self.detections[look]
+        detections = self.looks[look].in_view
         best, label = detections.confidence[0], detections.labels[0]
         chosen = detections.mask[0] & (best >= score)
         if self.target is not None:
             chosen &= label == self.target
         return self.views.world.places(detections.boxes[0, chosen], self.pose(look)), label[chosen], best[chosen]
-
-    def _looks(self) -> Iterator[RecordedLook]:
-        """The looks; regions are the smallest boxes around what they show."""
-        world = self.views.world
-        frame = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
-        values = self.values or (math.inf,) * len(self.actions)
-        points = world.pixels_of(self.views.gaze[[*self.actions]]).tolist()
-        for number, (action, (x, y), value) in enumerate(zip(self.actions, points, values, strict=True)):
-            pose, seen = self.pose(number), self.detections[number]
-            x1, y1, x2, y2 = world.boxes(frame, pose)[0].tolist()
-            boxes = world.boxes(seen.boxes[0], pose)[None].to(seen.boxes)
-            more = {
-                "action": action,
-                **dict(zip(("pan", "tilt", "field"), pose.tolist(), strict=True)),
-                **cell_columns(world.scene, int(self.views.gaze_cell[action]), self.maps[number]),
-            }
-            chosen = value if math.isfinite(value) else None
-            region = (x1, y1, x2, y2)
-            yield RecordedLook(number, (x, y), region, replace(seen, boxes=boxes), self.seconds[number], chosen, more)
 
     def outline(self, look: RecordedLook) -> Tensor:
         """Border of the view of a look, `(P, 2)`; it goes on beyond the picture where it crosses its seam."""
@@ -269,29 +329,28 @@ class HeadPath(Record):
         return self.views.world.scene, self.maps[number]
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
-        """The views of the head, rendered from a picture of the scene in any size."""
+        """Render the views of the head from a picture of the scene in any size."""
         world, (width, height) = self.views.world, self.size
         image = read_region(source, (0, 0, width, height), self.size, 2 * LONGEST)
         # Poses in a panorama are angles, which do not depend on the size of the picture.
         scene = Panorama(image[..., : image.shape[-1] // 2 * 2], world.size, reach=90) if world.closed else None
         across, down = image.shape[-1] / width, image.shape[-2] / height
-        for look in self:
+        for look in self.looks:
             if scene is not None:
                 pixels = scene.view(self.pose(look.number))[0]
             else:
                 x1, y1, x2, y2 = (side * by for side, by in zip(look.region, (across, down) * 2, strict=True))
                 left, top, right, bottom = whole_pixels((x1, y1, x2, y2), (image.shape[-1], image.shape[-2]))
                 pixels = resize(image[None, :, top:bottom, left:right], world.size)[0].clamp(0, 1)
-            x, y = self.views.view_grid.centres[self.actions[look.number] % self.views.cells].tolist()
-            yield LookView(pixels, world.size, self.detections[look.number].boxes[0], (x, y))
+            x, y = self.views.view_grid.centres[look.action % self.views.cells].tolist()
+            yield LookView(pixels, world.size, look.in_view.boxes[0], (x, y))
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         views = self.views
         record: dict[str, Any] = {"fields": list(views.fields), "fovea": views.fovea, "duration": self.duration}
         record["seconds"] = list(self.seconds)
         tensors = {"actions": torch.tensor(self.actions), "maps": self.maps}
-        if self.values:
-            tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
+        tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         return tensors, {"world": _settings(views.world), **record}
 
     @classmethod
@@ -310,14 +369,13 @@ class HeadPath(Record):
         check(maps.shape[-1] == cells, "maps", f"values of {cells} cells", maps.shape[-1])
         cell = None if decision is None else decision.cell
         check(cell is None or cell < cells, "decision.cell", f"a cell number below {cells}", cell)
-        values = tuple(tensors["values"].tolist()) if "values" in tensors else ()
-        seconds = tuple(record["seconds"])
-        made = {"views": views, "actions": tuple(actions.tolist()), "maps": maps, "seconds": seconds, "values": values}
-        return made | {"duration": record.get("duration")}
+        values = tensors["values"].tolist() if "values" in tensors else []
+        looks = head_looks(views, actions.tolist(), shared["detections"], maps, record["seconds"], values)
+        return {"views": views, "looks": looks, "maps": maps, "duration": record.get("duration")}
 
 
 def _settings(world: World) -> dict[str, Any]:
-    """The geometry of a scene as JSON values."""
+    """Describe the geometry of a scene by JSON values."""
     what = type(world) if world.still else Sphere  # that of a camera
     for kind, (made, names) in _WORLDS.items():
         if what is made:

@@ -43,7 +43,7 @@ class RecordedLook:
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Number, point, region and number of detections from score 0.1 on in one line."""
+        """Tell number, point, region and number of detections from score 0.1 on in one line."""
         (x, y), count = self.fixation, int(confident_detections(self.detections).count)
         seen = f"{count} detection{'s' if count != 1 else ''} from score {CONFIDENT:g} on"
         return f"{type(self).__name__} {self.number} at ({x:.0f}, {y:.0f}), box {box_text(self.region)}: {seen}"
@@ -59,7 +59,7 @@ class LookView(NamedTuple):
 
 
 def whole_pixels(box: Sequence[float], size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """A region in whole pixels, with at least one pixel, inside a picture of `(width, height)`."""
+    """Round a region to whole pixels, at least one, inside a picture of `(width, height)`."""
     x1, y1 = (min(max(round(low), 0), most - 1) for low, most in zip(box[:2], size, strict=True))
     x2, y2 = (min(max(round(high), low + 1), most) for high, low, most in zip(box[2:], (x1, y1), size, strict=True))
     return x1, y1, x2, y2
@@ -73,18 +73,27 @@ def read_region(source: LargePicture, region: Sequence[float], size: tuple[int, 
 
 
 def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]:
-    """Columns of a table on a fixated cell: its place, its probability `(cells,)`, and the most probable cell."""
+    """Columns of a table on a look at a cell: its place, its probability, and the most probable cell.
+
+    Args:
+        grid: the cells.
+        cell: number of the cell.
+        belief: `(cells,)`, the probability of each cell after the look; None if there is none.
+    """
     row, column = divmod(cell, grid.columns)
+    place = {"cell": cell, "column": column, "row": row}
+    if belief is None:
+        return {**place, "probability": None, "highest": None, "highest_cell": None}
     return {
-        **{"cell": cell, "column": column, "row": row},
-        "probability": None if belief is None else float(belief[cell]),
-        "highest": None if belief is None else float(belief.max()),
-        "highest_cell": None if belief is None else int(belief.argmax()),
+        **place,
+        "probability": float(belief[cell]),
+        "highest": float(belief.max()),
+        "highest_cell": int(belief.argmax()),
     }
 
 
 def confident_detections(detections: Detections, most: int | None = None) -> Detections:
-    """The most confident detections of a look, a batch of one in descending order of confidence, without padding."""
+    """Take the most confident detections of a look, a batch of one without padding, the most confident first."""
     order = detections.confidence[0].argsort(descending=True, stable=True)
     count = int((detections.confidence[0] >= CONFIDENT).sum())
     return detections.take(order[:count][:most]).to("cpu")

@@ -17,6 +17,7 @@ def merge_fixations(
     *,
     cut: Sequence[Tensor] | None = None,
     around: float | None = None,
+    numbers: Sequence[int] | None = None,
 ) -> Objects:
     """Merge the detections of fixations and of closer looks into objects.
 
@@ -29,19 +30,21 @@ def merge_fixations(
         closer: closer looks.
         cut: `(L,)` boolean for each look, boxes that the border of the view cuts; None for none.
         around: width in pixels after which the picture repeats; None for other pictures.
+        numbers: number of each of the looks; None for 0 to n - 1.
 
     Returns:
         The objects from score 0.05 on, most confident first.
     """
     rows = []
-    for number, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
+    for place, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
+        number = place if numbers is None else numbers[place]
         chosen = detections.mask[0] & (detections.confidence[0] >= FAINTEST)
         columns = (
             detections.boxes[0],
             detections.confidence[0],
             detections.labels[0],
             torch.full_like(chosen, number, dtype=torch.int64),
-            torch.zeros_like(chosen) if cut is None else cut[number],
+            torch.zeros_like(chosen) if cut is None else cut[place],
             -distance,
         )
         rows.append([column[chosen].detach().cpu() for column in columns])

@@ -50,11 +50,10 @@ class Outcome(ABC):
 
     classes: tuple[str, ...]
     target: int | None
-    detections: tuple[Detections, ...]
+    looks: tuple[RecordedLook, ...]
     found: bool = False
     closer: tuple[CloseUp, ...] = ()
     ending: Ending | None = None
-    seconds: tuple[Any, ...] = ()
     decision: Decision | None = None
     targets: tuple[int, ...] = ()
     least: float = LEAST
@@ -67,10 +66,6 @@ class Outcome(ABC):
     kind: ClassVar[LookKind]
     """Kind of look: of a fovea, at windows, or of a head that turns."""
 
-    @abstractmethod
-    def _looks(self) -> Iterator[RecordedLook]:
-        """Make the looks in their order, anew."""
-
     @property
     @abstractmethod
     def size(self) -> tuple[int, int]:
@@ -81,10 +76,20 @@ class Outcome(ABC):
         """Name of the kind of look: `fovea`, `windows` or `head`."""
         return self.kind.how
 
-    @cached_property
-    def looks(self) -> tuple[RecordedLook, ...]:
-        """The looks in their order."""
-        return tuple(self._looks())
+    @property
+    def fixated(self) -> tuple[RecordedLook, ...]:
+        """The looks that move the gaze: all of windows and of a head, of a fovea those that are no closer looks."""
+        return self.looks
+
+    @property
+    def detections(self) -> tuple[Detections, ...]:
+        """Detections of each look, batches of one."""
+        return tuple(look.detections for look in self.looks)
+
+    @property
+    def seconds(self) -> tuple[Any, ...]:
+        """Time at the end of each look, on the clock of the episode; empty if the times are not known."""
+        return () if any(look.seconds is None for look in self.looks) else tuple(look.seconds for look in self.looks)
 
     def __iter__(self) -> Iterator[RecordedLook]:
         """Go through the looks in their order."""
@@ -92,7 +97,7 @@ class Outcome(ABC):
 
     def __len__(self) -> int:
         """Return the number of looks, the first included."""
-        return len(self.detections)
+        return len(self.looks)
 
     def __getitem__(self, number: int) -> RecordedLook:
         """Return the look of a number, as iteration gives it; -1 is the last one."""
@@ -141,11 +146,10 @@ class Outcome(ABC):
 
         A closer look is nearer still; its score is the probability that the target is there.
         """
-        looks = [look.detections for look in self]
-        distances = [
-            distances_to(look.detections.boxes[0], torch.tensor(look.fixation, dtype=torch.float64)) for look in self
-        ]
-        return merge_fixations(looks, distances, self.closer)
+        looks = [look.detections for look in self.fixated]
+        points = [torch.tensor(look.fixation, dtype=torch.float64) for look in self.fixated]
+        distances = [distances_to(look.boxes[0], point) for look, point in zip(looks, points, strict=True)]
+        return merge_fixations(looks, distances, self.closer, numbers=[look.number for look in self.fixated])
 
     @property
     def objects(self) -> Objects:

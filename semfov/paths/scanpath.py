@@ -1,28 +1,25 @@
-"""The records of looks of a fovea at cells: an episode in a photograph, from its steps, and a frame of a stream."""
+"""The records of looks of a fovea at cells: an episode in a photograph, and a frame of a stream."""
 
-import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from itertools import accumulate
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from semfov.belief import Belief, Grid
-from semfov.belief.observers.base import Observer
 from semfov.data.inputs import as_image
 from semfov.data.windowed import LargePicture
 from semfov.decision import Decision
-from semfov.detection.objects import LEAST
-from semfov.episode import STAGES, Step
+from semfov.episode import STAGES
 from semfov.errors import InputError, check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Text
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
+from semfov.paths.fovea import FoveaLook, FoveaLooks, moment_look
 from semfov.paths.kinds import FOVEA
-from semfov.paths.look import LookView, RecordedLook, cell_columns
+from semfov.paths.look import LookView
 from semfov.paths.stimulus import Stimulus
 from semfov.paths.words import MomentWords, Words
 
@@ -50,12 +47,14 @@ _PLACEMENT = {"size": Array(POSITIVE, 2), "scale": Array(POSITIVE, 2), "offset":
 _FORMAT = Format(
     "scanpath",
     {
-        "cells": Field(("n",), dtype=torch.int64, low=0),
-        "fixations": Field(("n", 2), mixed=True, low=-FARTHEST, high=FARTHEST),
-        "probabilities": Field(("n", "cells", "C"), mixed=True, low=0, high=1 + 1e-3),
-        "values": Field(("n", "cells"), mixed=True, finite=False),
-        "posterior": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3, optional=True),
-        "presence": Field(("n",), mixed=True, low=0, high=1 + 1e-3, optional=True),
+        "cells": Field(("f",), dtype=torch.int64, low=0),
+        "fixations": Field(("f", 2), mixed=True, low=-FARTHEST, high=FARTHEST),
+        "probabilities": Field(("f", "cells", "C"), mixed=True, low=0, high=1 + 1e-3),
+        "values": Field(("f", "cells"), mixed=True, finite=False),
+        "posterior": Field(("f", "cells"), mixed=True, low=0, high=1 + 1e-3, optional=True),
+        "presence": Field(("f",), mixed=True, low=0, high=1 + 1e-3, optional=True),
+        "closer_regions": Field(("q", 4), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
+        "closer_values": Field(("q",), mixed=True, low=0, high=1 + 1e-3, optional=True),
         "canvas": Field((3, "H", "W"), dtype=torch.uint8, optional=True),
     },
     {
@@ -88,10 +87,10 @@ class _MadeWhenRead:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class _CellRecord(Record):
-    """Base of the records of looks of a fovea at cells; `seconds` are those of each look by stage."""
+    """Base of the records of looks of a fovea at cells."""
 
     grid: Grid
-    seconds: tuple[Mapping[str, float], ...] = ()
+    looks: tuple[FoveaLook, ...]
 
     kind = FOVEA
 
@@ -100,6 +99,11 @@ class _CellRecord(Record):
 
     _plain: ClassVar[tuple[str, ...]] = ()
     """Attributes that are JSON values of a file."""
+
+    @property
+    def seconds(self) -> tuple[Mapping[str, float], ...]:
+        """Seconds of each look by stage (`semfov.episode.STAGES`); empty if they are not known."""
+        return tuple(look.stages for look in self.looks) if all(look.stages for look in self.looks) else ()
 
     @property
     def size(self) -> tuple[int, int]:
@@ -112,7 +116,7 @@ class _CellRecord(Record):
         tensors = {name: getattr(self, name) for name in self._tensors if getattr(self, name) is not None}
         record = {name: getattr(self, name) for name in self._plain}
         record |= {"grid": [self.grid.columns, self.grid.rows], "size": size}
-        return tensors, {**record, "seconds": [dict(each) for each in self.seconds]}
+        return tensors, {**record, "seconds": [dict(stages) for stages in self.seconds]}
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
@@ -124,8 +128,8 @@ class _CellRecord(Record):
         check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
         for look in shared["closer"]:
             check((look.cell or 0) < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
-        made = {name: tensors.get(name) for name in cls._tensors} | {name: record[name] for name in cls._plain}
-        return {**made, "grid": grid, "seconds": tuple(seconds)}
+        kept = {name: tensors.get(name) for name in cls._tensors} | {name: record[name] for name in cls._plain}
+        return {**kept, "grid": grid}
 
 
 class ScanpathWords(Words):
@@ -172,40 +176,42 @@ class ScanpathWords(Words):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Scanpath(_CellRecord):
-    """Fixations of one episode in order, with the detections and the belief at each of them.
+    """Looks of one episode of a fovea in order, fixations and closer looks, with the belief after each fixation.
 
     A notebook shows a scanpath as an interactive page. `plot`, `animate`, `to_frame` and `save` make a picture, an
     animation, a table and a file.
 
-    Beside the attributes of `semfov.paths.Record` it has those of its looks.
+    Beside the attributes of `semfov.paths.Record` it has those of its fixations, of which there are n.
 
     Attributes:
         grid: the cells of the image.
-        cells: `(n,)`, fixated cells.
-        fixations: `(n, 2)`, centres of the fixated cells as `(x, y)` in pixels.
-        probabilities: `(n, X·Y, K+1)`, probability that each cell holds each class after each look, background first.
-            A learned map gives marginal probabilities: several classes can share a cell, so they need not sum to 1.
+        looks: the looks; the clock of the episode is the sum of their times so far. The value of a closer look is the
+            probability that the target is at the place.
+        probabilities: `(n, X·Y, K+1)`, probability that each cell holds each class after each fixation, background
+            first. A learned map gives marginal probabilities: several classes can share a cell, so they need not sum
+            to 1.
         values: `(n, X·Y)`, values of the acquisition function, by which the next fixation was chosen.
-        posterior: `(n, X·Y)`, probability of the target in each cell after each look, by the belief of the search; None
-            for exploration.
-        presence: `(n,)`, probability that the image holds the target after each look; None for exploration.
-        seconds: time of each look by stage (`semfov.episode.STAGES`); the clock of the episode is their sum so far.
+        posterior: `(n, X·Y)`, probability of the target in each cell after each fixation, by the belief of the search;
+            None for exploration.
+        presence: `(n,)`, probability that the image holds the target after each fixation; None for exploration.
         stimulus: the data for the foveated views of the photograph; None if it was not kept.
 
     Example::
 
-        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup", how="fovea")
         scanpath.plot().savefig("scanpath.png")
         scanpath.save("scanpath.safetensors")
 
+    >>> from semfov.detection import Detections
     >>> grid, none = Grid(2, 1, (10, 10)), torch.zeros(2, 2)
-    >>> Scanpath(grid=grid, classes=("background", "cup"), target=1, cells=torch.arange(2), fixations=none,
-    ...          detections=(), probabilities=none, values=none, found=True).describe()
+    >>> fovea = FoveaLooks(grid)
+    >>> for cell in (0, 1):
+    ...     look = fovea.fixate(cell, grid.centres[cell].tolist(), Detections.empty(1, 1), {}, None, none[0], None)
+    >>> fields = {"grid": grid, "looks": tuple(fovea.looks), "probabilities": none, "values": none}
+    >>> Scanpath(classes=("background", "cup"), target=1, found=True, **fields).describe()
     '“cup” found after 1 gaze shift'
     """
 
-    cells: Tensor
-    fixations: Tensor
     probabilities: Tensor = _MadeWhenRead()  # type: ignore[assignment]
     values: Tensor
     posterior: Tensor | None = None
@@ -219,17 +225,28 @@ class Scanpath(_CellRecord):
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "probabilities": self.probabilities}
 
-    def __len__(self) -> int:
-        """Number of fixations, the start included."""
-        return len(self.cells)
+    @cached_property
+    def fixated(self) -> tuple[FoveaLook, ...]:
+        """The looks that are fixations, without closer ones."""
+        return tuple(look for look in self.looks if not look.is_closer)
+
+    @cached_property
+    def cells(self) -> Tensor:
+        """`(n,)`, fixated cells."""
+        return torch.tensor([look.cell for look in self.fixated], dtype=torch.int64)
+
+    @cached_property
+    def fixations(self) -> Tensor:
+        """`(n, 2)`, centres of the fixated cells as `(x, y)` in pixels."""
+        return torch.tensor([look.fixation for look in self.fixated], dtype=self.values.dtype).view(-1, 2)
 
     @property
     def shifts(self) -> int:
         """Number of gaze shifts (saccades): fixations after the start."""
-        return len(self) - 1
+        return max(len(self.fixated) - 1, 0)
 
     def views(self) -> list[Tensor]:
-        """The foveated photograph at each fixation.
+        """Foveate the photograph at each fixation.
 
         Returns:
             One view `(3, h, w)` in [0, 1] for each fixation.
@@ -241,37 +258,33 @@ class Scanpath(_CellRecord):
             raise InputError("scanpath: expected one with its stimulus, as an agent makes it, got one without")
         return self.stimulus.views(self.fixations)
 
-    def _looks(self) -> Iterator[RecordedLook]:
-        belief = self.posterior
-        if belief is None and self.target is not None:
-            belief = self.probabilities[..., self.target]
-        region = (0.0, 0.0, float(self.size[0]), float(self.size[1]))
-        times = [sum(each.values()) for each in self.seconds]
-        clock: list[float | None] = [*accumulate(times)] if times else [None] * len(self)
-        columns = zip(self.cells.tolist(), self.fixations.tolist(), self.detections, clock, strict=True)
-        for number, (cell, (x, y), detections, seconds) in enumerate(columns):
-            value = float(self.values[number - 1, cell]) if number else math.inf
-            chosen = value if math.isfinite(value) else None
-            more = cell_columns(self.grid, cell, None if belief is None else belief[number])
-            more["presence"] = None if self.presence is None else float(self.presence[number])
-            yield RecordedLook(number, (x, y), region, detections, seconds, chosen, more)
+    def fixation_after(self, number: int) -> int:
+        """Count to the last fixation up to a look, from 0: the index of the tensors of the fixations."""
+        return sum(not look.is_closer for look in self.looks[: number % len(self.looks) + 1]) - 1
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """Probability in each cell after a look: of the target by the belief of the search, or of any object."""
+        fixation = self.fixation_after(number)
         if self.target is None:
-            return self.grid, self.probabilities[number, :, 1:].amax(-1)
-        return self.grid, (self.probabilities[..., self.target] if self.posterior is None else self.posterior)[number]
+            return self.grid, self.probabilities[fixation, :, 1:].amax(-1)
+        posterior = self.probabilities[..., self.target] if self.posterior is None else self.posterior
+        return self.grid, posterior[fixation]
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
-        """The foveated views, or where the stimulus was not kept, the picture."""
+        """Show foveated views, and of closer looks the enlarged windows; without the stimulus parts of the picture."""
+        parts = super().look_views(source)
         if self.stimulus is None:
-            yield from super().look_views(source)
+            yield from parts
             return
-        for look, view in zip(self, self.views(), strict=True):
-            yield LookView(view, self.size, look.detections.boxes[0], look.fixation)
+        views = iter(self.views())
+        for look, part in zip(self.looks, parts, strict=True):
+            if look.is_closer:
+                yield part
+            else:
+                yield LookView(next(views), self.size, look.detections.boxes[0], look.fixation)
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
-        """Data of the scanpath for a page (`semfov.report.episode.episode_data`)."""
+        """Collect the data of the scanpath for a page (`semfov.report.episode.episode_data`)."""
         from semfov.report.episode import episode_data
 
         image = self.image if picture is None else as_image(picture)
@@ -286,6 +299,10 @@ class Scanpath(_CellRecord):
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors, record = super()._contents()
         record |= {"placement": None, "settings": None}
+        closer = [look for look in self.looks if look.is_closer]
+        if closer:
+            tensors["closer_regions"] = torch.tensor([look.region for look in closer], dtype=torch.float64)
+            tensors["closer_values"] = torch.tensor([look.value for look in closer], dtype=torch.float64)
         if self.stimulus is not None:
             tensors["canvas"] = self.stimulus.canvas
             record["placement"] = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
@@ -294,62 +311,46 @@ class Scanpath(_CellRecord):
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-        made = super()._fields(tensors, record, shared)
-        cells, most, values = len(made["grid"]), int(tensors["cells"].max()), tensors["values"].shape[-1]
+        kept = super()._fields(tensors, record, shared)
+        grid = kept["grid"]
+        cells, most, values = len(grid), int(tensors["cells"].max()), tensors["values"].shape[-1]
         check(values == cells, "values", f"one for each of {cells} cells", values)
         check(most < cells, "cells", f"cell numbers below {cells}", most)
-        return {**made, "stimulus": Stimulus.restored(tensors, record)}
+        looks = _looks_of_file(grid, tensors, record, shared)
+        return {**kept, "looks": looks, "stimulus": Stimulus.restored(tensors, record)}
 
 
-class Trace:
-    """Keeps the steps of one episode, and makes scanpaths of them at any time."""
+def _looks_of_file(
+    grid: Grid, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]
+) -> tuple[FoveaLook, ...]:
+    """Make the looks of a scanpath from the tensors and values of a file.
 
-    def __init__(
-        self,
-        grid: Grid,
-        classes: tuple[str, ...],
-        target: int | None,
-        beside: Observer | None,
-        least: float = LEAST,
-        steps: Iterable[Step] = (),
-    ) -> None:
-        self.grid, self.classes, self.target, self.beside, self.least = grid, classes, target, beside, least
-        self.steps = [*steps]
-        self._maps: list[Tensor] = []
-        self._belief: Belief | None = None
-        self._modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-
-    def scanpath(self, **outcome: Any) -> Scanpath:
-        """Make the scanpath of the steps so far. Its map of all classes is made when it is read."""
-        steps, target = self.steps, self.target
-        fields = {
-            "grid": self.grid,
-            "classes": self.classes,
-            "target": target,
-            "least": self.least,
-            "cells": torch.cat([step.cell for step in steps]),
-            "fixations": torch.cat([step.fixation for step in steps]),
-            "detections": tuple(step.detections for step in steps),
-            "probabilities": partial(self._probabilities, len(steps)),
-            "values": torch.stack([step.values[0] for step in steps]),
-            "found": False,
-            "seconds": tuple(step.seconds for step in steps),
-        }
-        if target is not None:
-            fields["posterior"] = torch.stack([step.belief.probability(target)[0] for step in steps])
-            fields["presence"] = torch.stack([step.belief.presence(target)[0] for step in steps])
-        return Scanpath(**{**fields, **outcome})
-
-    def _probabilities(self, looks: int) -> Tensor:
-        """The map of all classes after each of the first looks, `(looks, X·Y, K+1)`."""
-        gradients, inference = self._modes
-        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
-            for step in self.steps[len(self._maps) : looks]:
-                if self.beside is not None:
-                    before = self._belief or self.beside.start(1, self.grid, step.values)
-                    self._belief = self.beside(before, step.detections, step.fixation, self.grid)
-                self._maps.append((self._belief or step.belief).class_probabilities()[0])
-            return torch.stack(self._maps[:looks])
+    Closer looks of earlier versions have no number: they are in `closer` alone, not among the looks.
+    """
+    numbered = {close_up.number: close_up for close_up in shared["closer"] if close_up.number is not None}
+    detections, seconds = shared["detections"], record["seconds"]
+    regions = tensors.get("closer_regions", torch.zeros(0, 4)).tolist()
+    chances = tensors.get("closer_values", torch.zeros(0)).tolist()
+    cells, points = tensors["cells"].tolist(), tensors["fixations"].tolist()
+    expected = f"{len(cells)} fixations and {len(regions)} closer looks"
+    check(len(detections) == len(cells) + len(regions), "lengths", expected, len(detections))
+    check(len(numbered) == len(regions) == len(chances), "closer_regions", f"{len(numbered)} regions", len(regions))
+    posterior, presence = tensors.get("posterior"), tensors.get("presence")
+    made = FoveaLooks(grid)
+    fixation = 0
+    for number, seen in enumerate(detections):
+        stages = seconds[number] if seconds else {}
+        if number in numbered:
+            closer = number - fixation
+            made.look_closely(numbered[number].cell or 0, regions[closer], seen, stages, chances[closer])
+            continue
+        cell = cells[fixation]
+        value = float(tensors["values"][fixation - 1, cell]) if fixation else None
+        probability = None if posterior is None else posterior[fixation]
+        there = None if presence is None else float(presence[fixation])
+        made.fixate(cell, points[fixation], seen, stages, value, probability, there)
+        fixation += 1
+    return tuple(made.looks)
 
 
 _FOVEA = Format(
@@ -391,14 +392,12 @@ class FoveaMoment(_CellRecord, Moment):
 
     Attributes:
         grid: the cells.
-        cell: the fixated cell, or the one that was looked at closely.
-        fixation: `(2,)`, the centre of the cell as `(x, y)` in pixels.
+        looks: the look at this frame; `open` is the stage in which the frame is fitted into the detector's input. A
+            closer look has the stage `detect` alone.
         probability: `(X·Y,)`, probability that each cell holds the target, or any object in an exploration, after the
             last look that was not a closer one.
         visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
         next_cell: the cell to look at in the next frame.
-        seconds: time of the look by stage, one mapping; `open` is the fitting of the frame into the detector's input. A
-            closer look has the stage `detect` alone.
         belief: belief of one episode that gave the probability; None in a moment from a file.
 
     Example::
@@ -407,8 +406,6 @@ class FoveaMoment(_CellRecord, Moment):
         print(moment.decision.outcome, moment.probability.max())
     """
 
-    cell: int
-    fixation: Tensor
     probability: Tensor
     visited: Tensor
     next_cell: int
@@ -425,22 +422,35 @@ class FoveaMoment(_CellRecord, Moment):
         x, y = self.grid.centres[self.next_cell].tolist()
         return x, y
 
-    def _looks(self) -> Iterator[RecordedLook]:
-        (x, y), (width, height) = self.fixation.tolist(), self.size
-        more = {"frame": self.number, **cell_columns(self.grid, self.cell, self.probability)}
-        region = (0.0, 0.0, float(width), float(height))
-        yield RecordedLook(0, (x, y), region, self.detections[0], sum(self.seconds[0].values()), None, more)
+    @property
+    def seconds(self) -> tuple[Mapping[str, float], ...]:
+        """Seconds of the look by stage, one mapping."""
+        return (self.looks[0].stages,)
+
+    @property
+    def cell(self) -> int:
+        """The fixated cell, or the one that was looked at closely."""
+        return self.looks[0].cell
+
+    @property
+    def fixation(self) -> Tensor:
+        """`(2,)`, the centre of the cell as `(x, y)` in pixels."""
+        return torch.tensor(self.looks[0].fixation, dtype=self.probability.dtype)
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
-        """The probability of the target, or of any object, in each cell."""
+        """Give the probability of the target, or of any object, in each cell."""
         return self.grid, self.probability
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         check(len(shared["detections"]) == 1, "lengths", "one look", len(shared["detections"]))
-        made = super()._fields(tensors, record, shared)
-        cells, visited = len(made["grid"]), len(tensors["visited"])
+        kept = super()._fields(tensors, record, shared)
+        cells, visited = len(kept["grid"]), len(tensors["visited"])
         check(visited == cells, "visited", f"{cells} cells", visited)
         for name in ("cell", "next_cell"):
             check(record[name] < cells, name, f"a cell number below {cells}", record[name])
-        return made
+        stages = record["seconds"][0] if record["seconds"] else {}
+        look = moment_look(
+            kept["grid"], record["number"], record["cell"], shared["detections"][0], tensors["probability"], stages
+        )
+        return {**kept, "looks": (look,)}

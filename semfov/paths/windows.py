@@ -1,7 +1,7 @@
 """The records of looks at windows: of a search or an exploration of a picture, and of a frame of a stream."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.classes import plural
-from semfov.detection import Detections, Objects
+from semfov.detection import Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
@@ -189,6 +189,51 @@ def _range_in_words(low: int, high: int) -> str:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
+class LookAtWindow(RecordedLook):
+    """One look at a window of a picture, or of a frame of a stream.
+
+    Attributes:
+        shown: what the look shows: window, detections and highest scores. One from a file has no gist.
+    """
+
+    shown: WindowLook
+
+
+def look_at_window(
+    shown: WindowLook, lattice: Lattice, number: int, seconds: float | None = None, value: float = math.inf
+) -> LookAtWindow:
+    """Make the complete look at a window.
+
+    Args:
+        shown: what the look shows.
+        lattice: lattice of the picture.
+        number: number of the look.
+        seconds: time at its end, on the clock of the episode; None if it is not known.
+        value: value for which it was chosen; infinite for the overview.
+    """
+    window = shown.window
+    return LookAtWindow(
+        number=number,
+        fixation=window.centre(lattice),
+        region=window.region(lattice),
+        detections=shown.detections,
+        seconds=seconds,
+        value=value if math.isfinite(value) else None,
+        more={"magnification": window.fixation[2], "level": window.level},
+        shown=shown,
+    )
+
+
+def looks_at_windows(
+    shown: Sequence[WindowLook], lattice: Lattice, values: Sequence[float], seconds: Sequence[float] = ()
+) -> tuple[LookAtWindow, ...]:
+    """Make the looks at windows from their columns (`look_at_window`); without `seconds` their times are not known."""
+    times: Sequence[float | None] = seconds or [None] * len(shown)
+    columns = enumerate(zip(shown, times, values, strict=True))
+    return tuple(look_at_window(one, lattice, number, time, value) for number, (one, time, value) in columns)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class ZoomPath(Record):
     """The record of a search or an exploration of a large picture.
 
@@ -198,32 +243,28 @@ class ZoomPath(Record):
 
     Attributes:
         lattice: lattice of the picture.
-        window_looks: looks in their order, the overview first. In a path from a file they have no gist.
-        values: value of each look when it was chosen; that of the overview is infinite. For a closer look it is the
-            probability that the target is at the place.
+        looks: looks in their order, the overview first. The value of a closer look is the probability that the target
+            is at the place.
         candidates: objects merged from all looks (`semfov.zoom.merge`). With a fitted certainty their scores are the
             probabilities that box and class are right.
         spread: standard deviation of the share of the expected number by which it is off because the model does not
             suit the picture (`semfov.zoom.certainty`).
-        detections: detections of each look, batches of one, with boxes in picture pixels.
         found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
-        closer: closer looks of a search, in their order; they are among the `window_looks`, each with its `number`.
+        closer: closer looks of a search, in their order; they are among the `looks`, each with its `number`.
 
     >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
     >>> lattice = Lattice.over((2560, 1920), (416, 416))
     >>> path = ZoomPath(
-    ...     lattice=lattice, classes=("background", "cup"), target=1, window_looks=(), values=(), candidates=nothing
+    ...     lattice=lattice, classes=("background", "cup"), target=1, looks=(), candidates=nothing
     ... )
     >>> path.describe()
     'No cup found. 0 looks'
     """
 
     lattice: Lattice
-    window_looks: tuple[WindowLook, ...]
-    values: tuple[float, ...]
+    looks: tuple[LookAtWindow, ...]
     candidates: Objects = field()
     spread: float = SPREAD
-    detections: tuple[Detections, ...] = field(init=False)
     found: bool = field(init=False)
 
     kind = WINDOWS
@@ -231,11 +272,20 @@ class ZoomPath(Record):
     _format = Format("zoom path", _TENSORS, _VALUES)
 
     def __post_init__(self) -> None:
-        """Derive what the looks and the decision tell."""
-        object.__setattr__(self, "detections", tuple(look.detections for look in self.window_looks))
+        """Derive what the decision, or the objects tell."""
         some = bool(self.sought) and len(self.objects) > 0
         found = some if self.decision is None else self.decision.outcome == "found"
         object.__setattr__(self, "found", found)
+
+    @property
+    def window_looks(self) -> tuple[WindowLook, ...]:
+        """What each look shows; in a path from a file without gist."""
+        return tuple(look.shown for look in self.looks)
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Value of each look when it was chosen; that of the overview is infinite."""
+        return tuple(math.inf if look.value is None else look.value for look in self.looks)
 
     @property
     def reacts(self) -> bool:
@@ -288,14 +338,6 @@ class ZoomPath(Record):
         """`(width, height)` of the picture in pixels."""
         return self.lattice.size
 
-    def _looks(self) -> Iterator[RecordedLook]:
-        clock = self.seconds or (None,) * len(self.window_looks)
-        for number, (look, seconds, value) in enumerate(zip(self.window_looks, clock, self.values, strict=True)):
-            window, chosen = look.window, value if math.isfinite(value) else None
-            more = {"magnification": window.fixation[2], "level": window.level}
-            point, region = window.centre(self.lattice), window.region(self.lattice)
-            yield RecordedLook(number, point, region, look.detections, seconds, chosen, more)
-
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
@@ -320,17 +362,14 @@ class ZoomPath(Record):
             check(fits, f"object_{name}", f"numbers below {most}", values.tolist())
         windows = [_window_from(each, lattice) for each in record["windows"]]
         cuts = tensors["cut"].split(record["lengths"])
+        columns = zip(windows, looks, cuts, tensors["show"], strict=True)
+        shown = [WindowLook(window, detections, cut, show, None) for window, detections, cut, show in columns]
         return {
             "lattice": lattice,
-            "window_looks": tuple(
-                WindowLook(window, detections, cut, show, None)
-                for window, detections, cut, show in zip(windows, looks, cuts, tensors["show"], strict=True)
-            ),
-            "values": tuple(tensors["values"].tolist()),
+            "looks": looks_at_windows(shown, lattice, tensors["values"].tolist(), record["seconds"]),
             "candidates": objects,
             "unseen": unseen,
             "spread": SPREAD if record.get("spread") is None else record["spread"],
-            "seconds": tuple(record["seconds"]),
         }
 
 
@@ -403,7 +442,7 @@ class WindowMoment(ZoomPath, Moment):
 
 
 def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:
-    """The window with these JSON values; raises `InputError` where the picture has no such level."""
+    """Make the window with these JSON values; raise `InputError` where the picture has no such level."""
     check(values["level"] < lattice.levels, "windows", f"levels below {lattice.levels}", values["level"])
     within = values["within"] and tuple(values["within"])
     return Window(tuple(values["fixation"]), values["level"], tuple(values["cells"]), within)

@@ -121,7 +121,7 @@ class Words(ABC):
             name = f"closer {outcome}" if looked_closer else outcome
             return self._sentences.get(name, self._sentences[outcome])
         if record.ending == "shifts":
-            return f"All {len(record) - 1} gaze shifts were made."
+            return f"All {len(record.fixated) - 1} gaze shifts were made."
         if record.ending == "passes":
             return f"All {record.passes} passes were used." if record.passes != 1 else "The only pass was used."
         return self._sentences.get(record.ending or "", "")

@@ -126,18 +126,17 @@ def _outcome_data(scanpath: Scanpath) -> Data:
 
 def _fixation_data(scanpath: Scanpath, views: Sequence[Tensor] | None, width: int, quality: int) -> list[Data]:
     """Tell of each fixation what was seen, the values of the next ones, and its time."""
-    cells = scanpath.cells.tolist()
-    following = [*cells[1:], None]
+    following = [*scanpath.cells.tolist()[1:], None]
     fixations = []
-    for number, cell in enumerate(cells):
+    for number, look in enumerate(scanpath.fixated):
         fixations.append(
             {
-                "cell": cell,
+                "cell": look.cell,
                 "view": None if views is None else jpeg_uri(views[number], width, quality),
                 "detections": _detection_data(scanpath, number),
                 "values": [rounded(value) for value in scanpath.values[number].tolist()],
                 "next": following[number],
-                "seconds": dict(scanpath.seconds[number]) if scanpath.seconds else None,
+                "seconds": dict(look.stages) if look.stages else None,
             }
         )
     return fixations
@@ -158,6 +157,8 @@ def object_data(record: Record) -> Data:
     for row, score in zip(rows[:_DRAWN], record.objects.scores.tolist(), strict=False):
         box = [row[edge] for edge in ("x1", "y1", "x2", "y2")]
         more: Data = {name: row[name] for name in ("look", "confirmed", "pan", "tilt") if name in row}
+        if isinstance(record, Scanpath):  # whose page steps through its fixations
+            more["look"] = record.fixation_after(row["look"])
         objects.append({"box": box, "label": row["class"], "score": score, **more})
     return {
         "pixels": f"{width} × {height} px",
@@ -208,7 +209,7 @@ def _sensor_in_words(sensor: Mapping[str, Any]) -> str:
 
 def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
     """Tell the most confident detections of a look, each with its best classes and the place of its label."""
-    looked = confident_detections(scanpath.detections[fixation], _DETECTIONS)[0]
+    looked = confident_detections(scanpath.fixated[fixation].detections, _DETECTIONS)[0]
     detections = []
     for box, scores in zip(looked.boxes, looked.class_scores, strict=True):
         best = scores.topk(min(_SCORES, len(scores)))

@@ -91,7 +91,10 @@ def plot_belief(
     """
     check_foveal(scanpath)
     check(columns >= 1, "columns", "at least 1", columns)
-    fixations = choose_fixations(scanpath, most) if fixation is None else [check_fixation(scanpath, fixation)]
+    if fixation is None:
+        fixations = choose_fixations(scanpath, most)
+    else:
+        fixations = [check_fixation(len(scanpath.fixated), fixation)]
     photograph = scanpath.image if image is None else image
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)

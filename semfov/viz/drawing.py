@@ -57,9 +57,8 @@ def photograph_of(record: Record | Fixations, image: ImageLike | None) -> Tensor
     return photograph
 
 
-def check_fixation(record: Record, fixation: int) -> int:
-    """Return the number of a look; negative numbers count from the end."""
-    count = len(record)
+def check_fixation(count: int, fixation: int) -> int:
+    """Return the number of one of some looks; negative numbers count from the end."""
     check(-count <= fixation < count, "fixation", f"a number from 0 to {count - 1}, or -1 for the last", fixation)
     return fixation % count
 
@@ -71,9 +70,9 @@ def check_foveal(record: Record) -> None:
 
 
 def choose_fixations(record: Record, most: int) -> list[int]:
-    """List the numbers of at most `most` looks: the first ones and the last."""
+    """List the numbers of at most `most` fixations: the first ones and the last."""
     check(most >= 1, "most", "at least 1", most)
-    count = len(record)
+    count = len(record.fixated)
     return list(range(count)) if count <= most else [*range(most - 1), count - 1]
 
 

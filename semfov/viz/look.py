@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.large import open_large
 from semfov.errors import check
-from semfov.paths import Record, Scanpath
+from semfov.paths import Record, RecordedLook, Scanpath
 from semfov.paths.look import LookView, confident_detections
 from semfov.viz.drawing import (
     check_fixation,
@@ -69,27 +69,26 @@ def plot_fixation(
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
         save_figure(plot_fixation(scanpath, 0), "first.png")
     """
-    number = check_fixation(scanpath, fixation)
+    number = check_fixation(len(scanpath), fixation)
     image = photograph_of(scanpath, image)
-    views = None if view is None else [view] * len(scanpath)
+    views = None if view is None else [view] * len(scanpath.fixated)
     shown = views_of(scanpath, image, views)[number]
     return LookFigure(scanpath, image, shown, boxes, axes).show(number, shown)
 
 
-def draw_view(axes: Axes, record: Record, number: int, view: LookView, most: int) -> list[Artist]:
+def draw_view(axes: Axes, record: Record, look: RecordedLook, view: LookView, most: int) -> list[Artist]:
     """Draw gaze and detections of a look into its view; no label covers the point of gaze.
 
     Args:
         axes: axes of the view, laid out.
         record: the record.
-        number: number of the look.
+        look: the look.
         view: what it shows.
         most: largest number of detections; the most confident ones are drawn.
 
     Returns:
         What was drawn.
     """
-    look = record.looks[number]
     detections = confident_detections(replace(look.detections, boxes=view.boxes[None]), most)
     x, y = view.gaze
     reach = 8 * per_point(axes)
@@ -104,18 +103,19 @@ def views_of(record: Record, image: Tensor, views: Sequence[Tensor] | None) -> l
     Args:
         record: the record.
         image: `(3, H, W)`, the picture.
-        views: for each look a view `(3, h, w)` of the whole picture; None takes those of the record.
+        views: for each fixation a view `(3, h, w)` of the whole picture; None takes those of the record.
 
     Returns:
         Pixels, boxes and gaze of each look.
     """
+    shown = list(record.look_views(open_large(image)))
     if views is None:
-        return list(record.look_views(open_large(image)))
-    check(len(views) == len(record), "views", f"{len(record)} views, one for each fixation", len(views))
-    return [
-        LookView(view, record.size, look.detections.boxes[0], look.fixation)
-        for look, view in zip(record, views, strict=True)
-    ]
+        return shown
+    count = len(record.fixated)
+    check(len(views) == count, "views", f"{count} views, one for each fixation", len(views))
+    for look, view in zip(record.fixated, views, strict=True):
+        shown[look.number] = LookView(view, record.size, look.detections.boxes[0], look.fixation)
+    return shown
 
 
 class LookFigure:
@@ -212,7 +212,7 @@ class LookFigure:
         self.view.set_data(picture_array(view.pixels))
         self.view.set_extent((0, width, height, 0))
         axes.set(xlim=(0, width), ylim=(height, 0))
-        return draw_view(axes, self.record, number, view, most=10)
+        return draw_view(axes, self.record, self.record.looks[number], view, most=10)
 
     def _show_belief(self, number: int, grid: Grid, chances: Tensor) -> list[Artist]:
         """Show the belief after a look; returns what was drawn."""

@@ -228,7 +228,8 @@ def _views(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tenso
     """Return the given foveated views of a fovea's record, or its own, one for each fixation."""
     check_foveal(scanpath)
     views = scanpath.views() if views is None else views
-    check(len(views) == len(scanpath), "views", f"{len(scanpath)} views, one for each fixation", len(views))
+    count = len(scanpath.fixated)
+    check(len(views) == count, "views", f"{count} views, one for each fixation", len(views))
     return views
 
 
@@ -236,6 +237,6 @@ def _label_views(panels: Sequence[Axes], scanpath: Scanpath, fixations: Sequence
     """Draw gaze and detections into views, after the layout of the figure, on which the positions of labels depend."""
     lay_out(root(panels[0]))
     for axes, fixation in zip(panels, fixations, strict=False):
-        look = scanpath.looks[fixation]
+        look = scanpath.fixated[fixation]
         view = LookView(views[fixation], scanpath.size, look.detections.boxes[0], look.fixation)
-        draw_view(axes, scanpath, fixation, view, most=6)
+        draw_view(axes, scanpath, look, view, most=6)

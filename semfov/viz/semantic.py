@@ -66,7 +66,7 @@ def plot_semantic_map(
         save_figure(plot_semantic_map(scanpath), "map.pdf")
     """
     check_foveal(scanpath)
-    number = check_fixation(scanpath, fixation)
+    number = check_fixation(len(scanpath.fixated), fixation)
     image = scanpath.image if image is None else image
     width, height = scanpath.grid.extent.tolist()
     figure, (map_axes, entropy_axes) = make_figure(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.prior import Prior
+from semfov.belief.target_evidence import Thresholds
 from semfov.data.inputs import FRAME
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
@@ -75,14 +76,14 @@ class SearchLook(NamedTuple):
         number: number of the next look of the path.
         presence: probability that the picture holds the target.
         best: highest score of the target in any look.
-        left: value of the best look that is left.
+        hit_chance: chance that the best remaining window shows the target.
     """
 
     detections: Detections
     number: int
     presence: float
     best: float
-    left: float
+    hit_chance: float
 
 
 class CandidateBoxes(CandidatePlaces[SearchLook]):
@@ -112,7 +113,6 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._look = look
         self._next = look.number
-        self._left = self.prior.place(look.left, look.presence)
         self.detections = look.detections
         self.presence = self.prior(look.presence)
         scores = look.detections.scores[0, :, self.target]
@@ -120,19 +120,27 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         if bool(of_target.any()):
             self._looks.append((self._now, (look.detections.boxes[0][of_target], scores[of_target])))
 
-    def due(self, least: float, *, last: bool) -> CandidatePlace | None:
-        """Take the most evident box, if it is likely enough, or at the end probable enough."""
+    @property
+    def hit_chance(self) -> float:
+        """Chance that the best window that was not looked at shows the target."""
+        return self.prior.place(self._look.hit_chance, self._look.presence)
+
+    def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
+        """The most evident box, if it is as likely as what is found, or at the end probable enough."""
+        place = self._most_evident()
+        least = thresholds.place if last else self.likely
+        return None if place is None or place.probability < least else place
+
+    def _most_evident(self) -> CandidatePlace | None:
+        """The box with the highest faded score that is of no examined place; None if there is none."""
         boxes, scores = self._boxes()
         if self._examined:
-            scores = scores.masked_fill(self._again(boxes), 0)
+            scores = scores.masked_fill(self._are_examined(boxes), 0)
         if not len(scores) or float(scores.max()) <= 0:
             return None
         number = int(scores.argmax())
         score = float(scores[number])
-        probability = self._chance(score)
-        if probability < (least if last else self.likely):
-            return None
-        return CandidatePlace(boxes[number], score, probability)
+        return CandidatePlace(boxes[number], score, self._chance(score))
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the path."""
@@ -176,10 +184,13 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
 
 
 class PhotographPlaces(CandidateBoxes):
-    r"""Places of a photograph, hints among them; a look at one is worth :math:`v = p \, (1 - \max_i p_i)`."""
+    r"""Places of a photograph, hints among them; all are examined at which the chance of a hit is large enough.
+
+    It is :math:`v = p \, (1 - \max_i p_i)`, with the probability p of the place and those of the closer looks so far.
+    """
 
     least = 0.002
-    by_worth = True
+    exhaustive = True
 
     def __init__(
         self,
@@ -200,17 +211,17 @@ class PhotographPlaces(CandidateBoxes):
         self._shown[Window.overview(self._lattice)] = look.number - 1, look.detections
 
     @property
-    def left(self) -> float:
-        """Worth of the best look that is left; below 0 if there is none."""
-        place = super().due(0.0, last=True)
-        return -1.0 if place is None else self._worth(place)
+    def hit_chance(self) -> float:
+        """Chance of a hit at the most evident place; below 0 if there is none."""
+        place = self._most_evident()
+        return -1.0 if place is None else self._hit_chance_at(place)
 
-    def due(self, least: float, *, last: bool) -> CandidatePlace | None:
-        """Take the most evident place, if a look at it is worth a pass."""
-        place = super().due(0.0, last=True)
-        return None if place is None or self._worth(place) < least else place
+    def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
+        """The most evident place, if the chance of a hit there is worth a pass."""
+        place = self._most_evident()
+        return None if place is None or self._hit_chance_at(place) < thresholds.give_up else place
 
-    def seen(self, candidate: CandidatePlace) -> bool:
+    def is_shown(self, candidate: CandidatePlace) -> bool:
         """Whether the window that shows a place was looked at."""
         return self._showing(candidate) in self._shown
 
@@ -220,7 +231,7 @@ class PhotographPlaces(CandidateBoxes):
         if window not in self._shown:
             self._shown[window] = self._next, super().look_at(candidate, close_up)
         self._number, detections = self._shown[window]
-        return replace(detections, mask=detections.mask & ~self._again(detections.boxes[0]))
+        return replace(detections, mask=detections.mask & ~self._are_examined(detections.boxes[0]))
 
     def wait(self, passed: float = FRAME) -> None:
         """Let seconds pass; closer looks at earlier frames show other pixels where the scene changes."""
@@ -236,5 +247,6 @@ class PhotographPlaces(CandidateBoxes):
             return Window.overview(self._lattice)
         return window
 
-    def _worth(self, place: CandidatePlace) -> float:
-        return place.probability * (1 - max((known for _, known in self._known), default=0.0))
+    def _hit_chance_at(self, place: CandidatePlace) -> float:
+        """Chance that a look at a place shows the target, if no closer look so far has."""
+        return place.probability * (1 - max((known for _, known in self._places), default=0.0))

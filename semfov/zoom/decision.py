@@ -2,21 +2,22 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from semfov.belief.prior import Prior, check_prior
+from semfov.belief.prior import Prior
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
+from semfov.decision import FOUND, GO_ON, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
 from semfov.episode import Forgetting
 from semfov.motion import Motion
+from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, SearchLook
 from semfov.zoom.episode import WindowStep
-from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
+from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.hint_maps import features
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS
@@ -24,7 +25,15 @@ from semfov.zoom.looks import WindowLook
 
 
 class _LookFacts(NamedTuple):
-    """What one look of a search shows of the target; box `(4,)`."""
+    """What one look of a search shows of the target.
+
+    Attributes:
+        score: highest score of the target, hints included.
+        closest: the same for a look of the last level, 0 for others.
+        named: highest score of a detection whose most probable class is the target.
+        found: highest score of a detection.
+        box: box `(4,)` of that detection; None without a detection.
+    """
 
     score: float
     closest: float
@@ -34,15 +43,22 @@ class _LookFacts(NamedTuple):
 
 
 class SearchFacts:
-    """What looks have shown of the target: the highest score, its `box` `(4,)`, and whether a detection shows it."""
+    """What the looks of a search have shown of the target.
 
-    best: float
-    box: Tensor | None
-    detected: bool
+    Attributes:
+        belief: the belief of the search.
+        looks: what each look that counts shows.
+        best: highest score of the target in all looks.
+        box: box `(4,)` of the detection with the highest score; None without a detection.
+        detected: whether a detection shows the target.
+    """
 
     def __init__(self, belief: ZoomBelief) -> None:
         self.belief = belief
         self.looks: list[_LookFacts] = []
+        self.best = 0.0
+        self.box: Tensor | None = None
+        self.detected = False
 
     def see(self, looks: Sequence[WindowLook]) -> None:
         """Take the looks that count after another look; those of earlier ones that are missing were forgotten."""
@@ -51,176 +67,297 @@ class SearchFacts:
         for look in looks[len(self.looks) :]:
             self.add(look)
 
-    def add(self, window_look: WindowLook) -> None:
-        target, detections = self.belief.target, window_look.detections
-        score, named, found, box = float(window_look.show[target - 1]), 0.0, 0.0, None
-        closest = score if window_look.window.level == self.belief.lattice.levels - 1 else 0.0
-        scores = detections.scores[0, :, target].detach().float().numpy()
-        if len(scores):
-            named = float(scores[detections.labels[0].numpy() == target].max(initial=0))
-            found, box = float(scores.max()), detections.boxes[0, int(scores.argmax())]
-        self.looks.append(_LookFacts(score, closest, named, found, box))
-        self.best = max(look.score for look in self.looks)
-        shown = max(self.looks, key=lambda look: look.found)
-        self.box, self.detected = shown.box if shown.found > 0 else None, shown.found >= DETECTION_SCORE
+    def add(self, look: WindowLook) -> None:
+        """Take in one look."""
+        self.looks.append(self._facts_of(look))
+        self.best = max(facts.score for facts in self.looks)
+        surest = max(self.looks, key=lambda facts: facts.found)
+        self.box = surest.box if surest.found > 0 else None
+        self.detected = surest.found >= DETECTION_SCORE
 
-    def case(self, ahead: float) -> Tensor:
-        """Facts `(10,)` for `GlimpseEvidence.anywhere`: six scores, what is left to see, and numbers of looks."""
+    def _facts_of(self, look: WindowLook) -> _LookFacts:
+        target = self.belief.target
+        score = float(look.show[target - 1])
+        is_closest = look.window.level == self.belief.lattice.levels - 1
+        closest = score if is_closest else 0.0
+        scores = look.detections.scores[0, :, target].detach().float().numpy()
+        if not len(scores):
+            return _LookFacts(score, closest, 0.0, 0.0, None)
+        named = scores[look.detections.labels[0].numpy() == target]
+        box = look.detections.boxes[0, int(scores.argmax())]
+        return _LookFacts(score, closest, float(named.max(initial=0)), float(scores.max()), box)
+
+    def case(self, hit_chance: float) -> Tensor:
+        """Facts `(10,)` for `GlimpseEvidence.anywhere`: scores, what remains to be seen, and numbers of looks.
+
+        Args:
+            hit_chance: chance that the best remaining window shows the target.
+        """
         looks = self.looks
         best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)
-        closest, named = max(look.closest for look in looks), max(look.named for look in looks)
-        hints = features(torch.tensor([best, second, closest, looks[0].score, named, ahead], dtype=torch.float32))
+        closest = max(look.closest for look in looks)
+        named = max(look.named for look in looks)
+        scores = torch.tensor([best, second, closest, looks[0].score, named, hit_chance], dtype=torch.float32)
         last = self.belief.lattice.levels - 1
         # Number of looks of the last level that are expected to show the target. Windows start at every cell: this is
         # the mean over all ways to lay them side by side.
         showing = float(self.belief.chances(last).sum()) / CELLS**2 if last else 0.0
         share = float(self.belief.unexplored.sum() / self.belief.visible.sum().clamp(1))
-        left = [math.log(showing + 1e-3) / 4, share]
-        counts = [math.log1p(sum(look.score >= DETECTION_SCORE for look in looks)) / 2, math.log(len(looks)) / 2]
-        return torch.cat([hints, torch.tensor([*left, *counts])])
+        remaining = [math.log(showing + 1e-3) / 4, share]
+        detected = sum(look.score >= DETECTION_SCORE for look in looks)
+        counts = [math.log1p(detected) / 2, math.log(len(looks)) / 2]
+        return torch.cat([features(scores), torch.tensor([*remaining, *counts])])
 
     @torch.no_grad()
-    def presence(self, ahead: float) -> float:
-        """Predict whether the picture holds the target, by the prior of the fit."""
-        photograph, target = self.belief.photograph, torch.tensor(self.belief.target)
+    def presence(self, hit_chance: float) -> float:
+        """Predict whether the picture holds the target, by the prior of the fit.
+
+        Args:
+            hit_chance: chance that the best remaining window shows the target.
+        """
+        best = torch.tensor(self.best)
+        photograph = self.belief.photograph
         if photograph is not None:
-            return float(photograph.presence(torch.tensor(self.best), target).sigmoid())
-        odds = self.belief.evidence.anywhere(torch.tensor(self.best), self.case(ahead))
-        return float(odds.sigmoid())
+            return float(photograph.presence(best, torch.tensor(self.belief.target)).sigmoid())
+        return float(self.belief.evidence.anywhere(best, self.case(hit_chance)).sigmoid())
 
 
 CLOSER = 100  # largest number of closer looks in a large picture: as many as there are passes for
 _DEFAULTS = Thresholds(0.9, 0.005)  # thresholds of searches whose evidence has none
+_LEAST_SCORE = 0.5  # default for the score from which on a search without evidence has found its target
 
 
 class WindowDecisions:
-    """Decides one search by windows, look by look, with closer looks where the evidence has fitted verification."""
+    """What is decided after each look at windows (the table in `semfov.decision`); the base decides nothing.
 
-    def __init__(
-        self,
-        evidence: GlimpseEvidence,
-        target: int,
-        close_up: LookAt,
-        *,
-        confirm: float | None = None,
-        give_up: float | None = None,
-        closer: int | None = None,
-        forgetting: Forgetting | None = None,
-        prior: float | None = None,
-    ) -> None:
-        check_prior(prior)
-        self._share, self.prior = prior, Prior()
-        self.evidence, self.target, self._close_up = evidence, target, close_up
-        self._given, self._most, self._forgetting = (confirm, give_up), closer, forgetting
-        self.thresholds = _DEFAULTS
-        self.verifier: Verifier[SearchLook] | None = None
-        self.criterion: str | None = None
-        """What the decision `found` needs, in words, after the first look."""
-        self.outcome = 0
-        self._facts: SearchFacts | None = None
-        self._ahead = 0.0
-        self._presence: float | None = None
+    Attributes:
+        ending: reason for an end that it makes.
+        criterion: what the decision `found` needs, in words; None where nothing is decided.
+        outcome: outcome of the last look, a number of `OUTCOMES`; `GO_ON` before the first one.
+    """
 
-    def _begin(self, belief: ZoomBelief) -> SearchFacts:
-        """Choose thresholds and closer looks by the kind of picture."""
-        (confirm, give_up), evidence = self._given, self.evidence
-        photograph = belief.photograph
-        at = evidence.thresholds if photograph is None else photograph.verification.thresholds
-        model = evidence.verification if photograph is None else photograph.verification
-        self.prior = self._prior_in(photograph)
-        self.thresholds = (at or _DEFAULTS).changed(give_up=give_up)
-        usual = CLOSER if photograph is None else MOST_IN_PHOTOGRAPH
-        most = usual if self._most is None else self._most
-        if most and model is not None and model.thresholds is not None:
-            worth = self.thresholds.give_up
-            at = model.thresholds.changed(confirm, worth)
-            places: CandidateBoxes
-            if photograph is None:
-                places = CandidateBoxes(self.target, self.thresholds.confirm, self._forgetting, self.prior)
-            else:
-                places = PhotographPlaces(self.target, belief.lattice, self._forgetting, photograph.window, self.prior)
-                at = at.changed(place=worth)  # all further looks are closer ones
-            self.verifier = Verifier(model, places, self._close_up, at, most)
-            self.criterion = self.verifier.criterion
-        else:
-            self.thresholds = self.thresholds.changed(confirm)
-            self.criterion = f"p is {self.thresholds.confirm:g} and a detection shows the target"
-        return SearchFacts(belief)
+    ending: Literal["decision", "detection"] = "decision"
+    criterion: str | None = None
+    outcome: int = GO_ON
 
-    def _prior_in(self, photograph: PhotographEvidence | None) -> Prior:
-        """Compare the share that was given with that of the fit, which for large pictures is one half."""
-        if self._share is None or photograph is None:
-            # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
-            return Prior() if self._share is None else Prior(self._share)
-        return Prior.of(self._share, photograph.shares, self.target)
+    def see(self, step: WindowStep[Any], number: int, room: float) -> None:
+        """Take in a step, and choose the place that is to be looked at closely.
 
-    def wait(self, passed: float) -> None:
-        """Let seconds pass. In a stream, call it before every frame."""
-        if self.verifier is not None:
-            self.verifier.wait(passed)
+        Args:
+            step: the step.
+            number: number of looks up to it, closer looks included.
+            room: number of passes that remain.
+        """
 
-    def follow(self, motion: Motion | None) -> None:
-        """Carry examined places along with the camera, or forget them where a frame fits none before."""
-        if self.verifier is not None:
-            self.verifier.follow(motion)
+    @property
+    def decision(self) -> Decision | None:
+        """The decision as it stands; None where nothing is decided, and before the first look."""
+        return None
 
-    def see(self, step: WindowStep[ZoomBelief], number: int, *, last: bool) -> None:
-        """Take in a look, and choose the place that is to be looked at closely."""
-        self._facts = self._facts or self._begin(step.belief)
-        self._facts.see(step.looks)
-        self._ahead, self._presence = step.ahead, None
-        facts, self.outcome = self._facts, 0
-        large = step.belief.photograph is None
-        if large and not facts.detected and not self.looks and self._left() >= self.thresholds.give_up:
-            return  # no probability ends the search
-        presence = self._fitted_presence()
-        if self.verifier is None:
-            there, looked = torch.tensor([self.prior(presence)]), torch.tensor([facts.detected])
-            self.outcome = int(settle(there, looked, torch.tensor([self._left()]), self.thresholds))
-            return
-        look = SearchLook(step.look.candidates, number, presence, facts.best, self._ahead)
-        self.verifier.see(look, last=last)
-        self._settle(self.verifier)
-
-    def _fitted_presence(self) -> float:
-        """Probability that the picture holds the target after the last look, by the prior of the fit."""
-        assert self._facts is not None
-        if self._presence is None:
-            self._presence = self._facts.presence(self._ahead)
-        return self._presence
-
-    def _left(self) -> float:
-        """Value of the best look that is left."""
-        if self.prior.changes_nothing:
-            return self._ahead  # without the presence, which takes time
-        return self.prior.place(self._ahead, self._fitted_presence())
+    def conclude(self) -> Decision | None:
+        """Make the decision of a search that ends."""
+        return self.decision
 
     @property
     def candidate(self) -> CandidatePlace | None:
         """The place that is to be looked at closely now; None if there is none."""
-        return None if self.verifier is None else self.verifier.candidate
+        return None
 
     @property
     def looks(self) -> list[CloseUp]:
-        return [] if self.verifier is None else self.verifier.looks
+        """The closer looks so far."""
+        return []
 
-    def look(self) -> CloseUp:
+    def look(self) -> None:
         """Look closely at the candidate, and choose the next one."""
-        assert self.verifier is not None
-        look = self.verifier.look()
-        self._settle(self.verifier)
-        return look
 
-    def _settle(self, verifier: Verifier[SearchLook]) -> None:
-        """Examine the places that need no pass, and decide."""
-        while verifier.candidate is not None and verifier.places.seen(verifier.candidate):
-            verifier.look()
-        self.outcome = verifier.outcome()
+    def wait(self, passed: float) -> None:
+        """Let seconds pass. In a stream, call it before every frame."""
 
-    def decision(self, *, over: bool | None = None) -> Decision:
-        assert self._facts is not None
-        if self.verifier is not None and self.verifier.looks:
-            return self.verifier.decision(over=over)
+    def follow(self, motion: Motion | None) -> None:
+        """Carry examined places along with the camera, or forget them where a frame fits none before."""
+
+
+class DecisionsByScore(WindowDecisions):
+    """Decisions of a search without evidence: a detection with a score from `confirm` on is the target."""
+
+    ending = "detection"
+
+    def __init__(self, target: int, confirm: float | None = None) -> None:
+        self._target = target
+        self._confirm = _LEAST_SCORE if confirm is None else confirm
+        self._step: WindowStep[Any] | None = None
+        self.criterion = f"a detection scores {self._confirm:g}"
+
+    def see(self, step: WindowStep[Any], number: int, room: float) -> None:
+        self._step = step
+        self.outcome = FOUND if self._best()[0] >= self._confirm else GO_ON
+
+    @property
+    def decision(self) -> Decision | None:
+        """`found` with the best detection, or `undecided` with its score."""
+        if self._step is None:
+            return None
+        score, box = self._best()
+        return Decision("found", score, None, box) if score >= self._confirm else Decision("undecided", score)
+
+    def _best(self) -> tuple[float, Tensor | None]:
+        """Score and box `(4,)` of the best detection of the target in the looks that count."""
+        assert self._step is not None
+        highest = 0.0
+        box = None
+        for look in self._step.looks:
+            scores = look.detections.class_scores[0, :, self._target - 1]
+            if len(scores) and float(scores.max()) > highest:
+                highest = float(scores.max())
+                box = look.detections.boxes[0, scores.argmax()]
+        return highest, box
+
+
+class DecisionsByPresence(WindowDecisions):
+    """Decisions of a search by its evidence, without closer looks (`semfov.decision.settle`).
+
+    The probability that the picture holds the target takes time, and is computed where it can matter.
+    """
+
+    def __init__(self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior) -> None:
+        self.thresholds = thresholds
+        self.prior = prior
+        self.criterion = f"p is {thresholds.confirm:g} and a detection shows the target"
+        self._facts = SearchFacts(belief)
+        self._is_large = belief.photograph is None
+        self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
+        self._presence: float | None = None  # that after the last look, once it was asked for
+
+    def see(self, step: WindowStep[Any], number: int, room: float) -> None:
+        self._facts.see(step.looks)
+        self._fitted_chance = step.next_value
+        self._presence = None
+        self.outcome = GO_ON
+        if not self._goes_on():
+            self._judge(step, number, last=step.next_value == 0 or room <= 1)
+
+    def _goes_on(self) -> bool:
+        """Whether the search goes on, whatever the presence is: nothing was found, and a look is worth a pass."""
+        if not self._is_large or self._facts.detected or self.looks:
+            return False
+        return self._hit_chance() >= self.thresholds.give_up
+
+    def _judge(self, step: WindowStep[Any], number: int, *, last: bool) -> None:
+        """Decide after a step."""
+        presence = torch.tensor([self.prior(self._fitted_presence())])
+        located = torch.tensor([self._facts.detected])
+        hit_chance = torch.tensor([self._hit_chance()])
+        self.outcome = int(settle(presence, located, hit_chance, self.thresholds))
+
+    @property
+    def decision(self) -> Decision | None:
+        if not self._facts.looks:
+            return None
         outcome = OUTCOMES[self.outcome]
         box = self._facts.box if outcome == "found" else None
         return Decision(outcome, self.prior(self._fitted_presence()), None, box)
+
+    def _fitted_presence(self) -> float:
+        """Probability that the picture holds the target after the last look, by the prior of the fit."""
+        if self._presence is None:
+            self._presence = self._facts.presence(self._fitted_chance)
+        return self._presence
+
+    def _hit_chance(self) -> float:
+        """Chance that the best remaining window shows the target."""
+        if self.prior.changes_nothing:
+            return self._fitted_chance  # without the presence, which takes time
+        return self.prior.place(self._fitted_chance, self._fitted_presence())
+
+
+class DecisionsByCloserLooks(DecisionsByPresence):
+    """Decisions of a search by closer looks at the places that seem to hold the target (`semfov.decision.Verifier`)."""
+
+    def __init__(
+        self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior, verifier: Verifier[SearchLook]
+    ) -> None:
+        super().__init__(belief, thresholds, prior)
+        self.verifier = verifier
+        self.criterion = verifier.criterion
+
+    def _judge(self, step: WindowStep[Any], number: int, *, last: bool) -> None:
+        """Choose the place of the next closer look, and decide."""
+        candidates = step.look.candidates
+        look = SearchLook(candidates, number, self._fitted_presence(), self._facts.best, self._fitted_chance)
+        self.verifier.see(look, last=last)
+        self._examine_shown()
+
+    @property
+    def candidate(self) -> CandidatePlace | None:
+        return self.verifier.candidate
+
+    @property
+    def looks(self) -> list[CloseUp]:
+        return self.verifier.looks
+
+    def look(self) -> None:
+        self.verifier.look()
+        self._examine_shown()
+
+    def _examine_shown(self) -> None:
+        """Examine the places that need no pass, and decide."""
+        while self.candidate is not None and self.verifier.places.is_shown(self.candidate):
+            self.verifier.look()
+        self.outcome = self.verifier.outcome()
+
+    @property
+    def decision(self) -> Decision | None:
+        return self.verifier.decision() if self.looks else super().decision
+
+    def conclude(self) -> Decision | None:
+        return self.verifier.decision_at_end() if self.looks else super().decision
+
+    def wait(self, passed: float) -> None:
+        self.verifier.wait(passed)
+
+    def follow(self, motion: Motion | None) -> None:
+        self.verifier.follow(motion)
+
+
+def decisions_of(
+    belief: ZoomBelief, close_up: LookAt, settings: DecisionSettings, forgetting: Forgetting | None = None
+) -> WindowDecisions:
+    """Make the decisions of a search with evidence, by the kind of picture and the settings.
+
+    Args:
+        belief: the belief of the search, before the first look.
+        close_up: looks closely at a box.
+        settings: thresholds, number of closer looks, and prior; None takes what was fitted.
+        forgetting: how evidence fades in a stream.
+
+    Returns:
+        The decisions: by closer looks where their model is fitted, unless the settings ask for none.
+    """
+    photograph = belief.photograph
+    prior = _prior_of(settings.prior, photograph, belief.target)
+    fitted = belief.evidence.thresholds if photograph is None else photograph.verification.thresholds
+    thresholds = (fitted or _DEFAULTS).changed(give_up=settings.give_up)
+    verification = belief.evidence.verification if photograph is None else photograph.verification
+    usual = CLOSER if photograph is None else MOST_IN_PHOTOGRAPH
+    most = usual if settings.closer is None else settings.closer
+    if not most or verification is None or verification.thresholds is None:
+        return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior)
+    places: CandidateBoxes
+    if photograph is None:
+        places = CandidateBoxes(belief.target, thresholds.confirm, forgetting, prior)
+    else:
+        places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
+    sure = verification.thresholds.changed(settings.confirm, thresholds.give_up)
+    verifier = Verifier(verification, places, close_up, sure, most)
+    return DecisionsByCloserLooks(belief, thresholds, prior, verifier)
+
+
+def _prior_of(share: float | None, photograph: PhotographEvidence | None, target: int) -> Prior:
+    """Compare the share that was given with that of the fit, which for large pictures is one half."""
+    if share is None:
+        return Prior()
+    if photograph is None:
+        # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
+        return Prior(share)
+    return Prior.of(share, photograph.shares, target)

@@ -23,7 +23,6 @@ _Guess = Callable[[Sequence[WindowLook], set[Window], Window | None], WindowChoi
 """Guesses the window to look at after one that is being looked at, which is among the windows; the last argument names
 it if it is not in the belief yet."""
 
-
 _LEAST_SHOWN = 0.75
 """Share of the frame that the look at the whole must show; below it the camera has moved on, and it is made anew."""
 
@@ -32,7 +31,7 @@ class KeptLook:
     """A look that counts: as it was taken, and where it lies in the present frame of a stream.
 
     Attributes:
-        taken: the look, in pixels of the frame in which it was taken.
+        original: the look, in pixels of the frame in which it was taken.
         current: the look in pixels of the present frame.
         time: seconds of the stream at which it was taken.
         value: the value that it was chosen for.
@@ -40,45 +39,56 @@ class KeptLook:
         seconds: time at its end, on the clock of the episode.
     """
 
-    def __init__(self, taken: WindowLook, time: float, value: float) -> None:
-        self.taken, self.current = taken, taken
-        self.time, self.value = time, value
-        self.number, self.seconds = 0, 0.0
-        self._since: Motion | None = None
+    def __init__(self, look: WindowLook, time: float, value: float, number: int = 0, seconds: float = 0.0) -> None:
+        self.original = look
+        self.current = look
+        self.time = time
+        self.value = value
+        self.number = number
+        self.seconds = seconds
+        self._motion: Motion | None = None  # of the camera since the look; None as long as it has stood still
 
     def carry(self, motion: Motion, lattice: Lattice) -> None:
         """Carry the look along with the camera, to the next frame."""
-        self._since = motion if self._since is None else self._since.then(motion)
-        self.current = carried(self.taken, self._since, lattice)
+        self._motion = motion if self._motion is None else self._motion.then(motion)
+        self.current = carried(self.original, self._motion, lattice)
 
 
 class WindowStep(Generic[_Belief]):
-    """One step of an episode: a look, the looks that count with it, and the belief after it."""
+    """One step of an episode: a look, the looks that count with it, and the belief after it.
+
+    Attributes:
+        newest: the look.
+        kept_looks: the looks that count, the overview first.
+        belief: the belief after it, which the next step changes; None without evidence.
+    """
 
     def __init__(
         self,
         newest: KeptLook,
         belief: _Belief,
-        kept: Sequence[KeptLook],
+        kept_looks: Sequence[KeptLook],
         choose: Callable[[], Sequence[WindowChoice]],
     ) -> None:
-        self.newest, self.kept, self._choose = newest, kept, choose
+        self.newest = newest
+        self.kept_looks = kept_looks
         self.belief: _Belief = belief
+        self._choose = choose
 
     @property
     def look(self) -> WindowLook:
         """The look, as it was taken."""
-        return self.newest.taken
+        return self.newest.original
 
     @property
-    def worth(self) -> float:
+    def value(self) -> float:
         """The value that the look was chosen for."""
         return self.newest.value
 
     @property
     def looks(self) -> list[WindowLook]:
         """The looks that count, where they lie in the present frame."""
-        return [look.current for look in self.kept]
+        return [look.current for look in self.kept_looks]
 
     @cached_property
     def choices(self) -> Sequence[WindowChoice]:
@@ -86,40 +96,47 @@ class WindowStep(Generic[_Belief]):
         return self._choose()
 
     @property
-    def ahead(self) -> float:
-        """Value of the best look that is left after it; 0 if none is left."""
+    def next_value(self) -> float:
+        """Value of the best look that remains, in a search its chance of a hit; 0 if none remains."""
         return self.choices[0][1] if self.choices else 0.0
 
 
 class _Recent(Generic[_Belief]):
     """The looks of an episode that count, the overview first, and the belief of them.
 
-    Invariant: `belief` holds the looks of `kept`, where they lie in the present frame, and nothing else. `aside` has
-    the looks of a scene that the camera has lost and may find again.
+    Invariant: `belief` holds the looks of `kept`, where they lie in the present frame, and nothing else; `windows` are
+    their windows. `aside` has the looks of a scene that the camera has lost and may find again. `lacks_overview` tells
+    whether the overview is too old, or shows too little of the frame; it is made anew then.
     """
 
     def __init__(self, belief: _Belief, source: WindowLooks, forgetting: Forgetting | None) -> None:
-        self.belief, self.source, self.forgetting = belief, source, forgetting
+        self.belief = belief
+        self.source = source
+        self.forgetting = forgetting
         self.kept: list[KeptLook] = []
         self.aside: list[KeptLook] = []
         self.windows: set[Window] = set()
-        self.renewed = False
+        self.lacks_overview = False
 
     @property
     def looks(self) -> list[WindowLook]:
+        """The looks that count, where they lie in the present frame."""
         return [look.current for look in self.kept]
 
-    def add(self, window_look: WindowLook, value: float) -> KeptLook:
+    def add(self, look: WindowLook, value: float) -> KeptLook:
         """Add a look at the present frame, and forget those that it replaces and those that are too old."""
-        look = KeptLook(window_look, self.source.time, value)
-        self.kept.append(look)
-        if self.forgetting is not None and self._forget(self.forgetting.span):
+        newest = KeptLook(look, self.source.time, value)
+        count = len(self.kept)
+        self.kept.append(newest)
+        if self.forgetting is not None:
+            self._forget(self.forgetting.span)
+        if len(self.kept) <= count:
             self._believe_anew()
         else:
-            self.windows.add(window_look.window)
+            self.windows.add(look.window)
             if self.belief is not None:
-                self.belief.add(window_look)
-        return look
+                self.belief.add(look)
+        return newest
 
     def follow(self, camera: CameraStep) -> None:
         """Carry the looks along with the camera, or set them aside where the frame fits none before."""
@@ -140,16 +157,18 @@ class _Recent(Generic[_Belief]):
             look.carry(motion, self.source.lattice)
 
     def _believe_anew(self) -> None:
+        """Make the belief of the looks that count."""
         self.windows = {look.current.window for look in self.kept}
         if self.belief is not None:
             self.belief.clear()
             for look in self.kept:
                 self.belief.add(look.current)
 
-    def _forget(self, span: float) -> bool:
-        """Forget looks that the newest one replaces, and those older than a span; returns whether there were any."""
-        first, newest, count = self.kept[0], self.kept[-1], len(self.kept)
-        if newest is not first and newest.taken.window == first.taken.window:
+    def _forget(self, span: float) -> None:
+        """Forget looks that the newest one replaces, and those older than a span in seconds."""
+        first = self.kept[0]
+        newest = self.kept[-1]
+        if newest is not first and newest.original.window == first.original.window:
             self.kept = [newest, *self.kept[1:-1]]
             first = newest
         # An old overview is kept until there is a new one, as all other looks are predicted from it.
@@ -161,8 +180,7 @@ class _Recent(Generic[_Belief]):
         ]
         at_next_frame = newest.time + self.source.passed
         is_old = at_next_frame - first.time > span
-        self.renewed = is_old or share_shown(first.current.window, self.source.lattice) < _LEAST_SHOWN
-        return len(self.kept) < count
+        self.lacks_overview = is_old or share_shown(first.current.window, self.source.lattice) < _LEAST_SHOWN
 
 
 def look_by_look(
@@ -180,16 +198,19 @@ def look_by_look(
     before. In a stream a look counts for the time in which half of its evidence would fade, or until the next look at
     its window. Where the order has no window left, the one that was looked at longest ago is looked at again.
     """
-    recent, first = _Recent(belief, source, forgetting), Window.overview(source.lattice)
+    recent = _Recent(belief, source, forgetting)
+    overview = Window.overview(source.lattice)
 
     def choose() -> Sequence[WindowChoice]:
         if not recent.kept:
-            return [(first, float("inf"))]
+            return [(overview, float("inf"))]
         choices = order(recent.looks, recent.windows)
-        if forgetting is not None and (recent.renewed or not choices):
-            oldest = min(recent.kept, key=lambda look: look.time).taken.window
-            return [(first, choices[0][1])] if choices else [(oldest, 0.0)]
-        return choices
+        if forgetting is None:
+            return choices
+        if not choices:
+            oldest = min(recent.kept, key=lambda look: look.time)
+            return [(oldest.original.window, 0.0)]
+        return [(overview, choices[0][1])] if recent.lacks_overview else choices
 
     def prepare(window: Window) -> None:
         assert guess is not None
@@ -206,9 +227,9 @@ def look_by_look(
         if guess is not None and forgetting is None and len(choices) == 1 and recent.kept:
             source.meanwhile = partial(prepare, choices[0][0])
         looks = source.see([window for window, _ in choices], hints=hints)
-        for window_look, (_, value) in zip(looks, choices, strict=True):
-            look = recent.add(window_look, value)
-            step = WindowStep(look, belief, tuple(recent.kept), choose)
+        for look, (_, value) in zip(looks, choices, strict=True):
+            newest = recent.add(look, value)
+            step = WindowStep(newest, belief, tuple(recent.kept), choose)
             yield step
         camera = source.camera_step()
         if camera is None or camera.is_still:
@@ -222,7 +243,13 @@ def look_for(
     source: WindowLooks, evidence: GlimpseEvidence, target: int, *, forgetting: Forgetting | None = None
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for one object of a class, look by look, until nothing is left to look at."""
-    belief = ZoomBelief(source.lattice, evidence, target, source.blank)
+    return search_windows(source, ZoomBelief(source.lattice, evidence, target, source.blank), forgetting=forgetting)
+
+
+def search_windows(
+    source: WindowLooks, belief: ZoomBelief, *, forgetting: Forgetting | None = None
+) -> Iterator[WindowStep[ZoomBelief]]:
+    """Look for one object of the class of a belief (`look_for`)."""
     return look_by_look(
         source,
         lambda _, done: jointly(partial(best_hit, belief), belief, done, 1),

@@ -17,6 +17,7 @@ from semfov.data.examples import example_scene
 from semfov.data.sources import Picture, Stream
 from semfov.decision import CloseUp, Decision
 from semfov.paths import FoveaMoment
+from semfov.paths.fovea import moment_look
 from semfov.viz.live import draw_moment, video, video_suffix
 from tests import small
 from tests.refusals import refused
@@ -189,8 +190,7 @@ def test_a_camera_runs_until_it_is_stopped(run, tmp_path, monkeypatch):
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 3
 
 
-def moment(**changes):
-    grid = Grid(4, 2, (40, 20))
+def moment(cell=0, grid=Grid(4, 2, (40, 20)), **changes):  # noqa: B008 (it does not change)
     beta = torch.ones(1, 8, 2)
     beta[0, 6, 1] = 1e6
     beta[0, :6, 0] = beta[0, 7:, 0] = 1e6
@@ -198,9 +198,10 @@ def moment(**changes):
     seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool))
     made = {
         "classes": ("background", "cup"),
-        "number": 0, "grid": grid, "target": 1, "cell": 0, "fixation": grid.centres[0], "detections": (seen,),
+        "number": 0, "grid": grid, "target": 1,
+        "looks": (moment_look(grid, 0, cell, seen, belief.probability(1)[0], {}),),
         "probability": belief.probability(1)[0], "decision": None, "visited": torch.zeros(8, dtype=torch.bool),
-        "next_cell": 3, "seconds": ({},),
+        "next_cell": 3,
     }  # fmt: skip
     return FoveaMoment(**{**made, **changes})
 
@@ -209,7 +210,7 @@ def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
     """The belief colours the likely cell, the gaze is marked, and a box surrounds the found object."""
     grey = torch.full((3, 200, 400), 0.5)
     grid = Grid(4, 2, (400, 200))
-    plain = moment(grid=grid, fixation=grid.centres[0])
+    plain = moment(grid=grid)
     drawn = draw_moment(grey, plain, "cup").astype(int)
     assert drawn.shape == (200, 400, 3)
     coloured = abs(drawn - 127).max(-1) > 8
@@ -220,16 +221,14 @@ def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
     # The line leads from the gaze to the next cell.
     assert coloured[50, 100:300].all()
     box = torch.tensor([110.0, 110, 190, 190])
-    found = draw_moment(
-        grey, moment(grid=grid, fixation=grid.centres[0], decision=Decision("found", 0.9, 6, box)), "cup"
-    )
+    found = draw_moment(grey, moment(grid=grid, decision=Decision("found", 0.9, 6, box)), "cup")
     changed = abs(found.astype(int) - drawn).max(-1) > 8
     assert changed[110, 110:190].all()
     assert changed[110:190, 110].all()
     assert not changed[115:185, 115:185].any()
     # A closer look is marked around its box instead of at the fixated point.
     closer = CloseUp(0, 1, 6, box, 0.9, 0.95, number=0)
-    there = {"grid": grid, "fixation": grid.centres[6], "next_cell": 6}
+    there = {"grid": grid, "cell": 6, "next_cell": 6}
     close = draw_moment(grey, moment(**there, closer=(closer,)), "cup").astype(int)
     changed = abs(close - draw_moment(grey, moment(**there), "cup")).max(-1) > 8
     assert changed[105, 110:190].all()

@@ -78,7 +78,7 @@ def test_a_still_picture_at_rate_zero_is_searched_frame_by_frame(one_thread):
         assert [each.number for each in moments] == list(range(len(moments)))
         plain = [each for each in moments if each.examined is None]
         assert [each.cell for each in plain] == searched.cells.tolist()
-        for moment, seen in zip(plain, searched.detections, strict=True):
+        for moment, seen in zip(plain, [each.detections for each in searched.fixated], strict=True):
             assert torch.equal(moment.seen.boxes, seen.boxes)
         closely = [each.examined for each in moments if each.examined is not None]
         for one, other in zip(closely, searched.closer, strict=True):
@@ -297,7 +297,7 @@ def test_thresholds_are_those_of_the_verification_unless_given():
     """A belief that fades gives up at its own threshold, since it stays less certain than in a search."""
 
     def thresholds(**options):
-        return agent(Counted(3)).live("red", **options)._episodes["fovea"].thresholds
+        return agent(Counted(3)).live("red", **options)._episodes["fovea"].plan.thresholds
 
     assert thresholds(rate=0) == AT
     assert thresholds() == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)

@@ -179,7 +179,7 @@ def test_candidates_come_in_the_order_of_a_loop(seed):
                     evidence = float(weight[one, other, cell] * looks.scores[one, other, 2])
                     if evidence * float(chances[cell]) > value * (1 + 1e-6):
                         value, place = evidence * float(chances[cell]), cell
-        candidate = candidates.due(0.0, last=True)
+        candidate = candidates.due(Thresholds(1.0, 0.0), last=True)
         if place is None:
             assert candidate is None
             break
@@ -193,7 +193,7 @@ def test_candidates_come_in_the_order_of_a_loop(seed):
         examined += [candidate.box, closer]
     probable = Known(torch.zeros(1, 12), torch.ones(1), chances[None])
     see(looks[:1])
-    assert candidates.due(0.0, last=True) is None
+    assert candidates.due(Thresholds(1.0, 0.0), last=True) is None
 
 
 class Fine(Square):

@@ -59,7 +59,7 @@ class WindowAgent:
         self.gaze = env.gazes
 
     def __call__(self):
-        gaze, belief, lattice = self.gaze, self.gaze.looking.belief, self.gaze.source.lattice
+        gaze, belief, lattice = self.gaze, self.gaze.looking.session.belief, self.gaze.source.lattice
         searching = gaze.task == "search"
         choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
         return _action_of(lattice, Window.overview(lattice) if choice is None else choice[0])

@@ -10,8 +10,8 @@ import torch
 
 from semfov import ActivePerception, EmbeddedScenes
 from semfov.agents import ZoomAgent
-from semfov.agents.episode import EpisodeLimits
-from semfov.agents.windows import WindowEpisode
+from semfov.agents.episode import EpisodeLimits, Goal
+from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data import Annotation, Scene
@@ -34,6 +34,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
 from semfov.runs.progress import WholeBar
+from semfov.settings import DecisionSettings
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
@@ -195,7 +196,8 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     for sought in searches:
         assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())
         # Looks and end are those of the agent.
-        path = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8)).open(sought.looks).run()
+        task = WindowTask(Goal.of(names, sought.target), model)
+        path = WindowEpisode(task, sought.looks, EpisodeLimits(8)).run()
         found, count = sought.unverified_end(model.thresholds)
         assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
         assert [look.window for look in sought.window_looks[:count]] == [each.window for each in path.window_looks]
@@ -212,8 +214,8 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     limits = Thresholds(1.0, model.thresholds.give_up, config.place)
     again = verify(searches, [model.verification], limits, model.thresholds)
     for sought, each in zip(searches, again, strict=True):
-        episode = WindowEpisode(names, model, sought.target, limits=EpisodeLimits(8), closer=MOST_CLOSER)
-        path = episode.open(sought.looks).run()
+        task = WindowTask(Goal.of(names, sought.target), model, DecisionSettings(closer=MOST_CLOSER))
+        path = WindowEpisode(task, sought.looks, EpisodeLimits(8)).run()
         right, count = each.found(fitted.confirm)
         assert (right is not None, count) == (path.decision.outcome == "found", path.passes)
         assert right is None or right == sought.right(path.decision.box)

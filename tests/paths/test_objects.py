@@ -12,7 +12,9 @@ from semfov.cli.outcome import _looks_text
 from semfov.decision import CloseUp, Decision
 from semfov.head.views import Views
 from semfov.paths import HeadPath, ZoomPath
+from semfov.paths.head import head_looks
 from semfov.paths.look import detections_in_words
+from semfov.paths.windows import looks_at_windows
 from semfov.report.episode import episode_data
 from semfov.sensor.sphere import panorama_directions
 from semfov.zoom import Lattice
@@ -90,7 +92,7 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     assert [line.endswith(", as decided") for line in told if "closer look " in line][:2] == [False, True]
     for other in (None, Decision("absent", 0.1), Decision("found", 0.9, 0, torch.tensor(LEFT))):
         assert replace(path, decision=other).words.best_place == ""
-    assert replace(path, closer=(), detections=(look(), look())).words.best_place == ""
+    assert small.with_looks(replace(path, closer=()), detections=[look(), look()]).words.best_place == ""
 
 
 def test_looks_tell_the_target_first_and_count_detections_from_one_score_on():
@@ -164,7 +166,7 @@ def test_the_number_in_all_starts_with_the_objects_that_are_listed(chances, unse
     """Unless fewer are expected. Where the detector shows faint candidates alone, a large picture has no number."""
     count = len(chances)
     found = Objects(torch.rand(count, 4), torch.tensor(chances), torch.ones(count).long(), torch.zeros(count).long())
-    lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"window_looks": (), "values": (), "least": 0.5}
+    lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"looks": (), "least": 0.5}
     path = ZoomPath(lattice=lattice, classes=CLASSES, target=1, candidates=found, unseen=unseen, **parts)
     assert path.describe() == f"{words}. 0 looks"
     values = path.to_dict()
@@ -178,7 +180,7 @@ def test_a_photograph_has_a_number_where_the_detector_hardly_reacts():
     lattice, empty = Lattice.over((640, 480), (416, 416)), torch.zeros(0).long()
     assert lattice.levels == 1
     nothing = Objects(torch.zeros(0, 4), torch.zeros(0), empty, empty)
-    parts = {"window_looks": (), "values": (), "least": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES}
+    parts = {"looks": (), "least": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES}
     path = ZoomPath(lattice=lattice, target=None, targets=(1, 2), candidates=nothing, **parts)
     assert path.expected == {"cup": 0, "cat": 0}
     assert path.expected_error == {"cup": 1, "cat": 1}
@@ -198,8 +200,8 @@ def test_a_large_picture_in_which_others_are_clear_has_a_number_too(clear, given
     cats = look(*((shifted(LEFT, 100 * number), 2, 0.75) for number in range(clear)))
     window_look = WindowLook(Window.overview(lattice), cats, torch.zeros(clear).bool(), torch.zeros(2), None)
     nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
-    parts = {"classes": CLASSES, "values": (0.0,), "unseen": (0.0, 0.0), "least": 0.5, "target": 1}
-    path = ZoomPath(lattice=lattice, window_looks=(window_look,), candidates=nothing, **parts)
+    parts = {"classes": CLASSES, "unseen": (0.0, 0.0), "least": 0.5, "target": 1}
+    path = ZoomPath(lattice=lattice, looks=looks_at_windows([window_look], lattice, [0.0]), candidates=nothing, **parts)
     assert path.describe() == "No cup found. 1 look"
     number = path.expected["cup"], path.expected_error["cup"]
     assert number == (0, 1) if given else all(map(isnan, number))
@@ -210,7 +212,7 @@ def test_a_number_is_claimed_class_by_class():
     chances, labels = torch.tensor([0.9, 0.8, 0.3, 0.3, 0.2]), torch.tensor([1, 1, 2, 2, 2])
     found = Objects(torch.rand(5, 4), chances, labels, torch.zeros(5).long())
     lattice = Lattice.over((2560, 1920), (416, 416))
-    parts = {"window_looks": (), "values": (), "least": 0.5, "unseen": (0.5, 0.1), "target": None, "targets": (1, 2)}
+    parts = {"looks": (), "least": 0.5, "unseen": (0.5, 0.1), "target": None, "targets": (1, 2)}
     path = ZoomPath(lattice=lattice, classes=CLASSES, candidates=found, **parts)
     share = 1.7 / 2.5
     assert path.expected["cup"] == pytest.approx(1.7 + 0.5 * share)
@@ -243,8 +245,8 @@ def test_looks_are_given_one_by_one():
 def head_path(world, actions, looks):
     views = Views(world)
     maps = torch.zeros(len(looks), len(world.scene))
-    parts = {"target": None, "classes": CLASSES, "maps": maps, "seconds": (0.5, 1.25)[: len(looks)]}
-    return HeadPath(views=views, actions=actions, detections=tuple(looks), **parts)
+    made = head_looks(views, actions, looks, maps, (0.5, 1.25)[: len(looks)])
+    return HeadPath(views=views, looks=made, target=None, classes=CLASSES, maps=maps)
 
 
 def test_boxes_of_a_head_are_in_pixels_of_the_picture_and_meet_across_the_seam():

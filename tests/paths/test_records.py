@@ -21,11 +21,15 @@ from semfov.detection import Placement
 from semfov.head.views import Views
 from semfov.io.storage import read, write_file
 from semfov.paths import FoveaMoment, HeadPath, Record, WindowMoment, ZoomPath
+from semfov.paths.fovea import moment_look
+from semfov.paths.head import head_looks
 from semfov.paths.stimulus import Stimulus, reduced_copy
+from semfov.paths.windows import looks_at_windows
 from semfov.viz import plot_belief, plot_belief_bars, plot_episode, plot_foveated_strip, plot_semantic_map
 from semfov.viz.style import FOUND, TARGET
 from semfov.zoom import Lattice
 from semfov.zoom.looks import Window, WindowLook
+from tests import small
 from tests.refusals import refused, unusable
 
 CLASSES = ("background", "cup", "cat")
@@ -48,20 +52,19 @@ def looks(count):
 def scanpath():
     grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
     generator = torch.Generator().manual_seed(1)
-    return Scanpath(
-        grid=grid,
-        classes=CLASSES,
+    return small.scanpath(
+        grid,
+        cells,
+        CLASSES,
+        looks(3),
+        ({"detect": 0.5}, {"detect": 0.25}, {"detect": 0.125}),
         target=1,
-        cells=cells,
-        fixations=grid.centres[cells],
-        detections=looks(3),
         probabilities=torch.rand(3, 12, 3, generator=generator).softmax(-1),
         values=torch.rand(3, 12, generator=generator),
         found=True,
         decision=Decision("found", 0.9, 6, BOX, 0.8),
         closer=(CloseUp(1, 1, 6, BOX, 0.8, 0.9),),
         ending="decision",
-        seconds=({"detect": 0.5}, {"detect": 0.25}, {"detect": 0.125}),
     )
 
 
@@ -81,8 +84,7 @@ def zoom_path():
         lattice=lattice,
         classes=CLASSES,
         target=1,
-        window_looks=window_looks,
-        values=(float("inf"), 0.1 + 0.2, 0.75),
+        looks=looks_at_windows(window_looks, lattice, (float("inf"), 0.1 + 0.2, 0.75)),
         candidates=objects,
         decision=Decision("found", 0.9, None, BOX, 0.8),
         closer=(CloseUp(None, 1, None, BOX, 0.8, 0.9, number=2),),
@@ -92,16 +94,14 @@ def zoom_path():
 
 def head_path(world=None):
     views = Views(Panorama(torch.rand(3, 64, 128), (40, 30)) if world is None else world)
-    actions = (205, 217, 30)
+    maps = torch.rand(3, len(views.world.scene), generator=torch.Generator().manual_seed(2))
+    values = (float("inf"), 0.5, 0.25)
     return HeadPath(
         views=views,
         classes=CLASSES,
         target=2,
-        actions=actions,
-        seconds=(0.2, 0.5, 1.25),
-        detections=looks(3),
-        maps=torch.rand(3, len(views.world.scene), generator=torch.Generator().manual_seed(2)),
-        values=(float("inf"), 0.5, 0.25),
+        looks=head_looks(views, (205, 217, 30), looks(3), maps, (0.2, 0.5, 1.25), values),
+        maps=maps,
         duration=12.5,
         ending="passes",
     )
@@ -116,13 +116,10 @@ def moment():
         decision=Decision("undecided", 0.25),
         number=7,
         grid=grid,
-        cell=5,
-        fixation=grid.centres[5],
-        detections=looks(3)[2:],
+        looks=(moment_look(grid, 7, 5, looks(3)[2], belief.probability(1)[0], {"open": 0.25, "detect": 0.5}),),
         probability=belief.probability(1)[0],
         visited=torch.zeros(8, dtype=torch.bool),
         next_cell=3,
-        seconds=({"open": 0.25, "detect": 0.5},),
     )
 
 
@@ -130,6 +127,12 @@ def window_moment():
     path = zoom_path()
     made = {each.name: getattr(path, each.name) for each in dataclasses.fields(path) if each.init}
     return WindowMoment(**{**made, "number": 7, "ending": None, "next_window": path.window_looks[1].window})
+
+
+def timed(record, seconds):
+    """A record whose looks end at these times."""
+    looks = zip(record.looks, seconds, strict=True)
+    return replace(record, looks=tuple(replace(look, seconds=time) for look, time in looks))
 
 
 RECORDS = [scanpath, zoom_path, head_path, moment, window_moment]
@@ -285,7 +288,7 @@ def test_the_table_has_the_looks_and_its_first_columns_are_those_of_every_kind(m
 def test_the_clock_of_an_episode_adds_up_the_times_of_a_fovea():
     assert [look.seconds for look in scanpath()] == [0.5, 0.75, 0.875]
     assert [look.seconds for look in head_path()] == [0.2, 0.5, 1.25]
-    assert [look.seconds for look in replace(zoom_path(), seconds=(0.1, 0.2, 0.4))] == [0.1, 0.2, 0.4]
+    assert [look.seconds for look in timed(zoom_path(), (0.1, 0.2, 0.4))] == [0.1, 0.2, 0.4]
 
 
 @pytest.mark.parametrize("make", [scanpath, zoom_path, head_path])

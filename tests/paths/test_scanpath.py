@@ -13,6 +13,7 @@ from semfov.detection import Candidates, Detector, Placement
 from semfov.errors import DataError
 from semfov.io.storage import read, write_file
 from semfov.paths.stimulus import LONGEST, Stimulus, reduced_copy
+from tests import small
 from tests.paths.test_records import same
 from tests.refusals import refused
 
@@ -127,13 +128,10 @@ def test_rows_have_cells_times_and_the_belief(scanpath):
 
 @pytest.mark.parametrize("target", [None, 1])
 def test_rows_without_detections_and_times(scanpath, target):
-    nothing = replace(
-        scanpath, detections=(Detections.empty(1, 2),) * len(scanpath), seconds=(), posterior=None, target=target
-    )
-    for number, row in enumerate(nothing.rows()):
+    nothing = small.scanpath(scanpath.grid, scanpath.cells, scanpath.classes, target=target)
+    for row in nothing.rows():
         assert (row["detections"], row["seen"], row["score"], row["seconds"]) == (0, None, None, None)
-        believed = float(nothing.probabilities[number, row["cell"], 1])
-        assert row["probability"] == (None if target is None else pytest.approx(believed, rel=5e-4))
+        assert (row["probability"], row["highest"], row["presence"]) == (None, None, None)
 
 
 def test_to_frame_without_pandas_names_the_remedy(scanpath, monkeypatch):
@@ -145,13 +143,15 @@ def variants(scanpath):
     none = Detections.empty(1, 2)
     values = scanpath.values.clone()
     values[0, :3] = torch.tensor([-math.inf, math.inf, math.nan])
-    double = {name: getattr(scanpath, name).double() for name in ("fixations", "probabilities", "values")}
+    double = {name: getattr(scanpath, name).double() for name in ("probabilities", "values")}
+    count = len(scanpath)
+    padded = [Detections.stack([each, none])[:1] for each in scanpath.detections]
+    untimed = small.with_looks(scanpath, seconds=[None] * count, stages=[{}] * count)
     return {
-        "bare": replace(scanpath, stimulus=None, photograph=None, seconds=(), decision=None, ending=None),
-        "nothing seen": replace(scanpath, detections=(none,) * len(scanpath)),
+        "bare": replace(untimed, stimulus=None, photograph=None, decision=None, ending=None),
+        "nothing seen": small.with_looks(scanpath, detections=[none] * count),
         "not finite": replace(scanpath, values=values),
-        "padded": replace(scanpath, detections=tuple(Detections.stack([each, none]).__getitem__(slice(0, 1))
-                                                     for each in scanpath.detections)),
+        "padded": small.with_looks(scanpath, detections=padded),
         "double": replace(scanpath, **double),
         "found": replace(scanpath, found=True, target=2, decision=Decision("found", 0.1 + 0.2, 7, torch.rand(4))),
         "closer": replace(

@@ -13,6 +13,7 @@ from eval.search.run import SearchConfig
 from semfov import Detections, Grid, Objects, Scanpath
 from semfov.decision import Decision
 from semfov.paths import ZoomPath
+from semfov.paths.windows import looks_at_windows
 from semfov.report import write_page
 from semfov.report.zoom import zoom_data
 from semfov.runs.config import DataConfig, PolicyConfig
@@ -109,8 +110,7 @@ def zoom_path(hostile: str) -> ZoomPath:
         lattice=lattice,
         classes=classes,
         target=2,
-        window_looks=looks,
-        values=(float("inf"), 0.5, 0.25),
+        looks=looks_at_windows(looks, lattice, (float("inf"), 0.5, 0.25)),
         candidates=objects,
         decision=decision,
         detector=hostile,

@@ -16,6 +16,7 @@ from semfov.report import write_page
 from semfov.report.episode import episode_data
 from semfov.report.zoom import zoom_data
 from semfov.viz.style import overlay_colours
+from tests import small
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="needs axe-playwright-python")
@@ -38,7 +39,7 @@ def chromium():
 @pytest.fixture(scope="module")
 def path(scanpath, image, hostile, tmp_path_factory):
     views = [image * share for share in (0.3, 0.6, 0.9)]
-    timed = replace(scanpath, seconds=tuple({"detect": 0.1 * number} for number in (1, 2, 3)))
+    timed = small.with_looks(scanpath, stages=[{"detect": 0.1 * number} for number in (1, 2, 3)])
     settings = {"sensor": {"sigma": 20, "reference": 640, "growth": 2}, "detector": {"name": "none"}}
     names = (hostile, "another")
     episodes = [episode_data(timed, image, views, name=name, settings=settings) for name in names]

@@ -32,7 +32,7 @@ from tests.small import rand
 
 @pytest.fixture
 def page(scanpath, image, hostile, tmp_path):
-    timed = replace(scanpath, seconds=({"detect": 0.1, "choose": 0.001},) * 3)
+    timed = small.with_looks(scanpath, stages=[{"detect": 0.1, "choose": 0.001}] * 3)
     data = episode_data(timed, image, [image * 0.5] * 3, name=hostile)
     sections = table_html([[hostile, "1"], [hostile, hostile]], hostile)
     return write_page(tmp_path / "page.html", hostile, [data], sections=sections).read_text(encoding="utf-8")
@@ -176,7 +176,9 @@ def test_a_page_of_fixations_lists_the_objects_that_its_outcome_counts(scanpath,
     boxes = torch.tensor([[[10.0, 10, 21.46, 30], [40.0, 20, 60, 50]]])
     scores = torch.tensor([[[0.1, 0.1, 0.1, 0.63499], [0.1, 0.5, 0.2, 0.2]]])
     looks = (Detections(boxes, scores, torch.ones(1, 2, dtype=torch.bool)), *scanpath.detections[1:])
-    explored = replace(scanpath, target=None, posterior=None, detections=looks, least=0.5, detector="net")
+    explored = replace(
+        small.with_looks(scanpath, detections=looks), target=None, posterior=None, least=0.5, detector="net"
+    )
     data = episode_data(explored, image, [image] * 3, name="kitchen")
     page = page_html("kitchen", [data])
     rows = re.findall(r'<tr data-object="(\d)" data-look="(\d)">(.*?)</tr>', page)

@@ -122,7 +122,8 @@ def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     last = path.window_looks[2]
     near = [replace(last, window=replace(last.window, fixation=(0, 0, 1.5 + more))) for more in range(4)]
     for looks, told in ((near[:1], "magnifications 0.25, 0.5, 1, 1.5"), (near, "magnifications from 0.25 to 4.5")):
-        assert replace(path, window_looks=(*path.window_looks[:2], *looks)).words.sensor.endswith(told)
+        closer = tuple(replace(path.looks[2], shown=look) for look in looks)
+        assert replace(path, looks=(*path.looks[:2], *closer)).words.sensor.endswith(told)
 
 
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
@@ -139,10 +140,8 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
         mask=torch.ones(1, many, dtype=torch.bool),
         confidence=first.detections.confidence.expand(1, many),
     )
-    looks = (replace(first, detections=seen), *zoom_path.window_looks[1:])
-    data = zoom_data(
-        replace(zoom_path, candidates=objects, decision=None, window_looks=looks), large_picture, name="crowd"
-    )
+    looks = (replace(zoom_path.looks[0], detections=seen), *zoom_path.looks[1:])
+    data = zoom_data(replace(zoom_path, candidates=objects, decision=None, looks=looks), large_picture, name="crowd")
     page = page_html("crowd", [data])
     assert "<p>7 less confident objects are left out.</p>" in page
     assert f"<p>{many - _MOST_DETECTIONS} less confident detections are left out.</p>" in page
@@ -233,4 +232,4 @@ def test_a_wrong_picture_or_a_path_without_looks_is_refused(zoom_path, large_pic
     with pytest.raises(InputError, match="picture: expected the picture of the record, 400 × 300 px"):
         zoom_data(zoom_path, large_picture[:, :200], name="other")
     with pytest.raises(InputError, match="at least one look"):
-        zoom_data(replace(zoom_path, window_looks=()), large_picture, name="other")
+        zoom_data(replace(zoom_path, looks=()), large_picture, name="other")

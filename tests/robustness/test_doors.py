@@ -445,4 +445,4 @@ def test_saliency_takes_pictures_of_any_type(tmp_path, model):
 @pytest.mark.parametrize("cells", [[], [0, 100], [0, -1], [0, 2.5], ["a"]])
 def test_cells_that_an_episode_cannot_look_at_are_refused(cells, agent):
     with pytest.raises(SemfovError, match=r"^cells: expected "):
-        semfov.agents.fovea.FoveaEpisode(agent.fovea, None, cells=cells)
+        semfov.agents.fovea_episode.GazePlan(agent.fovea, cells=cells)

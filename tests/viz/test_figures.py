@@ -10,7 +10,7 @@ import torch
 from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d import Axes3D
 
-from semfov import Detections, Grid, Scanpath
+from semfov import Detections, Grid
 from semfov.decision import CloseUp, Decision
 from semfov.viz import (
     COLOURS,
@@ -23,6 +23,7 @@ from semfov.viz import (
     plot_reliability,
     plot_scanpath,
 )
+from tests import small
 from tests.lightness import lab_of
 from tests.refusals import refused
 
@@ -172,10 +173,9 @@ def test_belief_shows_the_posterior_of_the_search_and_a_strip_every_fixation_on_
 @pytest.mark.parametrize("looks", [1, 2, 5])
 def test_the_colour_bar_of_a_strip_lies_inside_the_figure(size, looks):
     grid, cells = Grid(4, 4, size), torch.arange(looks)
-    fixed = {"grid": grid, "cells": cells, "fixations": grid.centres[cells], "values": torch.zeros(looks, 16)}
     belief = torch.full((looks, 16, 2), 0.5)
     classes = "background", "baseball glove"
-    figure = draw(plot_belief(Scanpath(classes=classes, target=1, detections=(), probabilities=belief, **fixed), None))
+    figure = draw(plot_belief(small.scanpath(grid, cells, classes, target=1, probabilities=belief), None))
     box, whole = figure.axes[-1].get_tightbbox(), figure.bbox
     assert whole.x0 <= box.x0 < box.x1 <= whole.x1
     assert whole.y0 <= box.y0 < box.y1 <= whole.y1

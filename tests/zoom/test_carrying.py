@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from semfov import Detections, Detector, InputError, WindowEye, ZoomAgent
-from semfov.agents.episode import EpisodeLimits
 from semfov.detection.scores import Candidates
 from semfov.motion import Motion
 from semfov.observation.matching import box_iou
+from semfov.settings import StreamSettings
 from semfov.zoom.carrying import carried, inside_frame, share_shown
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
@@ -119,7 +119,7 @@ def flight(count, speed):
 def test_objects_stay_at_their_places_while_the_camera_moves(speed):
     """After thirty frames, one look each, nearly all squares are known, and few boxes are elsewhere."""
     agent = ZoomAgent(WindowEye(Patches())).eval()
-    episode = agent.episode(None, (RED,), limits=EpisodeLimits(), rate=0.25, follows=True)
+    episode = agent.stream(None, (RED,), StreamSettings(rate=0.25))
     *_, (moment, boxes) = ((episode.step(frame), boxes) for frame, boxes in flight(30, speed))
     overlap = box_iou(boxes, moment.objects.boxes) >= 0.5
     assert overlap.any(1).float().mean() >= 0.85
@@ -131,7 +131,7 @@ def test_objects_stay_at_their_places_while_the_camera_moves(speed):
 def test_a_cut_ends_what_was_known():
     """Three frames after a cut nothing of the old scene is listed."""
     agent = ZoomAgent(WindowEye(Patches())).eval()
-    episode = agent.episode(None, (RED,), limits=EpisodeLimits(), rate=0.25, follows=True)
+    episode = agent.stream(None, (RED,), StreamSettings(rate=0.25))
     for frame, _ in flight(15, 4):
         moment = episode.step(frame)
     assert len(moment.objects)
@@ -145,7 +145,7 @@ def test_a_cut_ends_what_was_known():
 def test_known_poses_take_the_place_of_the_estimate():
     """A camera that turns about itself over a ground without any texture, where nothing can be followed."""
     agent = ZoomAgent(WindowEye(Patches())).eval()
-    episode = agent.episode(None, (RED,), limits=EpisodeLimits(), rate=0.25, follows=True)
+    episode = agent.stream(None, (RED,), StreamSettings(rate=0.25))
     for number in range(12):
         frame = np.full((768, 1024, 3), 90, np.uint8)
         x, y = 300 + 10 * number, 500 - 7 * number
@@ -159,7 +159,7 @@ def test_known_poses_take_the_place_of_the_estimate():
 def test_poses_are_given_for_all_frames_or_none():
     agent = ZoomAgent(WindowEye(Patches())).eval()
     frame = np.full((768, 1024, 3), 90, np.uint8)
-    episode = agent.episode(None, (RED,), limits=EpisodeLimits(), rate=0.25, follows=True)
+    episode = agent.stream(None, (RED,), StreamSettings(rate=0.25))
     episode.step(frame, pose=np.eye(3))
     with pytest.raises(InputError, match="pose: expected a pose of each frame, or of none"):
         episode.step(frame)

@@ -14,6 +14,7 @@ from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
 from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
+from semfov.settings import StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, SearchLook, closer_window, look_closely
@@ -111,7 +112,7 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
         return closely[-1]
 
     examined = []
-    while (candidate := candidates.due(0.0, last=True)) is not None:
+    while (candidate := candidates.due(Thresholds(1.0, 0.0), last=True)) is not None:
         odds = [math.log(p / (1 - p)) for p in (0.9, candidate.evidence, 0.95)]
         assert candidate.probability == pytest.approx(1 / (1 + math.exp(odds[2] - odds[0] - odds[1])), abs=1e-5)
         features, box = candidates.examine(candidate, close_up)
@@ -157,7 +158,7 @@ def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcom
     assert [each.number for each in judge.looks] == list(range(5, 5 + count))
     assert [round(each.place, 4) for each in judge.looks] == scores
     assert [round(each.probability, 4) for each in made] == [0.9] * count
-    assert OUTCOMES[judge.outcome()] == judge.decision(over=True).outcome == outcome
+    assert OUTCOMES[judge.outcome()] == judge.decision_at_end().outcome == outcome
     assert judge.presence == pytest.approx(presence)
     assert judge.best.place == pytest.approx(max(scores))
 
@@ -179,7 +180,7 @@ def test_improbable_places_are_examined_only_at_the_end():
         judge.see(look(1, chance, 0.5, ONE, OTHER), last=over)
         assert len(judge.look_closely(9)) == count
         assert judge.outcome() == (2 if count else 0)
-        assert judge.decision(over=count > 0).outcome == ("absent" if count else "undecided")
+        assert judge.decision_at_end().outcome == ("absent" if count else "undecided")
     none_left = verifier(FromScore(), [0.1, 0.1])
     none_left.see(look(24, 0.9, 0.0, ONE))
     assert none_left.look_closely(0) == []
@@ -369,19 +370,19 @@ def test_a_closer_look_is_due_when_it_is_worth_a_pass():
         return math.log(p / (1 - p))
 
     chances = [1 / (1 + math.exp(-(odds(0.8) + odds(score) - odds(0.5)))) for score in (0.5, 0.02)]
-    first = places.due(0.3, last=True)
+    first = places.due(Thresholds(1.0, 0.3), last=True)
     assert first.probability == pytest.approx(chances[0], abs=1e-5)
-    assert places.left == pytest.approx(chances[0], abs=1e-5)
-    assert places.due(chances[0] + 1e-3, last=True) is None
+    assert places.hit_chance == pytest.approx(chances[0], abs=1e-5)
+    assert places.due(Thresholds(1.0, chances[0] + 1e-3), last=True) is None
     places.dismiss(first, first.box)
     places.record(first.box, 0.6, 0.7)
     # The rest is what the first place leaves; the third place is too faint.
-    assert places.left == pytest.approx(chances[1] * 0.4, abs=1e-5)
-    second = places.due(chances[1] * 0.4 - 1e-4, last=True)
+    assert places.hit_chance == pytest.approx(chances[1] * 0.4, abs=1e-5)
+    second = places.due(Thresholds(1.0, chances[1] * 0.4 - 1e-4), last=True)
     assert second.box.tolist() == boxes[0, 1].tolist()
-    assert places.due(chances[1] * 0.4 + 1e-4, last=True) is None
+    assert places.due(Thresholds(1.0, chances[1] * 0.4 + 1e-4), last=True) is None
     places.dismiss(second, second.box)
-    assert places.left < 0
+    assert places.hit_chance < 0
 
 
 def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
@@ -395,14 +396,14 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
         looked.append(box)
         return whole
 
-    large = places.due(0.1, last=True)
-    assert places.seen(large)
+    large = places.due(Thresholds(1.0, 0.1), last=True)
+    assert places.is_shown(large)
     features, box = places.examine(large, close_up)
     expected = closer_features(0.8, large.probability, 0.5, whole, large.box, 1)
     assert torch.equal(features, expected[0])
     assert (looked, places.record(box, 0.4, 0.5).number) == ([], 0)
-    small = places.due(0.1, last=True)
-    assert not places.seen(small)
+    small = places.due(Thresholds(1.0, 0.1), last=True)
+    assert not places.is_shown(small)
     _, box = places.examine(small, close_up)
     assert (len(looked), places.record(box, 0.4, 0.5).number) == (1, 1)
 
@@ -421,9 +422,9 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
     judge.see(SearchLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
     judge.look()
     # The second place is due in the same frame, and needs no pass; in a later one of a scene that changes it does.
-    assert judge.places.seen(judge.candidate)
+    assert judge.places.is_shown(judge.candidate)
     judge.wait()
-    assert judge.places.seen(judge.candidate) == (rate == 0)
+    assert judge.places.is_shown(judge.candidate) == (rate == 0)
     due = judge.candidate
     assert len(judge.look_closely(1)) == 1
     assert looked[0] == boxes[0, 0].tolist()
@@ -440,9 +441,9 @@ def test_a_closer_look_is_not_at_an_object_that_was_examined():
     whole = Detections(boxes, torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
     places.see(SearchLook(whole, 1, 0.8, 0.5, 0.0))
     one = Detections(boxes[:, :1] + 1, torch.tensor([[[0, 0.9, 0]]]), torch.ones(1, 1).bool())
-    _, box = places.examine(places.due(0.1, last=True), lambda box: one)
+    _, box = places.examine(places.due(Thresholds(1.0, 0.1), last=True), lambda box: one)
     assert torch.equal(box, one.boxes[0, 0])
-    second = places.due(0.1, last=True)
+    second = places.due(Thresholds(1.0, 0.1), last=True)
     assert torch.equal(second.box, boxes[0, 1])
     features, box = places.examine(second, lambda box: one)
     nothing = closer_features(0.8, second.probability, 0.3, Detections.empty(1, 2), second.box, 1)
@@ -496,9 +497,8 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     assert nothing.passes == 1
     assert "frequency and low score" in nothing.why_it_ended()
     seen = torch.tensor([0.0, 0.0, PhotographPlaces.least + 1e-6])
-    shown = replace(
-        nothing, window_looks=tuple(replace(window_look, show=seen) for window_look in nothing.window_looks)
-    )
+    looks = tuple(replace(look, shown=replace(look.shown, show=seen)) for look in nothing.looks)
+    shown = replace(nothing, looks=looks)
     assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.
     made = [agent.search(photograph, "red", confirm=least, give_up=0.0) for least in (0.01, 0.9)]
@@ -569,9 +569,9 @@ def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph
     agent = ZoomAgent(WindowEye(detector), own_evidence())
     path = agent.search(photograph, "red", give_up=0.0)
     assert path.passes < 1 + len(path.closer)  # some places are in one window
-    live = agent.episode(1, rate=0.0, give_up=0.0)
+    live = agent.stream(1, (), StreamSettings(rate=0.0, give_up=0.0), follows=False)
     for _ in range(path.passes):
-        live.look(photograph)
+        live.step(photograph)
     moment = live.moment()
     assert moment.decision.outcome == path.decision.outcome
     assert moment.decision.probability == pytest.approx(path.decision.probability, abs=1e-9)

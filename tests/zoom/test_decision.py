@@ -102,7 +102,7 @@ def test_before_fitting_the_probability_is_the_best_score(eye, picture):
     facts = SearchFacts(seen[0].belief)
     for step in seen:
         facts.add(step.look)
-        assert facts.presence(step.ahead) == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
+        assert facts.presence(step.next_value) == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
 
 
 def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
@@ -143,8 +143,8 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
         for step in look_for(source, evidence, target):
             facts = facts or SearchFacts(step.belief)
             facts.add(step.look)
-            presence, passes = facts.presence(step.ahead), passes + 1
-            state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([step.ahead])
+            presence, passes = facts.presence(step.next_value), passes + 1
+            state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([step.next_value])
             ended = int(settle(*state, thresholds))
             if ended or passes == most:
                 break

@@ -10,8 +10,9 @@ from torchvision.transforms.functional import to_pil_image
 
 from semfov import ActivePerception, Detections, InputError, WindowEye, ZoomAgent
 from semfov.agents.picture import OpenedPicture
-from semfov.agents.windows import _without_replaced
+from semfov.agents.window_episode import _without_replaced
 from semfov.data.large import open_large
+from semfov.settings import StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from tests.refusals import refused
@@ -232,7 +233,7 @@ def same_looks(moments, path):
 def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, picture, target, one_thread):
     path = agent.find_all(picture, target, passes=9)
     targets = {None: (), 3: (3,)}.get(target) if not isinstance(target, list) else tuple(target)
-    live = agent.episode(None, targets, rate=0)
+    live = agent.stream(None, targets, StreamSettings(rate=0), follows=False)
     moments = [live.step(picture) for _ in path.window_looks]
     same_looks(moments, path)
     assert moments[-1].decision is None
@@ -246,7 +247,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, pict
     model = {"closely": evidence(), "plain": GlimpseEvidence(3, 8), "slices": None}[kind]
     agent = ZoomAgent(WindowEye(detector), model).eval()
     path = agent.search(picture, "red")
-    live = agent.episode(1, rate=0)
+    live = agent.stream(1, (), StreamSettings(rate=0), follows=False)
     moments = [live.step(picture) for _ in path.window_looks]
     same_looks(moments, path)
     last = moments[-1]
@@ -265,7 +266,7 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
     image[:, [0, 0, -1, -1], [0, -1, 0, -1]] = 0.02  # no blank ground
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
     path = agent.search(image, "red", closer=2)
-    live = agent.episode(1, rate=0, closer=2)
+    live = agent.stream(1, (), StreamSettings(rate=0, closer=2), follows=False)
     moments = [live.step(image) for _ in path.window_looks]
     same_looks(moments, path)
     assert (path.decision.outcome, moments[-1].decision.outcome) == ("absent", "absent")
@@ -274,7 +275,7 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
 
 def test_looks_are_forgotten_by_the_seconds_that_passed(agent, picture):
     """A twin keeps the date of each look; the overview is kept until there is a new one."""
-    live, dates, now = agent.episode(rate=math.log(2) / 4.5), {}, 0.0
+    live, dates, now = agent.stream(settings=StreamSettings(rate=math.log(2) / 4.5), follows=False), {}, 0.0
     for passed in (1, 1, 1, 1, 3, 0.5, 6, 1, 1, 1):
         moment = live.step(picture, passed)
         now += passed
@@ -296,8 +297,8 @@ def test_objects_that_move_or_leave_are_forgotten(agent):
         image[0, 320:352, x : x + 32] = 1
         return image
 
-    live = agent.episode(rate=1)
-    kept = agent.episode(rate=0)
+    live = agent.stream(settings=StreamSettings(rate=1), follows=False)
+    kept = agent.stream(settings=StreamSettings(rate=0), follows=False)
     for x in [160] * 24 + [800] * 20:
         moment, old = live.step(frame(x)), kept.step(frame(x))
         if x == 160:
@@ -311,7 +312,7 @@ def test_objects_that_move_or_leave_are_forgotten(agent):
 
 def test_a_found_target_is_lost_when_it_leaves(detector, picture):
     agent = ZoomAgent(WindowEye(detector), evidence())
-    live = agent.episode(1, rate=2.5)
+    live = agent.stream(1, (), StreamSettings(rate=2.5), follows=False)
     found = [live.step(picture).decision.outcome for _ in range(12)]
     gone = [live.step(torch.zeros_like(picture)).decision for _ in range(20)]
     assert "found" in found

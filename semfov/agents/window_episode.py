@@ -1,0 +1,564 @@
+"""Episodes of looks at windows: of a picture, of the frames of a stream, or at windows that are given.
+
+`WindowTask` says what is looked for, and with what. `WindowSession` looks at the windows of one source: it chooses
+them, makes closer looks, decides, and merges objects. Three short drivers stand on it: `WindowEpisode` looks at a
+picture, whose record is a `ZoomPath`; `WindowStream` has the looks that count at the present frame, a `WindowMoment`;
+and `GivenWindows` looks where it is asked to.
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
+from math import isfinite
+from typing import Any
+
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, no_frame_yet
+from semfov.belief.prior import Prior
+from semfov.data.inputs import Color, ImageLike
+from semfov.data.large import open_large
+from semfov.data.windowed import LargePicture
+from semfov.decision import CloseUp, Decision
+from semfov.detection import LEAST, Detections, Objects
+from semfov.episode import Forgetting
+from semfov.errors import InputError, check
+from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
+from semfov.paths import Ending, WindowMoment, ZoomPath
+from semfov.paths.stimulus import reduced_copy
+from semfov.paths.windows import LookAtWindow, look_at_window
+from semfov.settings import DecisionSettings
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.blank import blank_cells
+from semfov.zoom.carrying import inside_frame
+from semfov.zoom.certainty import SPREAD
+from semfov.zoom.closer import USUAL_WINDOW, closer_window, look_closely
+from semfov.zoom.decision import DecisionsByScore, WindowDecisions, decisions_of
+from semfov.zoom.episode import KeptLook, WindowStep, find_everything, look_by_look, search_windows
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye, WindowView
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
+from semfov.zoom.objects import merge, probable_objects
+from semfov.zoom.slices import ranked, usual_slices
+
+PASSES = 24  # default for the largest number of passes of the detector
+LIKELY = 0.5  # default for the least probability of the objects that a record counts
+NEW_OBJECTS = 0.01  # default for the least number of new objects that a look must be expected to find
+
+
+@dataclass(frozen=True)
+class WindowTask:
+    """What windows are looked at for, and with what.
+
+    Attributes:
+        goal: what is looked for.
+        evidence: predicts from a look what closer looks will find; None looks at slices in the order of the overview's
+            scores, and then nothing is `absent`.
+        decisions: settings of the decision of a search.
+        worth: an exploration ends when no look is expected to find more new objects than this. In a photograph, and
+            without evidence, all slices are looked at, and it means nothing.
+        batch: number of windows that are chosen jointly and pass the detector together; in a photograph one.
+        least: probability, without evidence score, from which on objects count; None for the usual one.
+        detector: name of the detector; None if it is not known.
+    """
+
+    goal: Goal
+    evidence: GlimpseEvidence | None = None
+    decisions: DecisionSettings = field(default_factory=DecisionSettings)
+    worth: float = NEW_OBJECTS
+    batch: int = 1
+    least: float | None = None
+    detector: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.evidence is None and self.goal.searches:
+            Prior.of(self.decisions.prior, None, 0)  # without evidence there is no probability
+
+    def takes_slices(self, lattice: Lattice) -> bool:
+        """Whether a picture is looked at by slices, in the order of the overview's scores: not chosen by a belief."""
+        return self.evidence is None or (lattice.levels == 1 and not self.goal.searches)
+
+
+class WindowSession:
+    """Looks at the windows of one source: a picture, or a scene that a camera shows frame by frame.
+
+    Invariant: `step` is the last look that was no closer look, None before the first one. All numbers are those after
+    the last look, and all places are where they lie in the present frame.
+
+    Args:
+        task: what is looked for.
+        source: the source of looks.
+        limits: where the episode ends; they have its clock.
+        forgetting: how evidence fades in a stream; None for a picture.
+        steps: the looks as they are made; None chooses windows by the task.
+
+    Attributes:
+        decisions: what is decided after each look.
+        passes: number of passes of the detector so far.
+        newest: the last look of any kind; None before the first one.
+        follows: whether the camera is followed, so that objects may lie beyond the frame.
+    """
+
+    def __init__(
+        self,
+        task: WindowTask,
+        source: WindowLooks,
+        limits: EpisodeLimits,
+        forgetting: Forgetting | None = None,
+        steps: Iterator[WindowStep[Any]] | None = None,
+    ) -> None:
+        evidence = task.evidence
+        self.task = task
+        self.source = source
+        self.limits = limits
+        self.forgetting = forgetting
+        self.decisions = WindowDecisions()
+        self.passes = 0
+        self.newest: KeptLook | None = None
+        self.step: WindowStep[Any] | None = None
+        self.follows = False
+        photograph = None if evidence is None else evidence.photograph
+        self._close_window = USUAL_WINDOW if photograph is None else photograph.window
+        self._certainty = None if evidence is None else evidence.certainty_in(source.lattice)
+        self._closer_looks: list[KeptLook] = []  # those that count
+        self._steps = self._chosen_steps() if steps is None else steps
+
+    @property
+    def _stands_still(self) -> bool:
+        """Whether nothing is forgotten, as in a picture."""
+        return self.forgetting is None or self.forgetting.rate == 0
+
+    def _chosen_steps(self) -> Iterator[WindowStep[Any]]:
+        """Choose by the task how windows are chosen, and what decides; returns the looks as they are made."""
+        task, source = self.task, self.source
+        goal, evidence = task.goal, task.evidence
+        if isinstance(source, LiveWindowLooks) and self._stands_still and source.lattice.levels > 1:
+            source.blank = cache(partial(blank_cells, source.view.picture, source.lattice))
+        if goal.searches and goal.target is not None and evidence is None:
+            self.decisions = DecisionsByScore(goal.target, task.decisions.confirm)
+        if evidence is None or task.takes_slices(source.lattice):
+            order = ranked(usual_slices(source.lattice, source.blank()), goal.sought)
+            return look_by_look(
+                source,
+                order,
+                None,
+                forgetting=self.forgetting,
+                guess=lambda looks, done, _: next(iter(order(looks, done)), None),
+            )
+        if goal.searches and goal.target is not None:
+            belief = ZoomBelief(source.lattice, evidence, goal.target, source.blank)
+            self.decisions = decisions_of(belief, self._close_up, task.decisions, self.forgetting)
+            return search_windows(source, belief, forgetting=self.forgetting)
+        return find_everything(
+            source, evidence, goal.target, batch=task.batch, worth=task.worth, forgetting=self.forgetting
+        )
+
+    def look(self) -> KeptLook | None:
+        """Look at the next window, or closely at a place that seems to hold the target; None if no window is left."""
+        if self.decisions.candidate is not None:
+            self.decisions.look()
+            return self.newest
+        step = next(self._steps, None)
+        if step is None:
+            return None
+        self.step = step
+        self._number(step.newest)
+        if self.forgetting is not None:
+            oldest = self.source.time - self.forgetting.span
+            self._closer_looks = [look for look in self._closer_looks if look.time >= oldest]
+        self.decisions.see(step, self.passes, self.limits.room(self.passes))
+        return step.newest
+
+    def _close_up(self, box: Tensor) -> Detections:
+        """Spend a pass on a closer look at the box `(4,)` of the candidate."""
+        candidate = self.decisions.candidate
+        assert candidate is not None
+        look = KeptLook(look_closely(self.source, box, self._close_window), self.source.time, candidate.probability)
+        self._number(look)
+        self._closer_looks.append(look)
+        return look.original.candidates
+
+    def _number(self, look: KeptLook) -> None:
+        """Give the newest look the number of its pass and the time at its end."""
+        look.number = self.passes
+        look.seconds = self.limits.elapsed()
+        self.newest = look
+        self.passes += 1
+
+    def follow(self, motion: Motion | None) -> None:
+        """Carry closer looks along with the camera, or drop them where a frame fits none before."""
+        if motion is None:
+            self._closer_looks = []
+        else:
+            for look in self._closer_looks:
+                look.carry(motion, self.source.lattice)
+        self.decisions.follow(motion)
+
+    @property
+    def next_window(self) -> Window:
+        """The window of the next look; there must have been one look."""
+        candidate = self.decisions.candidate
+        if candidate is not None:
+            return closer_window(self.source.lattice, candidate.box, self._close_window)
+        assert self.step is not None
+        return self.step.choices[0][0]
+
+    @property
+    def belief(self) -> ZoomBelief | None:
+        """The belief after the last look; None without evidence, and before the first look."""
+        return None if self.step is None else self.step.belief
+
+    @property
+    def kept_looks(self) -> list[KeptLook]:
+        """The looks that count, in their order."""
+        chosen = () if self.step is None else self.step.kept_looks
+        return sorted([*chosen, *self._closer_looks], key=lambda look: look.number)
+
+    def record_fields(self, looks: Sequence[LookAtWindow]) -> dict[str, Any]:
+        """Collect what the record of a picture and that of a frame have alike.
+
+        Args:
+            looks: the looks that count, in the order of `kept_looks`.
+        """
+        task = self.task
+        places = {look.number: place for place, look in enumerate(self.kept_looks)}
+        objects, unseen = self._objects([look.shown for look in looks])
+        return {
+            "lattice": self.source.lattice,
+            "classes": task.goal.classes,
+            "target": task.goal.target,
+            "targets": task.goal.targets,
+            "looks": tuple(looks),
+            "candidates": objects,
+            "unseen": unseen,
+            "spread": SPREAD if self._certainty is None else self._certainty.spread,
+            "least": self._least,
+            "detector": task.detector,
+            "closer": _renumbered(self.decisions.looks, places),
+        }
+
+    @property
+    def _least(self) -> float:
+        """Probability, or score, from which on objects count."""
+        usual = LEAST if self._certainty is None else LIKELY
+        return usual if self.task.least is None else self.task.least
+
+    def _objects(self, looks: Sequence[WindowLook]) -> tuple[Objects, tuple[float, float] | None]:
+        """Merge the objects of looks; also the mean and the variance of how many more there are, if that is known."""
+        goal, lattice = self.task.goal, self.source.lattice
+        fades = not self._stands_still
+        current = _without_replaced(looks, lattice) if fades else looks
+        sought = goal.targets or goal.target
+        unseen = None
+        if self._certainty is None:
+            objects = merge(current, sought)
+        else:
+            objects, unseen = probable_objects(
+                current,
+                lattice,
+                sought,
+                self._certainty,
+                remaining=self._remaining(),
+                promised=self._promised(),
+                latest=fades,
+            )
+        if self.follows:
+            objects = objects[inside_frame(objects.boxes, lattice.size)]
+        return objects, unseen
+
+    def _remaining(self) -> tuple[float, float]:
+        """Ask the belief what further looks find; nothing in a search, and for several classes."""
+        # A belief about objects of any class says nothing about those of several.
+        if self.task.goal.searches or self.task.goal.targets or self.belief is None:
+            return 0.0, 0.0
+        return self.belief.remaining()
+
+    def _promised(self) -> float:
+        """Sum the values that looks after the overview were chosen for."""
+        chosen = () if self.step is None else self.step.kept_looks
+        return sum(look.value for look in chosen[1:] if isfinite(look.value))
+
+
+class WindowEpisode(PictureEpisode[ZoomPath]):
+    """Looks at windows of a picture.
+
+    A search decides by closer looks (`semfov.decision.Verifier`), or without them by the probability of the picture and
+    a detection that shows the target (`semfov.decision.settle`). Without evidence slices are looked at in the order of
+    the overview's scores, and nothing is `absent`.
+
+    Args:
+        task: what is looked for.
+        source: looks at the picture.
+        limits: where the episode ends, unless it decides before.
+    """
+
+    def __init__(self, task: WindowTask, source: WindowLooks, limits: EpisodeLimits | None = None) -> None:
+        super().__init__(task.goal, limits)
+        self.source = source
+        self.session = WindowSession(task, source, self.limits)
+        # The choice after the overview asks for the first, and the record at the end for the second.
+        source.meanwhile = lambda: (source.blank(), self._photograph)
+        self._looks: list[LookAtWindow] = []
+        self._concluded: Decision | None = None
+
+    @property
+    def looks(self) -> tuple[LookAtWindow, ...]:
+        return tuple(self._looks)
+
+    @property
+    def criterion(self) -> str | None:
+        return self.session.decisions.criterion
+
+    @property
+    def decision(self) -> Decision | None:
+        return self._concluded or self.session.decisions.decision
+
+    @torch.inference_mode()
+    def look(self) -> LookAtWindow | None:
+        """Look at the next window, or closely at a place that seems to hold the target."""
+        look = self.session.look()
+        if look is None:
+            return None
+        made = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
+        self._looks.append(made)
+        decisions = self.session.decisions
+        if decisions.outcome and decisions.candidate is None:
+            self.ending = decisions.ending
+        return made
+
+    def _end(self, limit: Ending | None) -> None:
+        decisions = self.session.decisions
+        self._concluded = decisions.conclude()
+        is_sliced = self.session.task.takes_slices(self.source.lattice)
+        usual: Ending = "windows" if self.goal.searches or is_sliced else "worth"
+        is_found = self._concluded is not None and self._concluded.outcome == "found"
+        self.ending = decisions.ending if is_found or decisions.outcome else limit or usual
+
+    def record(self) -> ZoomPath:
+        picture = self.source.view.picture if isinstance(self.source, LiveWindowLooks) else None
+        path = None if picture is None else picture.path
+        return ZoomPath(
+            **self.session.record_fields(self._looks),
+            decision=self.decision,
+            photograph=self._photograph,
+            source=None if path is None else str(path),
+            shown=None if picture is None else picture.shown,
+            ending=self.ending,
+        )
+
+    @cached_property
+    def _photograph(self) -> Tensor | None:
+        """A reduced copy of the picture; None for stored looks."""
+        return reduced_copy(self.source.view.picture) if isinstance(self.source, LiveWindowLooks) else None
+
+
+class GivenWindows(PictureEpisode[ZoomPath]):
+    """Looks at the windows that are given, the first of which is the overview; nothing is decided.
+
+    Args:
+        goal: what is looked for.
+        evidence: evidence for the belief; None for no belief.
+        source: looks at the picture.
+    """
+
+    def __init__(self, goal: Goal, evidence: GlimpseEvidence | None, source: WindowLooks) -> None:
+        super().__init__(replace(goal, searches=False))
+        self.source = source
+        self._next = Window.overview(source.lattice)
+        belief: Any = None if evidence is None else ZoomBelief(source.lattice, evidence, goal.target or 0)
+        steps = look_by_look(source, lambda looks, windows: [(self._next, 0.0)], belief)
+        self.session = WindowSession(WindowTask(self.goal, evidence), source, self.limits, steps=steps)
+        self._looks: list[LookAtWindow] = []
+
+    @property
+    def looks(self) -> tuple[LookAtWindow, ...]:
+        return tuple(self._looks)
+
+    @property
+    def criterion(self) -> str | None:
+        return None
+
+    @property
+    def decision(self) -> Decision | None:
+        return None
+
+    @torch.inference_mode()
+    def look(self, window: Window | None = None) -> LookAtWindow:
+        """Look at a window; None for the overview, and for the window of the look before."""
+        self._next = window or self._next
+        look = self.session.look()
+        assert look is not None
+        made = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
+        self._looks.append(made)
+        return made
+
+    def _end(self, limit: Ending | None) -> None:
+        self.ending = limit
+
+    def record(self) -> ZoomPath:
+        return ZoomPath(**self.session.record_fields(self._looks), ending=self.ending)
+
+
+class WindowStream(StreamEpisode[WindowMoment]):
+    r"""Looks at windows of the frames of a stream, one for each frame.
+
+    A look counts for :math:`\ln 2 / r` seconds, with the rate r, or until the next look at the same window
+    (`semfov.zoom.episode.look_by_look`), and what a later look has shown as closely replaces what earlier ones did.
+    What looks showed is carried along with a camera that moves. With rate 0 frames of a still picture give the looks
+    and the objects of an episode of the picture up to its end.
+
+    Args:
+        task: what is looked for.
+        eye: resamples a window and detects in it.
+        rate: rate at which looks are forgotten, per second.
+        color: order of the channels of frames that are arrays or tensors.
+        follows: whether the camera's motion is estimated from the frames, where no poses are given.
+    """
+
+    def __init__(
+        self, task: WindowTask, eye: WindowEye, rate: float, *, color: Color = "rgb", follows: bool = False
+    ) -> None:
+        super().__init__(task.goal, rate)
+        self.task = task
+        self.eye = eye
+        self.color = color
+        self._limits = EpisodeLimits()
+        self._camera = _Camera(follows=follows)
+        self._session: WindowSession | None = None  # from the first frame on
+        self._moment: WindowMoment | None = None
+        self._is_lost = False  # whether the present frame fits none before it
+
+    @property
+    def looks(self) -> tuple[LookAtWindow, ...]:
+        """The looks that count at the present frame, where they lie in it."""
+        return () if self._moment is None else self._moment.looks
+
+    @property
+    def criterion(self) -> str | None:
+        """What a search needs for the decision `found`, in words, after the first frame."""
+        return None if self._session is None else self._session.decisions.criterion
+
+    @property
+    def decision(self) -> Decision | None:
+        return None if self._moment is None else self._moment.decision
+
+    def moment(self) -> WindowMoment:
+        if self._moment is None:
+            raise no_frame_yet()
+        return self._moment
+
+    def _look_at(self, frame: ImageLike | LargePicture, passed: float, pose: Motion | ArrayLike | None) -> None:
+        view = self.eye.open(open_large(frame, color=self.color))
+        self._check_size(view.picture.size)
+        session = self._session
+        if session is None:
+            source = LiveWindowLooks(self.eye, view)
+            session = self._session = WindowSession(self.task, source, self._limits, self.forgetting)
+        self._follow(session, view, passed, pose)
+        session.decisions.wait(passed)
+        session.look()
+        self._passes += 1
+        self._moment = self._made(session, view)
+
+    def _follow(self, session: WindowSession, view: WindowView, passed: float, pose: Motion | ArrayLike | None) -> None:
+        """Show the next frame, and carry what is known along with the camera."""
+        assert isinstance(session.source, LiveWindowLooks)
+        camera = self._camera.step(view, pose)
+        session.follows = self._camera.is_followed
+        if camera is None or session.newest is None:
+            session.source.show(view, passed)
+            return
+        session.source.show(view, passed, camera)
+        self._is_lost = camera.motion is None and camera.recovered is None
+        if not camera.is_still:
+            session.follow(camera.motion)
+
+    def _made(self, session: WindowSession, view: WindowView) -> WindowMoment:
+        """Make the record of the present frame, after its look."""
+        lattice = session.source.lattice
+        looks = [
+            look_at_window(look.current, lattice, number, look.seconds, look.value)
+            for number, look in enumerate(session.kept_looks)
+        ]
+        return WindowMoment(
+            **session.record_fields(looks),
+            decision=session.decisions.decision,
+            photograph=reduced_copy(view.picture),
+            number=self.passes - 1,
+            lost=self._is_lost,
+            next_window=session.next_window,
+        )
+
+
+class _Camera:
+    """How the camera moves between frames: by the poses that are given, or estimated from the frames.
+
+    Attributes:
+        is_followed: whether its motion is known at all.
+    """
+
+    def __init__(self, *, follows: bool) -> None:
+        self._estimate = _camera_motion() if follows else None
+        self._poses: KnownPoses | None = None  # once poses are given
+        self._is_first = True  # whether no frame was seen
+
+    @property
+    def is_followed(self) -> bool:
+        return self._estimate is not None or self._poses is not None
+
+    def step(self, view: WindowView, pose: Motion | ArrayLike | None) -> CameraStep | None:
+        """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
+        has_poses = self._poses is not None
+        check(self._is_first or (pose is not None) == has_poses, "pose", "a pose of each frame, or of none", pose)
+        self._is_first = False
+        if pose is not None:
+            self._poses = self._poses or KnownPoses()
+            return self._poses.step(pose)
+        if self._estimate is None:
+            return None
+        width, height = view.picture.size
+        return self._estimate.step(view.picture.pixels((0, 0, width, height)))
+
+
+def _camera_motion() -> CameraMotion | None:
+    """Make what follows a camera that moves; without OpenCV a warning, and the camera is taken to stand still."""
+    try:
+        return CameraMotion()
+    except InputError as error:
+        warnings.warn(f"the camera is taken to stand still, unless poses are given: {error}", stacklevel=2)
+        return None
+
+
+def _renumbered(closer: Sequence[CloseUp], places: Mapping[int, int]) -> tuple[CloseUp, ...]:
+    """Give the closer looks that count the places of their looks in the record as numbers."""
+    counting = [look for look in closer if look.number is not None and look.number in places]
+    return tuple(replace(look, number=places[look.number]) for look in counting if look.number is not None)
+
+
+def _without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[WindowLook]:
+    """Drop detections whose surroundings a later look showed at the same or a higher magnification.
+
+    Args:
+        looks: the looks at a stream, in their order.
+        lattice: lattice of the frames.
+
+    Returns:
+        The looks with the detections that remain.
+    """
+    current = []
+    for number, look in enumerate(looks):
+        remain = look.detections.mask[0]
+        low, high = look.detections.boxes[0].split(2, -1)
+        margin = (high - low) / 2
+        low = (low - margin).clamp(min=0)
+        high = (high + margin).minimum(low.new_tensor(lattice.size))
+        for later in looks[number + 1 :]:
+            if later.window.fixation[2] >= look.window.fixation[2]:
+                first, last = low.new_tensor(later.window.region(lattice)).split(2)
+                remain = remain & ~((low >= first) & (high <= last)).all(-1)
+        current.append(replace(look, detections=look.detections.take(remain), cut=look.cut[remain]))
+    return current

@@ -1,0 +1,134 @@
+"""The looks and beliefs of one episode of a fovea, from which its scanpath is made at any time."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from semfov.belief import Belief, Grid
+from semfov.belief.observers.base import Observer
+from semfov.detection.detections import Detections
+from semfov.detection.objects import LEAST
+from semfov.episode import Step
+from semfov.paths.fovea import FoveaLook, FoveaLooks
+from semfov.paths.scanpath import Scanpath
+
+
+class _Fixated(NamedTuple):
+    """What a trace keeps of a fixation, a batch of one: what it showed, and the belief after it."""
+
+    cell: Tensor
+    fixation: Tensor
+    detections: Detections
+    belief: Belief
+    values: Tensor
+
+
+class Trace:
+    """Keeps the looks of one episode of a fovea, and makes scanpaths of them at any time.
+
+    Args:
+        grid: the cells.
+        classes: names of the classes, background first.
+        target: class 1..K that is searched for; None for an exploration.
+        beside: observer of the map of all classes beside the belief of a search; None if the belief is that map.
+        least: score from which on objects count.
+    """
+
+    def __init__(
+        self, grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None, least: float = LEAST
+    ) -> None:
+        self.grid = grid
+        self.classes = classes
+        self.target = target
+        self.beside = beside
+        self.least = least
+        self._made = FoveaLooks(grid)
+        self._fixated: list[_Fixated] = []
+        self._posterior: list[Tensor] = []  # of the target in each cell, after each fixation
+        self._presence: list[Tensor] = []
+        self._maps: list[Tensor] = []  # of all classes, made when they are read for the first time
+        self._belief: Belief | None = None  # the belief of the last map, where one is kept beside the search
+        self._modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    @property
+    def looks(self) -> tuple[FoveaLook, ...]:
+        """The looks so far."""
+        return tuple(self._made.looks)
+
+    def add(self, step: Step) -> FoveaLook:
+        """Add the fixation of a step."""
+        return self.fixate(step.cell, step.fixation, step.detections, step.belief, step.values, step.seconds)
+
+    def fixate(
+        self,
+        cell: Tensor,
+        fixation: Tensor,
+        detections: Detections,
+        belief: Belief,
+        values: Tensor,
+        stages: Mapping[str, float],
+    ) -> FoveaLook:
+        """Add a fixation.
+
+        Args:
+            cell: `(1,)`, the fixated cell.
+            fixation: `(1, 2)`, the fixated point.
+            detections: what it shows, a batch of one.
+            belief: the belief after it, a batch of one.
+            values: `(1, X·Y)`, values of the acquisition function after it.
+            stages: seconds by stage; empty if they are not known.
+
+        Returns:
+            The look.
+        """
+        number = int(cell)
+        value = float(self._fixated[-1].values[0, number]) if self._fixated else None
+        probability, presence = None, None
+        if self.target is not None:
+            probability = belief.probability(self.target)[0]
+            self._posterior.append(probability)
+            self._presence.append(belief.presence(self.target)[0])
+            presence = float(self._presence[-1])
+        self._fixated.append(_Fixated(cell, fixation, detections, belief, values))
+        return self._made.fixate(number, fixation[0].tolist(), detections, stages, value, probability, presence)
+
+    def look_closely(
+        self, cell: int, region: Sequence[float], detections: Detections, stages: Mapping[str, float], value: float
+    ) -> FoveaLook:
+        """Add a closer look (`FoveaLooks.look_closely`)."""
+        return self._made.look_closely(cell, region, detections, stages, value)
+
+    def scanpath(self, **outcome: Any) -> Scanpath:
+        """Make the scanpath of the looks so far. Its map of all classes is made when it is read."""
+        count = len(self._fixated)
+        like = torch.zeros(0, len(self.grid))
+        fields = {
+            "grid": self.grid,
+            "classes": self.classes,
+            "target": self.target,
+            "least": self.least,
+            "looks": self.looks,
+            "probabilities": partial(self._probabilities, count),
+            "values": torch.stack([kept.values[0] for kept in self._fixated]) if count else like,
+            "found": False,
+        }
+        if self.target is not None:
+            fields["posterior"] = torch.stack(self._posterior) if count else like
+            fields["presence"] = torch.stack(self._presence) if count else torch.zeros(0)
+        return Scanpath(**{**fields, **outcome})
+
+    def _probabilities(self, count: int) -> Tensor:
+        """Make the map of all classes after each of the first fixations, `(count, X·Y, K+1)`."""
+        gradients, inference = self._modes
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+            for kept in self._fixated[len(self._maps) : count]:
+                if self.beside is not None:
+                    before = self._belief or self.beside.start(1, self.grid, kept.values)
+                    self._belief = self.beside(before, kept.detections, kept.fixation, self.grid)
+                self._maps.append((self._belief or kept.belief).class_probabilities()[0])
+            if not count:
+                return torch.zeros(0, len(self.grid), len(self.classes))
+            return torch.stack(self._maps[:count])
