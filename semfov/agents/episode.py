@@ -233,19 +233,8 @@ def no_frame_yet() -> InputError:
     return InputError("moment: expected a frame before it, got none; call step with a frame first")
 
 
-def only_for(kind: str, suits: str, instead: str, **arguments: object) -> None:
-    """Raise `InputError` for arguments that suit another kind of look."""
-    by = {"fovea": "a fovea", "windows": "windows", "head": "a head that turns"}[kind]
-    for name, value in arguments.items():
-        if value is not None and kind != suits:
-            raise InputError(
-                f"{name}: expected none for a picture that is looked at by {by}, got {value}; use {instead}, or "
-                f"how={suits!r}"
-            )
-
-
 def without_none(**values: Any) -> dict[str, Any]:
-    """The arguments that are not None."""
+    """Select the arguments that are not None."""
     return {name: value for name, value in values.items() if value is not None}
 
 
