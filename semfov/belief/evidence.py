@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from semfov.belief.look_features import LOOK_FEATURES, nothing_seen
 from semfov.io.pretrained import PretrainedForEye
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 
 READOUT = 14  # number of inputs that describe a cell after several looks
 

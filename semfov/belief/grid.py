@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, check_whole, lookup
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 
 Footprint = Literal["overlap", "centre", "box_centre", "soft"]
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 
 STRIDES = (8, 16, 32, 64)
 """Strides of the levels in canvas pixels; heads have the first three of them, or all."""

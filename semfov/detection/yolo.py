@@ -12,7 +12,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import choose_layers, record_maps
 from semfov.detection.scores import HALVES, Candidates
 from semfov.errors import check
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 
 Runtime = Literal["auto", "torch", "onnxruntime"]
 

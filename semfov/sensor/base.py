@@ -207,13 +207,25 @@ def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, emp
     return whole.reshape(batch, many, *whole.shape[1:])
 
 
-def fixations(gaze: Tensor, like: Tensor) -> tuple[Tensor, bool]:
-    """Fixations `(2,)`, `(B, 2)` or `(B, G, 2)` as positions `(B, G, 2)` beside the images, and whether they had G."""
+def fixations(gaze: Tensor, like: Tensor) -> Tensor:
+    """Bring fixations to one shape, beside the images.
+
+    Args:
+        gaze: `(2,)` for all images, `(B, 2)` for one fixation of each, or `(B, G, 2)` for G of each.
+        like: the images `(B, ...)`.
+
+    Returns:
+        Positions `(B, G, 2)`, with G = 1 for the first two shapes.
+
+    Raises:
+        InputError: the shape is another one, or a number is not finite.
+    """
     batch = like.shape[0]
-    fits = 1 <= gaze.ndim <= 3 and gaze.shape[-1] == 2 and gaze.shape[0] == (2 if gaze.ndim == 1 else batch)
-    check(fits, "gaze", f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)", tuple(gaze.shape))
+    for_all = gaze.shape == (2,)
+    for_each = gaze.ndim in (2, 3) and gaze.shape[0] == batch and gaze.shape[-1] == 2
+    expected = f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)"
+    check(for_all or for_each, "gaze", expected, tuple(gaze.shape))
     if values_known(gaze):
         check_finite(gaze, "gaze")
-    many = gaze.ndim == 3
     points = as_positions(gaze, like)
-    return (points if many else points.expand(batch, 2)[:, None]), many
+    return points if points.ndim == 3 else points.expand(batch, 2)[:, None]

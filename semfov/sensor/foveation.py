@@ -1,6 +1,12 @@
-"""The foveal sensor: an image that is sharp around a fixation and gets coarser away from it."""
+"""The foveal sensor: an image that is sharp around a fixation and gets coarser away from it.
 
-from collections.abc import Mapping
+`foveate` is a Laplacian pyramid (`semfov.sensor.pyramid`) whose bands are weighted with the windows of a fovea
+(`semfov.sensor.fovea`) and put together again (`_reconstruct`). On a CPU, where no gradient and no graph is recorded,
+the same views are made in blocks that stay in the processor's cache (`_foveate_in_blocks`), and those of one fixation
+of a large image without its finest band (`_foveate_large`).
+"""
+
+from collections.abc import Iterator, Mapping
 from numbers import Real
 from typing import Any, get_args
 
@@ -8,15 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points, as_positions
+from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points
 from semfov.errors import check, lookup, values_known
-from semfov.sensor.base import Sensor, fixations
-from semfov.sensor.lines import constant, difference, empty
+from semfov.sensor.base import Sensor
+from semfov.sensor.fovea import Fovea, Window
+from semfov.sensor.lines import difference, empty
 from semfov.sensor.pyramid import Bands, Convention, expand, expanding, laplacian_pyramid, reduce, widened
 from semfov.threads import one_thread_if_small
 
-# Elements of the views that are made together on a CPU; those of many views leave the processor's cache.
-_TOGETHER = 1 << 21
+# Elements of the views of a block on a CPU; those of many views leave the processor's cache.
+_BLOCK = 1 << 21
 _LARGE = 360  # pixels of the shorter side from which on the finest band is not computed for one fixation
 
 
@@ -73,46 +80,166 @@ def foveate(
     >>> foveate(image[0], (32, 24), sigma=10.0).shape
     torch.Size([3, 48, 64])
     """
-    gaze = as_points(gaze)
-    if not (isinstance(image, Bands) or (isinstance(image, Tensor | np.ndarray) and image.ndim > 3)):
-        points = gaze[None] if gaze.ndim == 2 else gaze
+    points = as_points(gaze)
+    if _is_single_picture(image):
         bands = laplacian_pyramid(as_images(image), levels, convention)
-        return foveate(bands, points, sigma=sigma, growth=growth)[0]
-    source = image if isinstance(image, Bands) else as_batch(image)
-    like = source.base if isinstance(source, Bands) else source
-    fixation, many = fixations(gaze, like)
-    for name, value in (("sigma", sigma), ("growth", growth)):
-        known = not isinstance(value, Tensor) or values_known(value)
-        if known and not (value > 0 if isinstance(value, Real) else bool((torch.as_tensor(value) > 0).all())):
-            check(False, name, "a positive number", value.tolist() if isinstance(value, Tensor) else value)
-    widths, (batch, number) = _widths(sigma, like), fixation.shape[:2]
-    size = source.shape if isinstance(source, Bands) else tuple(source.shape[-2:])
-    details = source.details if isinstance(source, Bands) else ()
-    tensors = [each for each in (*details, like, fixation, widths, growth) if isinstance(each, Tensor)]
-    recorded = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
-    plain = like.device.type == "cpu" and not recorded and values_known(*tensors)
-    whole = plain and number == 1 and levels > 0 and min(size) >= _LARGE
-    step = max(1, _TOGETHER // max(1, like.shape[1] * size[0] * size[1]))
+        row = points[None] if points.ndim == 2 else points
+        return foveate(bands, row, sigma=sigma, growth=growth)[0]
+    images = image if isinstance(image, Bands) else as_batch(image)
+    like = images.base if isinstance(images, Bands) else images
+    fovea = Fovea.at(points, sigma, growth, like)
+    if _blocks_pay(images, fovea, levels):
+        views = _foveate_in_blocks(images, fovea, levels, convention)
+    else:
+        views = _reconstruct(_bands(images, levels, convention), fovea).to(like.dtype)
+    return views if points.ndim == 3 else views[:, 0]
 
-    def pyramid(some: slice) -> tuple[Bands, Tensor | None]:
-        if isinstance(source, Bands):
-            return Bands(tuple(band[some] for band in source.details), source.base[some], source.convention), None
-        if not whole:
-            return laplacian_pyramid(source[some], levels, convention), None
-        image = widened(source[some])
-        half = reduce(image, convention)
-        rest = laplacian_pyramid(half, levels - 1, convention)
-        return Bands((image, *rest.details), rest.base, convention), half
 
-    if not plain or batch * number <= step:
-        views = _collapse(*pyramid(slice(None)), fixation, widths, growth).to(like.dtype)
-        return views if many else views[:, 0]
-    views = empty(like, batch, number, like.shape[1], *size)
-    for b in (slice(n, n + max(1, step // number)) for n in range(0, batch, max(1, step // number))):
-        own = pyramid(b)
-        for g in (slice(n, n + step) for n in range(0, number, step)):
-            _collapse(*own, fixation[b, g], widths[b], growth, views[b, g])
-    return views if many else views[:, 0]
+def _reconstruct(bands: Bands, fovea: Fovea, into: Tensor | None = None) -> Tensor:
+    r"""Put a pyramid together around fixations: :math:`R_K = G_K`, :math:`R_k = w_k L_k + \mathrm{expand}(R_{k+1})`.
+
+    Args:
+        bands: the bands `L_k` and the coarsest level `G_K` of B images.
+        fovea: G fixations in each image, and the widths of the windows `w_k`.
+        into: memory for the views, which may have another dtype.
+
+    Returns:
+        The views `R_0`, `(B, G, C, H, W)`; those of half precision in float32 on a CPU.
+    """
+    if not bands.details:
+        return bands.base[:, None].repeat(1, fovea.fixation.shape[1], 1, 1, 1)
+    bands = bands.widened()
+    windows = fovea.windows(bands.sizes, bands.convention, bands.base.dtype)
+    return _collapse(bands, windows, into)
+
+
+def _collapse(bands: Bands, windows: tuple[Window, ...], into: Tensor | None = None) -> Tensor:
+    """Add the bands times their windows, from the coarsest to the finest, as `_reconstruct` says."""
+    views = bands.base[:, None]  # all fixations share the coarsest level
+    for k in reversed(range(len(windows))):
+        expanded = _expand(views, bands.sizes[k], bands.convention)
+        views = _blend(expanded, windows[k].plane(), bands.details[k][:, None], into if k == 0 else None)
+    return views
+
+
+def _expand(views: Tensor, size: tuple[int, int], convention: Convention) -> Tensor:
+    """Enlarge views `(B, G, C, h, w)` to the `(height, width)` of the next finer band."""
+    return expand(views.flatten(0, 1), size, convention).unflatten(0, views.shape[:2])
+
+
+def _blend(views: Tensor, window: Tensor, band: Tensor, into: Tensor | None = None) -> Tensor:
+    """Compute `views + window · band` with as little new memory as possible.
+
+    Args:
+        views: `(B, G, C, h, w)`, or `(B, 1, C, h, w)` if the fixations share it; it may be written over.
+        window: weights `(B, G, 1, h, w)`.
+        band: `(B, 1, C, h, w)`.
+        into: memory for the result, of any dtype.
+
+    Returns:
+        `(B, G, C, h, w)`.
+    """
+    if into is not None and into.dtype == views.dtype:
+        return torch.addcmul(views, window, band, out=into)
+    # Writing over the views avoids allocating memory; a traced graph must not do it.
+    in_place = views.shape[1] == window.shape[1] and values_known(views, window, band)
+    blended = views.addcmul_(window, band) if in_place else views.addcmul(window, band)
+    return blended if into is None else into.copy_(blended)
+
+
+def _blocks_pay(images: Tensor | Bands, fovea: Fovea, levels: int) -> bool:
+    """Tell whether views can be written into memory block by block: on a CPU, without a gradient or a graph."""
+    tensors = fovea.tensors()
+    if isinstance(images, Bands):
+        tensors += [*images.details, images.base]
+        levels = len(images.details)
+    else:
+        tensors.append(images)
+    recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return levels > 0 and not recorded and fovea.sigma.device.type == "cpu" and values_known(*tensors)
+
+
+def _foveate_in_blocks(images: Tensor | Bands, fovea: Fovea, levels: int, convention: Convention) -> Tensor:
+    """Foveate images on a CPU so that the views which are made together stay in the processor's cache.
+
+    Args:
+        images: `(B, C, H, W)`, or their pyramid.
+        fovea: G fixations in each image.
+        levels: number of bands of images that are not split yet.
+        convention: convention of their pyramid.
+
+    Returns:
+        Views `(B, G, C, H, W)` with the dtype of the images.
+    """
+    like = images.base if isinstance(images, Bands) else images
+    height, width = images.shape if isinstance(images, Bands) else images.shape[-2:]
+    channels = like.shape[1]
+    batch, number = fovea.count
+    block = max(1, _BLOCK // max(1, channels * height * width))  # views that are made together
+    large = isinstance(images, Tensor) and number == 1 and min(height, width) >= _LARGE
+    if batch * number <= block:
+        if isinstance(images, Tensor) and large:
+            return _foveate_large(images, fovea, levels, convention).to(like.dtype)
+        return _reconstruct(_bands(images, levels, convention), fovea).to(like.dtype)
+    views = empty(like, batch, number, channels, height, width)
+    for rows in _slices(batch, max(1, block // number)):
+        if isinstance(images, Tensor) and large:
+            _foveate_large(images[rows], fovea[rows, :], levels, convention, views[rows])
+            continue
+        bands = _bands(images[rows], levels, convention)
+        for columns in _slices(number, block):
+            _reconstruct(bands, fovea[rows, columns], views[rows, columns])
+    return views
+
+
+def _foveate_large(
+    images: Tensor, fovea: Fovea, levels: int, convention: Convention, into: Tensor | None = None
+) -> Tensor:
+    r"""Foveate large images around one fixation each without their finest band, which no other fixation would share.
+
+    With :math:`L_0 = G_0 - \mathrm{expand}(G_1)`, the finest level is
+    :math:`R_0 = w_0 G_0 + (\mathrm{expand}(R_1) - w_0 \, \mathrm{expand}(G_1))`, the difference in one product.
+
+    Args:
+        images: `(B, C, H, W)` on a CPU.
+        fovea: one fixation in each image.
+        levels: number of bands, at least 1.
+        convention: convention of the pyramid.
+        into: memory for the views, which may have another dtype.
+
+    Returns:
+        Views `(B, 1, C, H, W)`; those of half precision in float32.
+    """
+    image = widened(images)
+    half = reduce(image, convention)
+    rest = laplacian_pyramid(half, levels - 1, convention)
+    size = (image.shape[-2], image.shape[-1])
+    finest, *coarser = fovea.windows((size, *rest.sizes), convention, image.dtype)
+    coarse = _collapse(rest, tuple(coarser))[:, 0]
+    lines = expanding(rest.shape, size, convention, half.dtype, half.device)
+    views = torch.empty_like(image, memory_format=torch.contiguous_format)
+    weights = zip(finest.rows.flatten(1), finest.columns.flatten(1), strict=True)
+    for coarse_planes, half_planes, weight, view in zip(coarse, half, weights, views, strict=True):
+        difference(coarse_planes, half_planes, *lines, weight, view)
+    return _blend(views[:, None], finest.plane(), image[:, None], into)
+
+
+def _slices(count: int, step: int) -> Iterator[slice]:
+    """Cut `count` rows into parts of at most `step`."""
+    for first in range(0, count, step):
+        yield slice(first, first + step)
+
+
+def _bands(images: Tensor | Bands, levels: int, convention: Convention) -> Bands:
+    """Split images into bands, unless they are split already."""
+    return images if isinstance(images, Bands) else laplacian_pyramid(images, levels, convention)
+
+
+def _is_single_picture(image: ImageLike | Bands) -> bool:
+    """Tell whether this is one picture of a common type, not a batch or its pyramid."""
+    if isinstance(image, Bands):
+        return False
+    return not isinstance(image, Tensor | np.ndarray) or image.ndim <= 3
 
 
 class Foveation(Sensor):
@@ -152,20 +279,20 @@ class Foveation(Sensor):
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        for name, value in (("sigma", sigma), ("growth", growth)):
-            got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else value
-            check(value.numel() == 1 if isinstance(value, Tensor) else isinstance(value, Real), name, "a number", got)
-            check(bool(value > 0), name, "a positive number", value)
+        _check_setting(sigma, "sigma")
+        _check_setting(growth, "growth")
         check(levels >= 0, "levels", "0 or more", levels)
         lookup(convention, get_args(Convention), "pyramid convention")
         self.levels = levels
         self.growth = growth
         self.convention: Convention = convention
-        given = isinstance(sigma, Tensor) and sigma.requires_grad
-        check(not (given and learnable), "learnable", "False for a sigma that is learned outside", learnable)
-        self.given_sigma = sigma if isinstance(sigma, Tensor) and given else None
-        log_sigma = None if given else torch.tensor(float(sigma)).log()
-        self.log_sigma = None if log_sigma is None else nn.Parameter(log_sigma, requires_grad=learnable)
+        if isinstance(sigma, Tensor) and sigma.requires_grad:
+            check(not learnable, "learnable", "False for a sigma that is learned outside", learnable)
+            self.given_sigma: Tensor | None = sigma
+            self.log_sigma: nn.Parameter | None = None
+        else:
+            self.given_sigma = None
+            self.log_sigma = nn.Parameter(torch.tensor(float(sigma)).log(), requires_grad=learnable)
 
     @property
     def sigma(self) -> Tensor:
@@ -230,90 +357,10 @@ class Foveation(Sensor):
         )
 
 
-def _collapse(
-    bands: Bands,
-    half: Tensor | None,
-    fixation: Tensor,
-    sigma: Tensor,
-    growth: float | Tensor,
-    out: Tensor | None = None,
-) -> Tensor:
-    r"""Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`, into `out` if it is given.
-
-    With G₁, `half`, the first detail is the image itself, for one fixation of each. Then
-    :math:`R_0 = w_0 G_0 + (\mathrm{expand}(R_1) - w_0 \mathrm{expand}(G_1))`, the difference in one product.
-    """
-    batch, many = fixation.shape[:2]
-    if not bands.details:
-        views = bands.base[:, None].repeat(1, many, 1, 1, 1)
-        return views if out is None else out.copy_(views)
-    bands = Bands(tuple(map(widened, bands.details)), widened(bands.base), bands.convention)
-    result, windows = bands.base, _windows(bands, fixation, sigma, growth)
-    in_place = values_known(result, windows[0][0])
-    for k, (band, (across, down)) in reversed([*enumerate(zip(bands.details, windows, strict=True))]):
-        window, detail = down[..., None] * across[..., None, :], band[:, None]
-        size = band.shape[-2], band.shape[-1]
-        if k == 0 and half is not None:
-            lines = expanding((half.shape[-2], half.shape[-1]), size, bands.convention, half.dtype, half.device)
-            weights = zip(down.flatten(1), across.flatten(1), strict=True)
-            views = torch.empty_like(detail, memory_format=torch.contiguous_format)
-            for one, other, weight, view in zip(result, half, weights, views, strict=True):
-                difference(one, other, *lines, weight, view[0])
-        else:
-            views = expand(result, size, bands.convention)
-            # All fixations share the coarsest level.
-            views = views[:, None] if result is bands.base else views.view(batch, many, *detail.shape[2:])
-        if k == 0 and out is not None and out.dtype == views.dtype:
-            return torch.addcmul(views, window, detail, out=out)
-        # In place where no graph is traced and the views exist, which avoids allocating memory.
-        fits = in_place and views.shape[1] == many
-        result = (views.addcmul_ if fits else views.addcmul)(window, detail).flatten(0, 1)
-    views = result.unflatten(0, (batch, many))
-    return views if out is None else out.copy_(views)
-
-
-def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Gaussian windows `(B, G, 1, w_k)` along x and `(B, G, 1, h_k)` along y for every band, from one exponential."""
-    sizes = tuple((band.shape[-2], band.shape[-1]) for band in bands.details)
-    place, power, axis, level = _layout(sizes, bands.convention, sigma.dtype, sigma.device)
-    least = torch.finfo(sigma.dtype).tiny  # a width that underflows to 0 would give 0 / 0 at the fixation
-    widths = (sigma[..., None] * (growth**power).clamp(min=least)).clamp(min=least).flatten(1)
-    offset = (place - fixation.index_select(-1, axis)) / widths.index_select(-1, level)[:, None]
-    weights = offset.square().mul(-0.5).exp().to(bands.base.dtype)[:, :, None]
-    pieces = weights.split([n for size in sizes for n in reversed(size)], -1)
-    return list(zip(pieces[0::2], pieces[1::2], strict=True))
-
-
-def _pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:
-    """Positions of the `count` pixels of band k along an image side of `length` pixels: `(count,)`, float64."""
-    place = torch.arange(count, dtype=torch.float64)
-    return place * 2**k if convention == "opencv" else (place + 0.5) * (length / count) - 0.5
-
-
-@constant
-def _layout(
-    sizes: tuple[tuple[int, int], ...], convention: Convention, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Positions of the pixels along x and y of every band, exponents of the growth, and indices of axes and widths."""
-    lines = [(axis, k) for k in range(len(sizes)) for axis in (0, 1)]
-    place = [_pixel_positions(sizes[k][1 - axis], sizes[0][1 - axis], k, convention) for axis, k in lines]
-    counts = torch.tensor([sizes[k][1 - axis] for axis, k in lines])
-    axes, levels = (torch.tensor(n).repeat_interleave(counts) for n in zip(*lines, strict=True))
-    power = torch.arange(len(sizes))
-    return (
-        torch.cat(place).to(device, dtype),
-        power.to(device, dtype),
-        axes.to(device),
-        (axes * len(sizes) + levels).to(device),
-    )
-
-
-def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
-    """σ along x and y for every image, `(B, 2)`."""
-    # A number that is filled in on a GPU is not waited for; one that is copied there is.
-    number = like.new_full((), float(sigma), dtype=torch.float64) if isinstance(sigma, Real) else torch.as_tensor(sigma)
-    width = as_positions(number, like)
-    batch = like.shape[0]
-    fits = width.ndim == 0 or (width.shape[0] in (1, batch) and width.shape[1:] in ((), (2,)))
-    check(fits, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", tuple(width.shape))
-    return (width[:, None] if width.ndim == 1 else width).expand(batch, 2)
+def _check_setting(value: float | Tensor, name: str) -> None:
+    """Raise `InputError` unless this is a positive number, or a tensor that holds one."""
+    if isinstance(value, Tensor):
+        check(value.numel() == 1, name, "a number", f"shape {tuple(value.shape)}")
+    else:
+        check(isinstance(value, Real), name, "a number", value)
+    check(bool(value > 0), name, "a positive number", value)

@@ -5,10 +5,8 @@ into tiles along the diagonal. On a CPU the products of the tiles are several ti
 channels. A product reads a transposed image equally fast, so two passes filter both axes without a copy.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, wraps
-from typing import Any, TypeVar, TypeVarTuple
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -26,28 +24,6 @@ _CACHED = 1 << 18
 # a block of this size was freed, it keeps up to twice as much.
 _KEPT = 31 << 20
 torch.empty(_KEPT, dtype=torch.uint8)
-
-_Constant = TypeVar("_Constant")
-_Settings = TypeVarTuple("_Settings")
-
-
-def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Settings], _Constant]:
-    """Cache the results of a function of sizes and settings; a graph that is compiled or traced computes its own."""
-
-    @lru_cache(maxsize=256)
-    def remember(*settings: Any) -> Any:
-        # A tensor that is made during inference must be usable with gradients later.
-        with torch.inference_mode(False), torch.no_grad():
-            return function(*settings)
-
-    @wraps(function)
-    def call(*settings: *_Settings) -> _Constant:
-        # Tensors that are made while a graph is traced are of a kind of their own.
-        if torch.compiler.is_compiling() or type(torch.empty(0)) is not Tensor:
-            return function(*settings)
-        return remember(*settings)
-
-    return call
 
 
 def empty(like: Tensor, *shape: int) -> Tensor:

@@ -11,10 +11,11 @@ from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
 from semfov.sensor.base import Sensor, fixations
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 from semfov.sensor.pyramid import gaussian_pyramid
 
 _Levels = tuple[Tensor, ...]  # a Gaussian pyramid, finest level first
+_Numbers = tuple[float, float, float, tuple[float, float]]  # fovea, spacing, pooling and scale of a retina
 _TALLEST = 30  # levels of a pyramid; an image with sides of 2^30 pixels is a single pixel then
 _MOST = 2**26  # receptors
 _FARTHEST = 1e15  # pixels from the image to a fixation
@@ -33,6 +34,11 @@ class _Retina:
         for name in ("fovea", "spacing", "pooling"):
             value = getattr(self, name)
             check(0 < value < inf, name, "a positive number", value)
+
+    @property
+    def numbers(self) -> _Numbers:
+        """The arguments, as the key of what is computed for them once."""
+        return self.fovea, self.spacing, self.pooling, self.scale
 
     def receptors(self, size: tuple[int, int]) -> tuple[int, int]:
         """`(rings, wedges)` that cover an image of `(width, height)` from any fixation inside it."""
@@ -101,9 +107,8 @@ def log_polar(
     """
     retina = _Retina(fovea, spacing, pooling)
     levels = image if isinstance(image, tuple) else gaussian_pyramid(image, retina.levels(_size(image)))
-    fixation, many = fixations(gaze, levels[0])
-    result = _sample(levels, fixation, retina)
-    return result if many else result[:, 0]
+    cortical = _sample(levels, fixations(gaze, levels[0]), retina)
+    return cortical if gaze.ndim == 3 else cortical[:, 0]
 
 
 def from_log_polar(
@@ -134,10 +139,12 @@ def from_log_polar(
     check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
     retina = _Retina(fovea, spacing)
     check_shape(cortical, "cortical", None, None, *retina.receptors(size))
-    fixation, many = fixations(gaze, cortical)
-    check(cortical.ndim == 4 + many, "cortical", f"{4 + many} dimensions with a gaze of this shape", cortical.ndim)
-    result = _project(cortical if many else cortical[:, None], fixation, size, retina)
-    return result if many else result[:, 0]
+    fixation = fixations(gaze, cortical)
+    if gaze.ndim == 3:
+        check(cortical.ndim == 5, "cortical", "5 dimensions with a gaze of this shape", cortical.ndim)
+        return _project(cortical, fixation, size, retina)
+    check(cortical.ndim == 4, "cortical", "4 dimensions with a gaze of this shape", cortical.ndim)
+    return _project(cortical[:, None], fixation, size, retina)[:, 0]
 
 
 class LogPolar(Sensor):
@@ -210,7 +217,7 @@ class LogPolar(Sensor):
     def look(self, state: tuple[_Levels, _Retina], gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
         levels, retina = state
-        fixation, _ = fixations(gaze[None], levels[0])
+        fixation = fixations(gaze[None], levels[0])
         return _project(_sample(levels, fixation, retina), fixation, _size(levels[0]), retina)[0]
 
     def settings(self) -> dict[str, Any]:
@@ -233,12 +240,12 @@ def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
     """Responses `(B, G, C, M, N)` of the receptors around fixations `(B, G, 2)`."""
     finest = levels[0]
     size = _size(finest)
-    offset = _places(retina, size, fixation.dtype, finest.device)
+    offset = _places(retina.numbers, size, fixation.dtype, finest.device)
     # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
     place = (2 * (fixation[:, :, None, None] + offset) + 1) / fixation.new_tensor(size) - 1
     rings, many = offset.shape[0], fixation.shape[1]
     by_level = []
-    for level, first, weight in _shares(retina, size, finest.dtype, finest.device):
+    for level, first, weight in _shares(retina.numbers, size, finest.dtype, finest.device):
         if level >= len(levels):
             break
         last = first + len(weight)
@@ -277,8 +284,9 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
 
 
 @constant
-def _places(retina: _Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Positions of the receptors relative to the fixation, `(M, N, 2)`, in image pixels."""
+def _places(numbers: _Numbers, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Lay out the receptors: positions relative to the fixation, `(M, N, 2)`, in image pixels."""
+    retina = _Retina(*numbers)
     rings, wedges = retina.receptors(size)
     rho = (torch.arange(rings, dtype=torch.float64) + 0.5) * retina.spacing
     radius = retina.fovea * torch.expm1(rho / retina.fovea)
@@ -289,9 +297,10 @@ def _places(retina: _Retina, size: tuple[int, int], dtype: torch.dtype, device: 
 
 @constant
 def _shares(
-    retina: _Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device
+    numbers: _Numbers, size: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> list[tuple[int, int, Tensor]]:
-    """For each level of the pyramid that is read: its number, the first ring that reads it, and its weight by ring."""
+    """List the levels of the pyramid that are read: number, first ring that reads it, and weights of the rings."""
+    retina = _Retina(*numbers)
     rings, top = retina.receptors(size)[0], retina.levels(size)
     levels = [min(retina.level(retina.eccentricity(ring)), top) for ring in range(rings)]
     shares = []

@@ -93,9 +93,9 @@ class MultiScaleFovea(Sensor):
             InputError: a shape does not fit, or the gaze is not finite.
         """
         means = image if isinstance(image, tuple) else self.means(image)
-        fixation, many = fixations(gaze, means[0])
-        result = torch.stack([self._crop(plane, fixation, scale) for scale, plane in enumerate(means)], 2)
-        return result if many else result[:, 0]
+        fixation = fixations(gaze, means[0])
+        crops = torch.stack([self._crop(plane, fixation, scale) for scale, plane in enumerate(means)], 2)
+        return crops if gaze.ndim == 3 else crops[:, 0]
 
     def windows(self, gaze: Tensor) -> Tensor:
         """Compute the squares that the crops cover.
@@ -127,7 +127,7 @@ class MultiScaleFovea(Sensor):
         """Compose the crops into pictures `(F, 3, H, W)` in which each place is shown by its finest crop."""
         means, size = state
         crops = self(means, gaze[None])[0]
-        fixation, _ = fixations(gaze, crops)
+        fixation = fixations(gaze, crops)
         windows = self.windows(fixation[:, 0])
         x, y = (torch.arange(n, dtype=windows.dtype, device=crops.device) + 0.5 for n in size)
         picture = crops.new_zeros(len(crops), crops.shape[2], size[1], size[0])

@@ -1,13 +1,14 @@
 """Gaussian and Laplacian pyramids in Kornia's and in OpenCV's convention, for images of any size."""
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Literal, Self, get_args
 
 import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup, values_known
-from semfov.sensor.lines import Lines, Taps, banded, constant, separable
+from semfov.sensor.constants import constant
+from semfov.sensor.lines import Lines, Taps, banded, separable
 from semfov.threads import one_thread_if_small
 
 Convention = Literal["kornia", "opencv"]
@@ -34,6 +35,19 @@ class Bands:
         """`(height, width)` of the image."""
         height, width = (self.details[0] if self.details else self.base).shape[-2:]
         return height, width
+
+    @property
+    def sizes(self) -> tuple[tuple[int, int], ...]:
+        """`(height, width)` of the bands, finest first."""
+        return tuple((band.shape[-2], band.shape[-1]) for band in self.details)
+
+    def __getitem__(self, images: slice) -> Self:
+        """Select the bands of some of the images."""
+        return replace(self, details=tuple(band[images] for band in self.details), base=self.base[images])
+
+    def widened(self) -> Self:
+        """Convert bands of half precision to float32 on a CPU (`widened`)."""
+        return replace(self, details=tuple(widened(band) for band in self.details), base=widened(self.base))
 
 
 def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.belief.evidence import neighbourhood_peak
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 
 HINT_MAPS = 11  # number of maps of `hint_maps`
 MEMORY_MAPS = 2  # number of maps of `memory_maps`

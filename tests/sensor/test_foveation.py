@@ -1,10 +1,12 @@
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
 
 from semfov.sensor import Foveation, foveate, laplacian_pyramid
+from tests.base_tester import graphs_of
 from tests.refusals import refused
 from tests.small import close, draw, rand
 
@@ -96,7 +98,7 @@ def test_many_views_are_made_in_parts(monkeypatch, dtype, levels):
     bands = laplacian_pyramid(images, levels)
     at_once = foveate(images, gaze, sigma=5.0, levels=levels)
     for together in (0, 2 * images[0].numel()):
-        monkeypatch.setattr("semfov.sensor.foveation._TOGETHER", together)
+        monkeypatch.setattr("semfov.sensor.foveation._BLOCK", together)
         for source in (images, bands):
             views = foveate(source, gaze, sigma=5.0, levels=levels)
             assert views.dtype == dtype
@@ -180,17 +182,31 @@ def test_dtype_and_device_follow_a_large_image(dtype, device):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_large_images_compile_to_one_graph(convention):
-    image, gaze = draw(1, 2, 170, 164), 20 * draw(1, 3, 2)
+@pytest.mark.parametrize("size", [(48, 64), (170, 164)])
+def test_a_plain_compiler_makes_one_graph_whose_constants_are_kept(convention, size):
+    """One graph for each size, without the operations that lay out the bands and make the matrices of the pyramid."""
+    image, gaze = draw(1, 2, *size, dtype=torch.float32), 20 * draw(1, 3, 2, dtype=torch.float32)
+    sensor = Foveation(7.0, levels=2, convention=convention)
+    (graph,) = graphs_of(sensor, image, gaze)
+    program = torch.export.export(sensor, (image, gaze))
+    close(program.module()(image, gaze), sensor(image, gaze), 1e-6)
+    for traced in (graph.graph, program.graph):
+        operations = {str(getattr(node.target, "__name__", node.target)) for node in traced.nodes}
+        made = {name for name in operations if re.search("arange|scatter|repeat_interleave|full|linspace", name)}
+        assert made == set()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_a_compiled_sensor_takes_other_sizes(convention):
+    sensor = Foveation(7.0, levels=1, convention=convention)
     torch.compiler.reset()
-
-    def sensor(image, gaze):
-        return foveate(image, gaze, sigma=7.0, levels=1, convention=convention)
-
     compiled = torch.compile(sensor, fullgraph=True, backend="eager")
-    close(compiled(image, gaze), sensor(image, gaze))
-    with torch.no_grad():
-        close(compiled(image, gaze), sensor(image, gaze))
+    for height, width in ((40, 50), (41, 53), (60, 50)):
+        image, gaze = draw(1, 2, height, width, dtype=torch.float32), torch.tensor([9.0, 8.0])
+        close(compiled(image, gaze), sensor(image, gaze), 1e-6)
+        with torch.no_grad():
+            close(compiled(image, gaze), sensor(image, gaze), 1e-6)
 
 
 def test_module_equals_the_function():

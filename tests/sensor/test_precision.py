@@ -9,7 +9,7 @@ from semfov.data.inputs import as_positions
 from semfov.detection.placement import Placement
 from semfov.observation.matching import box_iou
 from semfov.sensor import LogPolar, MultiScaleFovea, glimpse, perspective
-from semfov.sensor.foveation import _pixel_positions
+from semfov.sensor.fovea import pixel_positions
 from semfov.sensor.glimpse import window_around, windows_at
 from tests.refusals import refused
 from tests.small import rand
@@ -130,6 +130,6 @@ def test_places_on_a_canvas_of_any_type(kind):
 
 
 def test_places_and_positions_are_not_rounded():
-    assert _pixel_positions(WIDE, WIDE, 0, "kornia").tolist() == list(range(WIDE))
+    assert pixel_positions(WIDE, WIDE, 0, "kornia").tolist() == list(range(WIDE))
     assert as_positions(torch.tensor([0.1], dtype=torch.float64)).dtype == torch.float64
     assert as_positions(torch.tensor([1]), torch.zeros(1, dtype=torch.float16)).dtype == torch.float32

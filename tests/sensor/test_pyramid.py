@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from torch._subclasses import FakeTensorMode
 
 from semfov.sensor import foveate, laplacian_pyramid, pyramid, pyrdown, pyrup
-from semfov.sensor.lines import Taps, banded, constant, separable
+from semfov.sensor.constants import constant
+from semfov.sensor.lines import Taps, banded, separable
 from tests.refusals import refused
 from tests.small import draw, rand
 

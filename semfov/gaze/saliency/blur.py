@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape
-from semfov.sensor.lines import Lines, Taps, banded, constant, separable
+from semfov.sensor.constants import constant
+from semfov.sensor.lines import Lines, Taps, banded, separable
 
 # Number of pixels that one matrix product computes: larger tiles multiply more zeros, smaller tiles are slower.
 _TILE = 24

@@ -19,7 +19,7 @@ from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Schema, Text
 from semfov.io.schema import Number as JsonNumber
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 
 _CELLS = 52  # cells along the longer side of a picture in which densities are computed
 

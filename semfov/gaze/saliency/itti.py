@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from semfov.data.inputs import ImageLike, as_batch
 from semfov.gaze.saliency.blur import rescale
 from semfov.gaze.saliency.opponent import anchor, double_opponency
-from semfov.sensor.lines import constant
+from semfov.sensor.constants import constant
 from semfov.sensor.pyramid import pyrdown
 
 _CENTRES = (2, 3, 4)
