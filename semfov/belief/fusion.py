@@ -13,6 +13,8 @@ from semfov.threads import one_thread_if_small
 __all__ = ["fuse", "kaplan", "product", "semba", "sum"]
 
 _Rule = Callable[[Tensor, Tensor], Tensor]
+# Elements of the maps that are fused together on a CPU; those of many episodes leave the processor's cache.
+_BLOCK = 1 << 19
 RULES: dict[str, _Rule] = {}  # the rules by name, without checks, for likelihoods from `_scale_likelihood`
 
 
@@ -203,45 +205,103 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     check_shape(footprint, "footprint", batch, likelihood.shape[1], cells)
     lookup(rule, RULES, "fusion rule")
     check_parameters(beta)
-    soft = footprint.is_floating_point()
-    check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
-    if soft and footprint.numel() and values_known(footprint):
-        # The minimum and the maximum of a tensor with a NaN are NaN.
-        least, most = torch.stack(footprint.detach().aminmax()).tolist()
-        check(least >= 0 and most <= 1, "footprint", "weights from 0 to 1", f"{least:g} to {most:g}")
+    _check_footprint(footprint)
     return fuse_scaled(beta, scale_covering(likelihood, footprint), footprint, rule)
+
+
+def _check_footprint(footprint: Tensor) -> None:
+    """Raise `InputError` unless a footprint is boolean, or weights from 0 to 1."""
+    if footprint.dtype == torch.bool:
+        return
+    check(footprint.is_floating_point(), "footprint", "a boolean or floating-point tensor", footprint.dtype)
+    if footprint.numel() and values_known(footprint):
+        # The minimum and the maximum of a tensor with a NaN are NaN.
+        least, largest = torch.stack(footprint.detach().aminmax()).tolist()
+        check(least >= 0 and largest <= 1, "footprint", "weights from 0 to 1", f"{least:g} to {largest:g}")
 
 
 @one_thread_if_small
 def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> Tensor:
-    """`fuse` without checks, for likelihoods from `scale_covering`."""
-    update, covered, soft = RULES[rule], footprint > 0, footprint.is_floating_point()
+    """Fuse as `fuse` does, without checks: in a graph detection by detection, else in blocks of episodes.
+
+    Args:
+        beta: `(B, X·Y, K+1)`, Dirichlet parameters.
+        scaled: likelihoods `(B, L, K+1)` from `scale_covering`.
+        footprint: `(B, L, X·Y)`, boolean, or exponents of the likelihood in [0, 1].
+        rule: name of the fusion rule.
+
+    Returns:
+        `(B, X·Y, K+1)`, new parameters.
+    """
+    update = RULES[rule]
     if not values_known(beta, scaled, footprint):
-        for number in range(scaled.shape[1]):
-            likelihood, covers = scaled[:, number, None], footprint[:, number, :, None]
-            if soft:
-                likelihood = likelihood.pow(covers.to(scaled))
-            beta = torch.where(covers > 0, update(beta, likelihood), beta)
-        return beta.clone()
-    batch, cells, components = beta.shape
+        return _fuse_everywhere(beta, scaled, footprint, update)
+    recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (beta, scaled, footprint))
+    episodes = max(1, _BLOCK // max(1, beta[:1].numel()))
+    if recorded or beta.device.type != "cpu" or len(beta) <= episodes:
+        return _fuse_covered(beta.clone(memory_format=torch.contiguous_format), scaled, footprint, update)
+    fused = torch.empty_like(beta, memory_format=torch.contiguous_format)
+    for first in range(0, len(beta), episodes):
+        block = slice(first, first + episodes)
+        _fuse_covered(fused[block].copy_(beta[block]), scaled[block], footprint[block], update)
+    return fused
+
+
+def _fuse_everywhere(beta: Tensor, scaled: Tensor, footprint: Tensor, update: _Rule) -> Tensor:
+    """Fuse each detection in a step of its own over all cells, so that the steps do not depend on values."""
+    for number in range(scaled.shape[1]):
+        likelihood = scaled[:, number, None]
+        weight = footprint[:, number, :, None]
+        if weight.is_floating_point():
+            likelihood = likelihood.pow(weight.to(scaled))
+        beta = torch.where(weight > 0, update(beta, likelihood), beta)
+    return beta.clone()
+
+
+def _fuse_covered(beta: Tensor, scaled: Tensor, footprint: Tensor, update: _Rule) -> Tensor:
+    """Fuse the r-th detection of every covered cell of every map in step r; `beta` is written over.
+
+    Args:
+        beta: `(B, X·Y, K+1)`, contiguous.
+        scaled: likelihoods `(B, L, K+1)`.
+        footprint: `(B, L, X·Y)`, boolean, or exponents of the likelihood.
+        update: the rule of fusion.
+
+    Returns:
+        `beta`.
+    """
+    covered = footprint > 0
     image, detection, cell = covered.nonzero(as_tuple=True)
     if len(image) == 0:
-        return beta.clone()
+        return beta
+    # The pairs of a cell and a detection that covers it, by the rank of the detection among those of its cell.
     rank = covered.cumsum(1, dtype=torch.int32)[image, detection, cell]
     order = rank.argsort(stable=True)
-    rows = (image * cells + cell)[order]
-    sources = (image * scaled.shape[1] + detection)[order]
     steps = torch.bincount(rank)[1:].tolist()
-    flat = beta.reshape(-1, components).clone()
-    evidence = scaled.reshape(-1, components)
-    weights = footprint[image, detection, cell][order, None].to(evidence).split(steps) if soft else None
-    for i, (row, source) in enumerate(zip(rows.split(steps), sources.split(steps), strict=True)):
-        likelihood = evidence.index_select(0, source)
-        likelihood = likelihood if weights is None else likelihood.pow(weights[i])
-        flat.index_copy_(0, row, update(flat.index_select(0, row), likelihood))
-    return flat.view(batch, cells, components)
+    cells = (image * beta.shape[1] + cell)[order].split(steps)
+    detections = (image * scaled.shape[1] + detection)[order].split(steps)
+    parameters = beta.view(-1, beta.shape[-1])
+    evidence = scaled.reshape(-1, beta.shape[-1])
+    exponents = None
+    if footprint.is_floating_point():
+        exponents = footprint[image, detection, cell][order, None].to(evidence).split(steps)
+    for step in range(len(steps)):
+        likelihood = evidence.index_select(0, detections[step])
+        if exponents is not None:
+            likelihood = likelihood.pow(exponents[step])
+        fused = update(parameters.index_select(0, cells[step]), likelihood)
+        parameters.index_copy_(0, cells[step], fused)
+    return beta
 
 
 def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
-    """Likelihoods of the detections that cover a cell, scaled; those of the others, such as padding, become 1."""
+    """Scale the likelihoods of the detections that cover a cell; those of the others, such as padding, become 1.
+
+    Args:
+        likelihood: `(B, L, K+1)`.
+        footprint: `(B, L, X·Y)`, boolean or weights.
+
+    Returns:
+        `(B, L, K+1)`, with a maximum of 1 in each row.
+    """
     return _scale_likelihood(torch.where((footprint > 0).any(-1, keepdim=True), likelihood, 1.0))

@@ -163,6 +163,28 @@ def test_fuse_equals_the_loop_and_weights_of_the_footprint_are_exponents_of_the_
     torch.testing.assert_close(rows, expected)
 
 
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("rule", sorted(fusion.RULES))
+def test_fuse_gives_the_bits_of_each_episode_alone_in_blocks_of_any_size(monkeypatch, rule, soft):
+    """Blocks of one episode, of two with one left over, of all; the maps may be strided, and stay as they are."""
+    beta = (torch.rand(9, 7, 5).transpose(0, 1) + 0.5)[:, ::2]
+    likelihood, footprint = torch.rand(7, 4, 5), torch.rand(7, 4, 5) < 0.5
+    footprint[3] = False
+    cells = footprint * torch.rand(7, 4, 5) if soft else footprint
+    before = beta.clone()
+    alone = torch.cat([fuse(*(part[n : n + 1] for part in (beta, likelihood, cells)), rule) for n in range(7)])
+    for block in (0, 2 * beta[0].numel(), 1 << 19):
+        monkeypatch.setattr(fusion, "_BLOCK", block)
+        assert torch.equal(fuse(beta, likelihood, cells, rule), alone)
+        learned = beta.clone().requires_grad_()
+        fused = fuse(learned, likelihood, cells, rule)
+        assert torch.equal(fused.detach(), alone)
+        fused.sum().backward()
+        assert bool(torch.isfinite(learned.grad).all())
+    assert torch.equal(beta, before)
+    assert fuse(beta[:0], likelihood[:0], cells[:0], rule).shape == (0, 5, 5)
+
+
 def test_fuse_changes_nothing_if_detections_cover_no_cell():
     beta = torch.rand(2, 3, 4)
     got = fuse(beta, torch.zeros(2, 5, 4), torch.zeros(2, 5, 3, dtype=torch.bool))

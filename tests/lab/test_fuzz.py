@@ -32,7 +32,7 @@ def test_every_change_that_is_set_aside_is_one_of_the_present_code():
         ("semfov.gone.fuse", "return a"),
         ("semfov.belief.fusion.sum", "return beta - likelihood / likelihood.total(-1, keepdim=True)"),
         ("semfov.belief.fusion.sum", "return beta + likelihood / likelihood.sum(-1, keepdim=True)"),
-        ("semfov.belief.fusion.fuse_scaled", "order = rank.argsort(stable=False)"),
+        ("semfov.belief.fusion.fuse_scaled", "episodes = max(0, _BLOCK // max(1, beta[:1].numel()))"),
         ("semfov.fuse", "soft = None"),
     ],
     ids=["no function", "no module", "no such line", "no change", "decorated", "another module"],
