@@ -5,6 +5,8 @@ import re
 
 import numpy as np
 import pytest
+import torch
+from kornia.geometry import transform
 from PIL import Image
 
 import semfov
@@ -50,6 +52,20 @@ def test_foveating_keeps_the_fixated_region_sharp(run, tmp_path):
     change = np.abs(np.asarray(Image.open(out), dtype=float) - noise).mean(-1)
     assert change[59:62, 39:42].mean() < 3
     assert change[:, 130:].mean() > 40
+
+
+def test_the_pyramid_for_kornia_has_the_numbers_the_borders_and_the_gradients_of_kornia_s(run):
+    ours = importlib.import_module("examples.kornia_pyramid")
+    for height, width in ((4, 4), (6, 18), (32, 50)):
+        image = torch.rand(2, 3, height, width, dtype=torch.float64, requires_grad=True)
+        for name in ("pyrdown", "pyrup"):
+            pyramid = getattr(ours, name)(image)
+            expected = getattr(transform, name)(image)
+            torch.testing.assert_close(pyramid, expected)
+            weights = torch.rand_like(expected)
+            slopes = [torch.autograd.grad((level * weights).sum(), image)[0] for level in (pyramid, expected)]
+            torch.testing.assert_close(*slopes)
+    assert len(re.findall(r"^pyr(down|up) of .* ms, Kornia .* ms", run("kornia_pyramid", "--repeats", 1), re.M)) == 6
 
 
 def test_searching_draws_the_scanpath(run, tmp_path):
