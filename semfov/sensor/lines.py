@@ -1,12 +1,27 @@
 """Separable filters of any kind as matrix products with the lines of an image.
 
 A filter whose output pixels depend on few neighbours is a matrix that is zero far from its diagonal. The matrix is cut
-into tiles along the diagonal. On a CPU the products of the tiles are several times faster than convolutions of few
-channels. A product reads a transposed image equally fast, so two passes filter both axes without a copy.
+into tiles along the diagonal, between two ends of one size:
+
+                        input pixels, `count`
+                  0     start
+                  ┌───────────┐
+          output  │ end       │
+          pixels  │     ┌─────┴──┐
+          `length`│     │ tile   │       `rows` output pixels are above the first tile,
+                  └─────┴──┬─────┴──┐    whose window of input pixels begins at `start`;
+                           │ tile   │    the next window begins `shift` pixels later
+                           └──┬─────┴─────┐
+                              │       end │
+                              └───────────┘
+
+On a CPU the products of the tiles are several times faster than convolutions of few channels. A product reads a
+transposed image equally fast, so two passes filter both axes without a copy.
 """
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,15 +42,27 @@ torch.empty(_KEPT, dtype=torch.uint8)
 
 
 def empty(like: Tensor, *shape: int) -> Tensor:
-    """`like.new_empty(shape)`, on a CPU in large pages of memory where the C library would not keep it."""
-    new = like.new_empty(shape)
-    # NumPy asks for large pages, of which fewer are fetched when the tensor is written.
-    large = new.nbytes > _KEPT and new.itemsize > 2 and new.device.type == "cpu"
-    return torch.from_numpy(np.empty_like(new.numpy())) if large else new
+    """Allocate `like.new_empty(shape)`, on a CPU in large pages of memory where the C library would not keep it."""
+    tensor = like.new_empty(shape)
+    # NumPy asks for large pages, of which fewer are fetched when the tensor is written. It has no bfloat16.
+    large = tensor.nbytes > _KEPT and tensor.itemsize > 2 and tensor.device.type == "cpu"
+    return torch.from_numpy(np.empty_like(tensor.numpy())) if large else tensor
 
 
-_Part = tuple[tuple[int, int, int], tuple[int, int, int], int]  # size, strides and begin of rows of planes
-_Product = tuple[Tensor, _Part, _Part]  # a matrix, what it multiplies, and where the product is written
+class _Part(NamedTuple):
+    """A stack of matrices in the memory of a tensor: what `Tensor.as_strided` takes."""
+
+    size: tuple[int, int, int]
+    strides: tuple[int, int, int]
+    begin: int
+
+
+class _Product(NamedTuple):
+    """A product of matrices with parts of two tensors, `target = matrix @ source`."""
+
+    matrix: Tensor
+    source: _Part
+    target: _Part
 
 
 @dataclass(frozen=True)
@@ -48,7 +75,18 @@ class Taps:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """A matrix from input to output lines: dense, or tiles `(tiles, tile, window)` between ends `(2, edge, span)`."""
+    """A matrix from input to output lines, dense or in tiles, as the drawing in `semfov.sensor.lines` shows.
+
+    Attributes:
+        count: number of input pixels.
+        length: number of output pixels.
+        dense: the matrix `(length, count)`, of short lines; None of long ones.
+        ends: `(2, edge, span)`, the first and last `edge` output pixels from the first and last `span` input pixels.
+        middle: `(tiles, tile, window)`, the output pixels of each tile from the input pixels of its window.
+        rows: number of output pixels above the first tile.
+        start: number of input pixels before the window of the first tile.
+        shift: number of input pixels from one window to the next.
+    """
 
     count: int
     length: int
@@ -63,94 +101,165 @@ class Lines:
 def banded(
     taps: Taps, count: int, tile: int, shift: int, reach: int, dtype: torch.dtype, device: torch.device
 ) -> Lines:
-    """The matrix of a filter; long lines are cut into tiles of `tile` pixels, each over `shift` and twice `reach`."""
-    index, weight = taps.index, taps.weight
-    length, window = len(index), shift + 2 * reach
-    before = -(-reach // shift)
+    """Make the matrix of a filter.
+
+    Args:
+        taps: the filter.
+        count: number of input pixels.
+        tile: number of output pixels of a tile, of long lines.
+        shift: number of input pixels that a tile advances.
+        reach: number of input pixels that a tile needs beside these, on either side.
+        dtype: dtype of the matrix.
+        device: device of the matrix.
+
+    Returns:
+        The matrix.
+    """
+    index = taps.index
+    weight = taps.weight
+    length = len(index)
+    before = -(-reach // shift)  # tiles that would reach beyond the first pixel
     tiles = min((count - reach) // shift, length // tile) - before
     if max(count, length) <= _SMALL or tiles < 1:
         dense = _dense(index, weight, count).to(device, dtype)
         return Lines(count, length, dense, dense[None], dense[None])
-    start, rows, rest = before * shift - reach, before * tile, (before + tiles) * tile
-    inner = index[rows:rest].reshape(tiles, tile, -1) - (start + shift * torch.arange(tiles)[:, None, None])
-    middle = _dense(inner, weight[rows:rest].reshape(inner.shape), window).to(device, dtype)
+    start = before * shift - reach
+    rows = before * tile
+    stop = rows + tiles * tile
+    first_pixels = start + shift * torch.arange(tiles)[:, None, None]
+    inner = index[rows:stop].reshape(tiles, tile, -1) - first_pixels
+    middle = _dense(inner, weight[rows:stop].reshape(inner.shape), shift + 2 * reach).to(device, dtype)
     if values_known(middle) and bool((middle == middle[0]).all()):
         # Usually all tiles are equal, and a single one stays in the fastest cache.
         middle = middle[:1].expand(tiles, -1, -1)
     # Both ends have the same size, so that one product computes them; the longer one decides.
-    edge = max(rows, length - rest)
+    edge = max(rows, length - stop)
     span = min(count, max(-(-edge // tile) * shift, count - (length - edge) // tile * shift) + reach)
-    head, tail = slice(edge), slice(length - edge, length)
-    ends = _dense(index[head], weight[head], span), _dense(index[tail] - (count - span), weight[tail], span)
-    return Lines(count, length, None, torch.stack(ends).to(device, dtype), middle, rows, start, shift)
+    head = _dense(index[:edge], weight[:edge], span)
+    tail = _dense(index[length - edge :] - (count - span), weight[length - edge :], span)
+    return Lines(count, length, None, torch.stack([head, tail]).to(device, dtype), middle, rows, start, shift)
 
 
 def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
-    """Filter the columns of an image `(..., h, w)` with `down` and its rows with `across`."""
-    if not values_known(image) or (image.requires_grad and torch.is_grad_enabled()) or image.device.type != "cpu":
+    """Filter the columns and the rows of images.
+
+    Args:
+        image: `(..., h, w)`.
+        down: filter of the columns, for h input pixels.
+        across: filter of the rows, for w input pixels.
+
+    Returns:
+        `(..., h', w')`, with the numbers of output pixels.
+    """
+    recorded = image.requires_grad and torch.is_grad_enabled()
+    if recorded or image.device.type != "cpu" or not values_known(image):
         return _product(_product(image.mT, across).mT, down)
     if down.dense is not None and across.dense is not None:
         return down.dense @ (image @ across.dense.mT)
     planes = image.reshape(image.shape[:-2].numel(), *image.shape[-2:])
+    return _filter_planes(planes, down, across).view(*image.shape[:-2], down.length, across.length)
+
+
+def _filter_planes(planes: Tensor, down: Lines, across: Lines) -> Tensor:
+    """Filter planes `(n, h, w)` on a CPU, so many at a time that what is between the passes stays in the cache."""
     shrinks = down.length < down.count
     if not shrinks:
         planes = planes.contiguous()
     number = planes.shape[0]
     result = empty(planes, number, down.length, across.length)
-    # So many planes are filtered at a time that what is between the passes stays in the cache.
-    sides = (down.length, across.count) if shrinks else (down.count, across.length)
-    most = max(1, _CACHED // (sides[0] * sides[1]))
-    between = planes.new_empty(min(most, number), *sides)
-    for first in range(0, number, most):
-        passes = _passes(down, across, min(most, number - first), planes.stride())
-        _multiply(passes[0], planes, int(planes.storage_offset()) + first * planes.stride(0), between, 0)
-        _multiply(passes[1], between, 0, result, first * down.length * across.length)
-    return result.view(*image.shape[:-2], *result.shape[-2:])
+    # The pass that makes fewer pixels goes first.
+    height, width = (down.length, across.count) if shrinks else (down.count, across.length)
+    together = max(1, _CACHED // (height * width))
+    between = planes.new_empty(min(together, number), height, width)
+    for first in range(0, number, together):
+        first_pass, second_pass = _passes(down, across, min(together, number - first), planes.stride())
+        begin = int(planes.storage_offset()) + first * planes.stride(0)
+        _multiply(first_pass, planes, begin, between, 0)
+        _multiply(second_pass, between, 0, result, first * down.length * across.length)
+    return result
 
 
 def difference(
-    one: Tensor, other: Tensor, down: Lines, across: Lines, weights: tuple[Tensor, Tensor], result: Tensor
+    planes: Tensor, others: Tensor, down: Lines, across: Lines, weights: tuple[Tensor, Tensor], result: Tensor
 ) -> None:
-    """Filter planes `(n, h, w)` of one image, minus those of another times the weights of rows and of columns.
+    """Filter planes of one image, minus those of another times the weights of rows and of columns.
 
-    Neither line may be dense. The lines of both images alternate between the passes, so that one product subtracts.
+    The lines of both images alternate between the passes, so that one product subtracts.
+
+    Args:
+        planes: `(n, h, w)`.
+        others: `(n, h, w)`, the planes that are subtracted.
+        down: filter of the columns, not dense.
+        across: filter of the rows, not dense.
+        weights: of the rows and of the columns of the result.
+        result: memory for the result, `(n, h', w')`.
     """
-    rows, width = down.count, across.length
-    between = one.new_empty(rows, 2, width)
-    ends, middle = _weighted(across, weights[1])
-    both = across, replace(across, ends=ends, middle=middle)
-    first = [_products(lines, 1, rows, (0, 1, across.count), (0, 1, 2 * width)) for lines in both]
-    pairs = zip((down.ends, down.middle), _weighted(down, -weights[0]), strict=True)
-    ends, middle = (torch.stack([each.expand_as(minus), minus], -1).flatten(-2) for each, minus in pairs)
-    last = Lines(2 * rows, down.length, None, ends, middle, down.rows, 2 * down.start, 2 * down.shift)
-    second = _products(last, 1, width, (0, width, 1), (0, width, 1))
-    for *planes, plane in zip(one, other, result, strict=True):
-        for at, (products, each) in enumerate(zip(first, planes, strict=True)):
-            _multiply(products, each, each.storage_offset(), between, at * width)
-        _multiply(second, between, 0, plane, plane.storage_offset())
+    rows = down.count
+    width = across.length
+    between = planes.new_empty(rows, 2, width)
+    weighted_across = _weighted(across, weights[1])
+    # The second pass reads a line of the planes and one of the others alternately.
+    minus = _weighted(down, -weights[0])
+    alternating = Lines(
+        2 * rows,
+        down.length,
+        None,
+        _alternated(down.ends, minus.ends),
+        _alternated(down.middle, minus.middle),
+        down.rows,
+        2 * down.start,
+        2 * down.shift,
+    )
+    first_passes = [
+        _products(lines, 1, rows, (0, 1, across.count), (0, 1, 2 * width)) for lines in (across, weighted_across)
+    ]
+    second_pass = _products(alternating, 1, width, (0, width, 1), (0, width, 1))
+    for plane, other, target in zip(planes, others, result, strict=True):
+        _multiply(first_passes[0], plane, plane.storage_offset(), between, 0)
+        _multiply(first_passes[1], other, other.storage_offset(), between, width)
+        _multiply(second_pass, between, 0, target, target.storage_offset())
 
 
-def _weighted(lines: Lines, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Ends and middle of lines with their output pixels times a weight `(length,)`."""
+def _alternated(matrix: Tensor, other: Tensor) -> Tensor:
+    """Alternate the columns of two matrices `(..., rows, n)`: `(..., rows, 2 n)`."""
+    return torch.stack([matrix.expand_as(other), other], -1).flatten(-2)
+
+
+def _weighted(lines: Lines, weight: Tensor) -> Lines:
+    """Multiply the output pixels of lines by weights `(length,)`."""
     tiles, tile, _ = lines.middle.shape
-    edge, last = lines.ends.shape[1], lines.rows + tiles * tile
+    edge = lines.ends.shape[1]
+    stop = lines.rows + tiles * tile
     ends = torch.stack([weight[:edge], weight[len(weight) - edge :]])[..., None] * lines.ends
-    return ends, weight[lines.rows : last].view(tiles, tile, 1) * lines.middle
+    return replace(lines, ends=ends, middle=weight[lines.rows : stop].view(tiles, tile, 1) * lines.middle)
 
 
-def _multiply(products: list[_Product], source: Tensor, begin: int, result: Tensor, into: int) -> None:
-    """Compute products of planes in the memory of `source` from `begin` on, in that of the result from `into` on."""
-    for matrix, (size, strides, offset), (sides, steps, place) in products:
-        planes = source.as_strided(size, strides, begin + offset)
-        torch.bmm(matrix, planes, out=result.as_strided(sides, steps, into + place))
+def _multiply(products: list[_Product], source: Tensor, read_from: int, target: Tensor, write_from: int) -> None:
+    """Compute products of the memory of `source` from an offset on, into that of `target` from another one on."""
+    for product in products:
+        size, strides, begin = product.source
+        planes = source.as_strided(size, strides, read_from + begin)
+        size, strides, begin = product.target
+        torch.bmm(product.matrix, planes, out=target.as_strided(size, strides, write_from + begin))
 
 
 @lru_cache(maxsize=256)
 def _passes(
     down: Lines, across: Lines, number: int, strides: tuple[int, int, int]
 ) -> tuple[list[_Product], list[_Product]]:
-    """Products of both passes over planes; to work them out takes as long as the products of a small plane."""
-    height, width = down.length, across.length
+    """List the products of both passes over planes, which takes as long as the products of a small plane.
+
+    Args:
+        down: filter of the columns.
+        across: filter of the rows.
+        number: number of planes.
+        strides: strides of planes, rows and columns.
+
+    Returns:
+        Products of the first pass, from the planes to what is between, and of the second one, to the result.
+    """
+    height = down.length
+    width = across.length
     if down.length < down.count:
         # The pass with fewer pixels is the slower one, across, which takes all planes at once.
         between = (height * across.count, across.count, 1)
@@ -168,56 +277,73 @@ def _passes(
 def _products(
     lines: Lines, number: int, width: int, source: tuple[int, int, int], target: tuple[int, int, int]
 ) -> list[_Product]:
-    """Products that filter the columns of planes, given the strides of planes, rows and columns."""
-    made: list[_Product] = []
+    """List the products that filter the columns of planes.
 
-    def at(row: int, other: int) -> tuple[int, int]:
-        return row * source[1], other * target[1]
+    Args:
+        lines: the filter.
+        number: number of planes.
+        width: number of columns of each.
+        source: strides of planes, rows and columns in the memory that is read.
+        target: the same strides in the memory that is written.
 
-    def add(matrix: Tensor, apart: tuple[int, int], begin: tuple[int, int]) -> None:
-        many, rows, window = matrix.shape
-        read = (many, window, width), (apart[0], *source[1:]), begin[0]
-        made.append((matrix, read, ((many, rows, width), (apart[1], *target[1:]), begin[1])))
+    Returns:
+        The products, in the order in which they must be computed.
+    """
+    products: list[_Product] = []
+
+    def offsets(read: int, written: int) -> tuple[int, int]:
+        """Turn a number of rows that are read, and of rows that are written, into offsets in memory."""
+        return read * source[1], written * target[1]
+
+    def multiply(matrix: Tensor, apart: tuple[int, int], begin: tuple[int, int]) -> None:
+        """Add a stack of products; the offsets are those from one to the next, and of the first."""
+        stack, height, window = matrix.shape
+        read = _Part((stack, window, width), (apart[0], *source[1:]), begin[0])
+        written = _Part((stack, height, width), (apart[1], *target[1:]), begin[1])
+        products.append(_Product(matrix, read, written))
 
     planes = source[0], target[0]
     if lines.dense is not None:
-        add(lines.dense.expand(number, -1, -1), planes, (0, 0))
-        return made
+        multiply(lines.dense.expand(number, -1, -1), planes, (0, 0))
+        return products
     tiles, tile, _ = lines.middle.shape
-    step, first, along = at(lines.shift, tile), at(lines.start, lines.rows), lines.count // lines.shift
-    alike = lines.middle.stride(0) == 0 and (lines.count, lines.length) == (along * lines.shift, along * tile)
-    if number > 1 and alike and planes == at(lines.count, lines.length):
+    step = offsets(lines.shift, tile)
+    first = offsets(lines.start, lines.rows)
+    tiles_of_plane = lines.count // lines.shift
+    divides = (lines.count, lines.length) == (tiles_of_plane * lines.shift, tiles_of_plane * tile)
+    one_tile = lines.middle.stride(0) == 0
+    if number > 1 and one_tile and divides and planes == offsets(lines.count, lines.length):
         # Tiles of all planes at once. Those that lie across two planes are written over by the ends.
-        add(lines.middle[:1].expand(tiles + (number - 1) * along, -1, -1), step, first)
+        multiply(lines.middle[:1].expand(tiles + (number - 1) * tiles_of_plane, -1, -1), step, first)
     else:
         for n in range(number):
-            add(lines.middle, step, (first[0] + n * planes[0], first[1] + n * planes[1]))
+            multiply(lines.middle, step, (first[0] + n * planes[0], first[1] + n * planes[1]))
     _, edge, span = lines.ends.shape
-    last = at(lines.count - span, lines.length - edge)
+    last = offsets(lines.count - span, lines.length - edge)
     if number == 1:
-        add(lines.ends, last, (0, 0))
-        return made
+        multiply(lines.ends, last, (0, 0))
+        return products
     for end, begin in zip(lines.ends, ((0, 0), last), strict=True):
-        add(end.expand(number, -1, -1), planes, begin)
-    return made
+        multiply(end.expand(number, -1, -1), planes, begin)
+    return products
 
 
 def _dense(index: Tensor, weight: Tensor, count: int) -> Tensor:
-    """The dense matrix `(..., count)` of some output pixels."""
+    """Make the dense matrix `(..., count)` of some output pixels."""
     return torch.zeros(*index.shape[:-1], count, dtype=weight.dtype).scatter_add(-1, index, weight)
 
 
 def _product(image: Tensor, lines: Lines) -> Tensor:
-    """Filter the columns of an image."""
+    """Filter the columns of an image by operations that can be recorded and traced."""
     if lines.dense is not None:
         return lines.dense @ image
+    tiles, tile, window = lines.middle.shape
     _, edge, span = lines.ends.shape
-    made = lines.rows + lines.middle.shape[:2].numel()
     top = lines.ends[0, : lines.rows] @ image[..., :span, :]
-    tiles, _, window = lines.middle.shape
     stop = lines.start + (tiles - 1) * lines.shift + window
     # The overlapping input windows of the tiles, `(..., tiles, window, w)`.
     windows = image[..., lines.start : stop, :].unfold(-2, window, lines.shift).mT
     inner = (lines.middle @ windows).flatten(-3, -2)
-    bottom = lines.ends[1, edge - lines.length + made :] @ image[..., image.shape[-2] - span :, :]
+    rest = lines.length - lines.rows - tiles * tile  # output pixels below the last tile
+    bottom = lines.ends[1, edge - rest :] @ image[..., image.shape[-2] - span :, :]
     return torch.cat([top, inner, bottom], -2)
