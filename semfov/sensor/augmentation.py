@@ -68,15 +68,17 @@ class RandomFoveation(IntensityAugmentationBase2D):
         keepdim: bool = False,
     ) -> None:
         super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
-        low, high = sigma if isinstance(sigma, tuple | list) else (sigma, sigma)
-        check(0 < low <= high < inf, "sigma", "a positive number, or the smallest and the largest one", sigma)
+        narrowest, widest = sigma if isinstance(sigma, tuple | list) else (sigma, sigma)
+        in_order = 0 < narrowest <= widest < inf
+        check(in_order, "sigma", "a positive number, or the smallest and the largest one", sigma)
         check(levels >= 0, "levels", "0 or more", levels)
         check(growth > 0, "growth", "a positive number", growth)
         check(0 <= p <= 1, "p", "a probability from 0 to 1", p)
         lookup(convention, get_args(Convention), "pyramid convention")
-        widths, whole = (float(low), float(high)), (0.0, 1.0)
+        widths = (float(narrowest), float(widest))
+        side = (0.0, 1.0)  # of an image
         self._param_generator = _Fixations(
-            (widths, "sigma", None, None), (whole, "x", None, None), (whole, "y", None, None)
+            (widths, "sigma", None, None), (side, "x", None, None), (side, "y", None, None)
         )
         self.flags = {"levels": levels, "growth": growth, "convention": convention}
 
@@ -106,8 +108,9 @@ class _Fixations(PlainUniformGenerator):
         return f"sigma={self.samplers[0][0]}"
 
     def forward(self, batch_shape: tuple[int, ...], same_on_batch: bool = False) -> dict[str, Tensor]:
-        """`gaze`, `(B, 2)`, and `sigma`, `(B,)`, for images `(B, C, H, W)`."""
-        drawn = super().forward(batch_shape, same_on_batch)
+        """Draw `gaze`, `(B, 2)`, and `sigma`, `(B,)`, for images `(B, C, H, W)`."""
+        numbers = super().forward(batch_shape, same_on_batch)
         # A pixel is an area around integer coordinates.
-        x, y = (drawn[name] * n - 0.5 for name, n in (("x", batch_shape[-1]), ("y", batch_shape[-2])))
-        return {"sigma": drawn["sigma"], "gaze": torch.stack([x, y], -1)}
+        x = numbers["x"] * batch_shape[-1] - 0.5
+        y = numbers["y"] * batch_shape[-2] - 0.5
+        return {"sigma": numbers["sigma"], "gaze": torch.stack([x, y], -1)}

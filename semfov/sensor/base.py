@@ -132,7 +132,7 @@ class Sensor(StatedModule, ABC):
         """
 
     def _stated(self) -> dict[str, Any]:
-        """The settings by which commands make the sensor, without those that are parameters."""
+        """List the constructor's settings, without those that are parameters."""
         learned = {name.removeprefix("log_") for name in self._parameters}
         return {name: value for name, value in self.settings().items() if name in {*self.names} - learned}
 
@@ -189,22 +189,37 @@ class Sensor(StatedModule, ABC):
         Returns:
             The numbers among them with their names.
         """
-        numbers = {name: each for name, each in settings.items() if isinstance(each, int | float)}
+        numbers = {name: value for name, value in settings.items() if isinstance(value, int | float)}
         return ", ".join(f"{name} {value:g}" for name, value in numbers.items())
 
     def extra_repr(self) -> str:
-        """The settings as text."""
+        """Write the settings as text."""
         settings = self.settings()
-        named = ((name, settings[name]) for name in self.names)
-        return ", ".join(f"{name}={v:g}" if isinstance(v, float) else f"{name}={v!r}" for name, v in named)
+        parts = []
+        for name in self.names:
+            value = settings[name]
+            parts.append(f"{name}={value:g}" if isinstance(value, float) else f"{name}={value!r}")
+        return ", ".join(parts)
 
 
-def stacked_views(view: Callable[[int, int], Tensor], batch: int, many: int, empty: Tensor) -> Tensor:
-    """Views `(B, G, ...)` by their two numbers; of none of them, a tensor of no views of the shape of `empty`."""
-    views = [view(b, g) for b in range(batch) for g in range(many)]
-    one = views[0] if views else empty
-    whole = torch.stack(views) if len(views) > 1 else one[None].expand(len(views), *one.shape)
-    return whole.reshape(batch, many, *whole.shape[1:])
+def stacked_views(view: Callable[[int, int], Tensor], batch: int, number: int, empty: Tensor) -> Tensor:
+    """Make views one by one, and stack them.
+
+    Args:
+        view: makes the view of an image by its number, and by its number among those of the image.
+        batch: number of images, B.
+        number: number of views of each, G.
+        empty: a tensor of the shape and kind of one view, for the case that there is none.
+
+    Returns:
+        Views `(B, G, ...)`.
+    """
+    views = [view(b, g) for b in range(batch) for g in range(number)]
+    if len(views) > 1:
+        return torch.stack(views).unflatten(0, (batch, number))
+    # One view is not copied.
+    shape = (views[0] if views else empty).shape
+    return (views[0] if views else empty)[None].expand(len(views), *shape).reshape(batch, number, *shape)
 
 
 def fixations(gaze: Tensor, like: Tensor) -> Tensor:

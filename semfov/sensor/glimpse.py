@@ -55,8 +55,8 @@ def glimpse(
     check_shape(image, "image", None, None, None, None)
     check_shape(boxes, "boxes", 4)
     batch = image.shape[0]
-    fits = boxes.ndim in (2, 3) and boxes.shape[0] == batch
-    check(fits, "boxes", f"shape ({batch}, G, 4) or ({batch}, 4)", tuple(boxes.shape))
+    by_image = boxes.ndim in (2, 3) and boxes.shape[0] == batch
+    check(by_image, "boxes", f"shape ({batch}, G, 4) or ({batch}, 4)", tuple(boxes.shape))
     check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
     lookup(padding_mode, get_args(_Padding), "padding mode")
     check(image.is_floating_point(), "image", "floating-point pixels", image.dtype)
@@ -68,19 +68,26 @@ def glimpse(
     windows = as_positions(boxes if boxes.ndim == 3 else boxes[:, None], image.dtype)
     value = 0.0 if padding_mode == "zeros" else fill_value
 
-    result = stacked_views(
-        lambda b, g: _window(image[b], windows[b, g], size, padding_mode, value),
-        batch,
-        windows.shape[1],
-        image.new_empty(image.shape[1], size[1], size[0]),
-    )
-    return result if boxes.ndim == 3 else result[:, 0]
+    def canvas(b: int, g: int) -> Tensor:
+        return _window(image[b], windows[b, g], size, padding_mode, value)
+
+    no_canvas = image.new_empty(image.shape[1], size[1], size[0])
+    canvases = stacked_views(canvas, batch, windows.shape[1], no_canvas)
+    return canvases if boxes.ndim == 3 else canvases[:, 0]
 
 
 def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Windows `(..., 4)` that are centred at points and fill a canvas of `(w, h)` pixels at given magnifications.
+    r"""Compute the windows that are centred at points and fill a canvas at given magnifications.
 
     .. math:: (x_1, y_1, x_2, y_2) = (p + ½) \mp \frac{(w, h)}{2 m}
+
+    Args:
+        points: p, `(..., 2)` in picture pixels.
+        magnification: m, `(...)`, canvas pixels for a picture pixel.
+        size: `(width, height)` of the canvas, `(w, h)`.
+
+    Returns:
+        `(..., 4)`, edges between pixels.
     """
     check_shape(points, "points", 2)
     points = as_positions(points)
@@ -88,82 +95,125 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
 
 
 def edges_at(point: _Length, magnification: _Length, length: _Length) -> tuple[_Length, _Length]:
-    """Edges along one axis of the window that is centred at a point, of a canvas of `length` pixels (`windows_at`)."""
-    centre, half = point + 0.5, length / (2 * magnification)
+    """Compute the edges along one axis of a window that is centred at a point (`windows_at`).
+
+    Args:
+        point: position along the axis, in picture pixels.
+        magnification: canvas pixels for a picture pixel.
+        length: number of canvas pixels along the axis.
+
+    Returns:
+        The lower and the upper edge.
+    """
+    centre = point + 0.5
+    half = length / (2 * magnification)
     return centre - half, centre + half
 
 
 def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0, least: float = 1 / 3) -> Tensor:
-    """The window `(4,)` that shows a box closely, with some of its surroundings.
+    """Compute the window that shows a box closely, with some of its surroundings.
 
-    The window is a square, `context` times as large as the longer side of the box, and at least `least` times as large
-    as the longer side of the picture. It is moved to lie inside the picture. Where the picture is narrower, it is cut.
+    It is moved to lie inside the picture. Where the picture is narrower, it is cut.
+
+    Args:
+        box: `(4,)` in pixels of the picture.
+        picture: `(width, height)` of the picture.
+        context: side of the square window, in longer sides of the box.
+        least: its smallest side, in longer sides of the picture.
+
+    Returns:
+        The window, `(4,)`.
     """
     check_shape(box, "box", 4)
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
     box = as_positions(box)
-    low, high = box[:2], box[2:]
-    whole = box.new_tensor(picture)
-    side = torch.minimum((context * (high - low).amax()).clamp(min=least * max(picture)), whole)
-    start = torch.minimum(((low + high - side) / 2).clamp(min=0), whole - side)
+    upper_left = box[:2]
+    lower_right = box[2:]
+    size = box.new_tensor(picture)
+    side = torch.minimum((context * (lower_right - upper_left).amax()).clamp(min=least * max(picture)), size)
+    start = torch.minimum(((upper_left + lower_right - side) / 2).clamp(min=0), size - side)
     return torch.cat([start, start + side])
 
 
 def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding, value: float) -> Tensor:
-    """One window of an image `(C, H, W)`: two matrix products, over the pixels that the window shows."""
-    across, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=padding == "border")
-    down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")
+    """Resample one window of an image `(C, H, W)`: two matrix products, over the pixels that the window shows."""
+    border = padding == "border"
+    columns, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=border)
+    rows, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=border)
     part = image[:, top:bottom, left:right]
-    across, down = across.to(part), down.to(part)
+    columns = columns.to(part)
+    rows = rows.to(part)
     part = part - value if value else part
     recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
     if recorded or not part.numel() or image.device.type != "cpu" or not values_known(image, box):
-        canvas = down @ part @ across.mT
+        canvas = rows @ part @ columns.mT
     else:
-        # The matrices are zero far from their diagonals.
         x1, y1, x2, y2 = box.tolist()
         between = part.new_empty(len(part), size[1], part.shape[-1])
         canvas = part.new_empty(len(part), size[1], size[0])
-        _fill(between, down, part, y1 - top, y2 - top)
-        _fill(canvas.mT, across, between.mT, x1 - left, x2 - left)
+        _fill(between, rows, part, y1 - top, y2 - top)
+        _fill(canvas.mT, columns, between.mT, x1 - left, x2 - left)
     return canvas + value if value else canvas
 
 
-def _fill(result: Tensor, weight: Tensor, part: Tensor, low: float, high: float) -> None:
-    """Resample the columns of planes `(C, n, w)`, some pixels of the canvas at a time, from the pixels they show."""
+def _fill(result: Tensor, weight: Tensor, part: Tensor, start: float, end: float) -> None:
+    """Resample the columns of planes, some pixels of the canvas at a time, from the pixels that they show.
+
+    The matrix of weights is zero far from its diagonal, where nothing is multiplied.
+
+    Args:
+        result: memory for the canvas, `(C, count, w)`.
+        weight: weights of the pixels in each pixel of the canvas, `(count, n)`.
+        part: the planes, `(C, n, w)`.
+        start: upper edge of the window in pixels of the part.
+        end: its lower edge.
+    """
     count, length = weight.shape
-    step = (high - low) / count
+    step = (end - start) / count
     reach = max(step, 1.0) + 1  # and a pixel for rounding
     together = _TOGETHER if length > 4 * _TOGETHER else count
     for first in range(0, count, together):
         last = min(first + together, count)
-        start = min(max(math.floor(low + (first + 0.5) * step - reach), 0), length - 1)
-        stop = min(max(math.ceil(low + (last - 0.5) * step + reach), start + 1), length)
-        some = weight[first:last, start:stop].expand(len(part), -1, -1)
-        torch.bmm(some, part[:, start:stop], out=result[:, first:last])
+        begin = min(max(math.floor(start + (first + 0.5) * step - reach), 0), length - 1)
+        stop = min(max(math.ceil(start + (last - 0.5) * step + reach), begin + 1), length)
+        matrix = weight[first:last, begin:stop].expand(len(part), -1, -1)
+        torch.bmm(matrix, part[:, begin:stop], out=result[:, first:last])
 
 
-def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool) -> tuple[Tensor, tuple[int, int]]:
-    """Weights `(count, n)` of n picture pixels in every canvas pixel along one axis, and the range of those pixels."""
-    step = (high - low) / count
+def _weights(start: Tensor, end: Tensor, count: int, length: int, *, border: bool) -> tuple[Tensor, tuple[int, int]]:
+    """Compute the weights of picture pixels in every canvas pixel along one axis.
+
+    Args:
+        start: lower edge of the window along the axis, `()`.
+        end: its upper edge, `()`.
+        count: number of canvas pixels.
+        length: number of picture pixels.
+        border: continue the picture by its outer pixels, instead of black.
+
+    Returns:
+        Weights `(count, n)` of n picture pixels, and the range of these pixels.
+    """
+    step = (end - start) / count
     reach = step.clamp(min=1.0)
-    middle = low + (torch.arange(count).to(low) + 0.5) * step
-    if not values_known(low, high):
+    middle = start + (torch.arange(count).to(start) + 0.5) * step
+    if not values_known(start, end):
         return _weights_of_all(middle, reach, length, border=border), (0, length)
-    first, last = torch.stack([(low - reach).floor(), (high + reach).ceil() + 1]).detach().long().tolist()
-    pixel = torch.arange(first, last, device=low.device)
-    weight = (1 - (middle[:, None] - (pixel.to(low) + 0.5)).abs() / reach).clamp(min=0)
+    first, last = torch.stack([(start - reach).floor(), (end + reach).ceil() + 1]).detach().long().tolist()
+    pixel = torch.arange(first, last, device=start.device)
+    weight = (1 - (middle[:, None] - (pixel.to(start) + 0.5)).abs() / reach).clamp(min=0)
     weight = weight / weight.sum(-1, keepdim=True)
     if border:
-        start, stop = min(max(first, 0), length - 1), max(min(last, length), 1)
-        place = pixel.clamp(0, length - 1) - start
-        return weight.new_zeros(count, stop - start).index_add(1, place, weight), (start, stop)
-    start, stop = min(max(first, 0), length), min(max(last, 0), length)
-    return weight[:, start - first : max(stop, start) - first], (start, max(stop, start))
+        begin = min(max(first, 0), length - 1)
+        stop = max(min(last, length), 1)
+        place = pixel.clamp(0, length - 1) - begin
+        return weight.new_zeros(count, stop - begin).index_add(1, place, weight), (begin, stop)
+    begin = min(max(first, 0), length)
+    stop = max(min(max(last, 0), length), begin)
+    return weight[:, begin - first : stop - first], (begin, stop)
 
 
 def _weights_of_all(middle: Tensor, reach: Tensor, length: int, *, border: bool) -> Tensor:
-    """`_weights` `(count, length)` of all pixels of a picture, in a graph whose shapes do not depend on the window."""
+    """Compute the weights `(count, length)` of all pixels of a picture, in a graph of one shape for all windows."""
     place = middle - 0.5
     weight = (1 - (place[:, None] - torch.arange(length).to(place)).abs() / reach).clamp(min=0)
     fraction = place - place.floor()
@@ -171,14 +221,16 @@ def _weights_of_all(middle: Tensor, reach: Tensor, length: int, *, border: bool)
     if border:
         outside = []
         for inwards in (place, length - 1 - place):
-            near, far = _beyond((inwards + 1).clamp(min=0), reach), total - _beyond((-inwards).clamp(min=0), reach)
-            outside.append(torch.where(inwards >= -1, near, far)[:, None])
+            # Of a triangle whose middle is inside or outside the picture, the part that is outside.
+            from_inside = _beyond((inwards + 1).clamp(min=0), reach)
+            from_outside = total - _beyond((-inwards).clamp(min=0), reach)
+            outside.append(torch.where(inwards >= -1, from_inside, from_outside)[:, None])
         pixel = torch.arange(length, device=place.device)
         weight = weight + outside[0] * (pixel == 0) + outside[1] * (pixel == length - 1)
     return weight / total[:, None]
 
 
 def _beyond(distance: Tensor, reach: Tensor) -> Tensor:
-    """Sum of the triangle 1 - d / reach over d = distance, distance + 1, … up to the reach."""
+    """Sum the triangle 1 - d / reach over d = distance, distance + 1, … up to the reach."""
     count = (reach - distance).floor().clamp(min=-1) + 1
     return count - (count * distance + count * (count - 1) / 2) / reach

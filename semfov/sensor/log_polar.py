@@ -41,7 +41,7 @@ class _Retina:
         return self.fovea, self.spacing, self.pooling, self.scale
 
     def receptors(self, size: tuple[int, int]) -> tuple[int, int]:
-        """`(rings, wedges)` that cover an image of `(width, height)` from any fixation inside it."""
+        """Count the `(rings, wedges)` that cover an image of `(width, height)` from any fixation inside it."""
         wedges = 4 * max(1, round(pi * self.fovea / (2 * self.spacing)))
         rings = 2 + ceil(self.fovea * log1p(self._reach(size) / self.fovea) / self.spacing)
         expected = f"a distance large enough for at most {_MOST:,} receptors"
@@ -49,19 +49,20 @@ class _Retina:
         return rings, wedges
 
     def levels(self, size: tuple[int, int]) -> int:
-        """How often an image of `(width, height)` is halved for its widest receptive field."""
+        """Count how often an image of `(width, height)` is halved for its widest receptive field."""
         return ceil(self.level(self._reach(size)))
 
     def level(self, eccentricity: float) -> float:
-        """Level of a Gaussian pyramid, possibly a fraction, whose pixels are as large as a receptive field."""
+        """Compute the level of a Gaussian pyramid, also between two, whose pixels are as large as a receptive field."""
         field = self.pooling * self.spacing * (1 + eccentricity / self.fovea) * sqrt(self.scale[0] * self.scale[1])
         return min(max(log2(field), 0.0), float(_TALLEST))
 
     def eccentricity(self, ring: int) -> float:
-        """Eccentricity of the receptors of a ring, in the unit of `fovea`."""
+        """Compute the eccentricity of the receptors of a ring, in the unit of `fovea`."""
         return self.fovea * (exp((ring + 0.5) * self.spacing / self.fovea) - 1)
 
     def _reach(self, size: tuple[int, int]) -> float:
+        """Measure the diagonal of an image, in the unit of `fovea`."""
         return hypot(size[0] / self.scale[0], size[1] / self.scale[1])
 
 
@@ -205,13 +206,13 @@ class LogPolar(Sensor):
             Images `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations.
         """
         finest = image[0] if isinstance(image, tuple) else image
-        cortical, retina = self.cortical(image, gaze), self.retina
-        return from_log_polar(cortical, gaze, _size(finest), fovea=retina.fovea, spacing=retina.spacing)
+        cortical = self.cortical(image, gaze)
+        return from_log_polar(cortical, gaze, _size(finest), fovea=self.retina.fovea, spacing=self.retina.spacing)
 
     def open(self, canvas: Tensor, scale: Tensor) -> tuple[_Levels, _Retina]:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""
-        across, down = scale.tolist()
-        retina = replace(self.retina, scale=(across, down))
+        scale_x, scale_y = scale.tolist()
+        retina = replace(self.retina, scale=(scale_x, scale_y))
         return gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina
 
     def look(self, state: tuple[_Levels, _Retina], gaze: Tensor) -> Tensor:
@@ -222,8 +223,8 @@ class LogPolar(Sensor):
 
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
-        own = self.retina
-        return {"kind": self.kind, "fovea": own.fovea, "spacing": own.spacing, "pooling": own.pooling}
+        retina = self.retina
+        return {"kind": self.kind, "fovea": retina.fovea, "spacing": retina.spacing, "pooling": retina.pooling}
 
     @classmethod
     def width(cls, settings: Mapping[str, Any]) -> float:
@@ -232,55 +233,75 @@ class LogPolar(Sensor):
 
 
 def _size(image: Tensor) -> tuple[int, int]:
+    """Read the `(width, height)` of images `(B, C, H, W)`."""
     check_shape(image, "image", None, None, None, None)
     return image.shape[-1], image.shape[-2]
 
 
 def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
-    """Responses `(B, G, C, M, N)` of the receptors around fixations `(B, G, 2)`."""
+    """Compute the responses of receptors, each from the two levels of the pyramid that are nearest to its size.
+
+    Args:
+        levels: the pyramid, `(B, C, h, w)` each.
+        fixation: `(B, G, 2)`, in pixels of the finest level.
+        retina: layout of the receptors.
+
+    Returns:
+        Cortical images `(B, G, C, M, N)`.
+    """
     finest = levels[0]
     size = _size(finest)
     offset = _places(retina.numbers, size, fixation.dtype, finest.device)
     # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
     place = (2 * (fixation[:, :, None, None] + offset) + 1) / fixation.new_tensor(size) - 1
-    rings, many = offset.shape[0], fixation.shape[1]
+    rings = offset.shape[0]
     by_level = []
     for level, first, weight in _shares(retina.numbers, size, finest.dtype, finest.device):
         if level >= len(levels):
             break
         last = first + len(weight)
-        where = place[:, :, first:last].flatten(1, 2)
-        responses = F.grid_sample(levels[level].to(where), where, "bicubic", "border", align_corners=False)
-        responses = responses.to(finest).unflatten(2, (many, last - first)) * weight[:, None]
+        points = place[:, :, first:last].flatten(1, 2)
+        responses = F.grid_sample(levels[level].to(points), points, "bicubic", "border", align_corners=False)
+        responses = responses.to(finest).unflatten(2, (fixation.shape[1], last - first)) * weight[:, None]
         by_level.append(F.pad(responses, (0, 0, first, rings - last)))
     return torch.stack(by_level).sum(0).transpose(1, 2)
 
 
 def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: _Retina) -> Tensor:
-    """Images `(B, G, C, H, W)` from cortical images `(B, G, C, M, N)` of fixations `(B, G, 2)`."""
-    batch, many, _, rings, wedges = cortical.shape
+    """Project cortical images back, by bicubic interpolation between receptors.
+
+    Args:
+        cortical: `(B, G, C, M, N)`.
+        fixation: their fixations, `(B, G, 2)` in image pixels.
+        size: `(width, height)` of the images.
+        retina: layout of the receptors.
+
+    Returns:
+        Images `(B, G, C, H, W)`.
+    """
+    batch, number, _, rings, wedges = cortical.shape
     # Squares of longer distances overflow, and beyond this distance the view no longer changes.
     fixation = fixation.clamp(-_FARTHEST, _FARTHEST)
     x, y = (torch.arange(n, dtype=fixation.dtype, device=fixation.device) for n in size)
     scale = fixation.new_tensor(retina.scale)
-    across = ((x - fixation[..., :1]) / scale[0])[:, :, None, :]
-    down = ((y - fixation[..., 1:]) / scale[1])[:, :, :, None]
-    squared = across.square() + down.square()
+    x_offset = ((x - fixation[..., :1]) / scale[0])[:, :, None, :]
+    y_offset = ((y - fixation[..., 1:]) / scale[1])[:, :, :, None]
+    squared = x_offset.square() + y_offset.square()
     # The angle is not defined at the fixation itself, so no gradient may flow through it there.
     middle = squared == 0
-    across = torch.where(middle, torch.ones_like(squared), across)
+    x_offset = torch.where(middle, torch.ones_like(squared), x_offset)
     radius = torch.where(middle, torch.ones_like(squared), squared).sqrt()
-    angle = torch.atan2(down.expand_as(across), across)
+    angle = torch.atan2(y_offset.expand_as(x_offset), x_offset)
     radius = torch.where(middle, torch.zeros_like(squared), radius)
     ring = retina.fovea * torch.log1p(radius / retina.fovea) / retina.spacing - 0.5
     wedge = angle.remainder(2 * pi) * (wedges / (2 * pi))
     # Bicubic interpolation needs neighbours: those of the innermost ring lie on the opposite side of the fixation, and
     # the last wedge is next to the first.
-    whole = torch.cat([cortical[..., :2, :].flip(-2).roll(wedges // 2, -1), cortical], -2)
-    whole = torch.cat([whole[..., -1:], whole, whole[..., :2]], -1).flatten(0, 1)
-    where = torch.stack([2 * (wedge + 1) / (wedges + 2) - 1, 2 * (ring + 2) / (rings + 1) - 1], -1).flatten(0, 1)
-    images = F.grid_sample(whole.to(where), where, "bicubic", "border", align_corners=True)
-    return images.to(cortical).unflatten(0, (batch, many))
+    extended = torch.cat([cortical[..., :2, :].flip(-2).roll(wedges // 2, -1), cortical], -2)
+    extended = torch.cat([extended[..., -1:], extended, extended[..., :2]], -1).flatten(0, 1)
+    points = torch.stack([2 * (wedge + 1) / (wedges + 2) - 1, 2 * (ring + 2) / (rings + 1) - 1], -1).flatten(0, 1)
+    images = F.grid_sample(extended.to(points), points, "bicubic", "border", align_corners=True)
+    return images.to(cortical).unflatten(0, (batch, number))
 
 
 @constant
@@ -301,7 +322,8 @@ def _shares(
 ) -> list[tuple[int, int, Tensor]]:
     """List the levels of the pyramid that are read: number, first ring that reads it, and weights of the rings."""
     retina = _Retina(*numbers)
-    rings, top = retina.receptors(size)[0], retina.levels(size)
+    rings, _ = retina.receptors(size)
+    top = retina.levels(size)
     levels = [min(retina.level(retina.eccentricity(ring)), top) for ring in range(rings)]
     shares = []
     for level in range(top + 1):

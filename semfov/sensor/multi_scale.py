@@ -52,9 +52,9 @@ class MultiScaleFovea(Sensor):
 
     def __init__(self, side: float = 160, scales: float = 4) -> None:
         super().__init__()
-        for name, value, most in (("side", side, 4096), ("scales", scales, 16)):
-            whole = int(value) if float(value).is_integer() else value
-            check_whole(whole, name, 1, most)
+        for name, value, largest in (("side", side, 4096), ("scales", scales, 16)):
+            # Files of settings may hold whole numbers as floats.
+            check_whole(int(value) if float(value).is_integer() else value, name, 1, largest)
         self.side = int(side)
         self.scales = self.crops = int(scales)
 
@@ -131,12 +131,15 @@ class MultiScaleFovea(Sensor):
         windows = self.windows(fixation[:, 0])
         x, y = (torch.arange(n, dtype=windows.dtype, device=crops.device) + 0.5 for n in size)
         picture = crops.new_zeros(len(crops), crops.shape[2], size[1], size[0])
+        # The coarsest crop first: finer ones are laid over it.
         for scale in reversed(range(self.scales)):
-            low, side = windows[:, scale, :2], self.side * 2**scale
-            across, down = (2 * (place - low[:, axis, None]) / side - 1 for axis, place in enumerate((x, y)))
-            where = torch.stack(torch.broadcast_tensors(across[:, None, :], down[:, :, None]), -1)
-            crop = F.grid_sample(crops[:, scale].to(where), where, "bilinear", "border", align_corners=False).to(crops)
-            picture = torch.where((where.abs() <= 1).all(-1)[:, None], crop, picture)
+            corner = windows[:, scale, :2]
+            side = self.side * 2**scale
+            columns = 2 * (x - corner[:, :1]) / side - 1
+            rows = 2 * (y - corner[:, 1:]) / side - 1
+            place = torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
+            crop = F.grid_sample(crops[:, scale].to(place), place, "bilinear", "border", align_corners=False).to(crops)
+            picture = torch.where((place.abs() <= 1).all(-1)[:, None], crop, picture)
         return picture
 
     def boxes_to_canvas(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor, boxes: Tensor) -> Tensor:
@@ -160,24 +163,25 @@ class MultiScaleFovea(Sensor):
         return [cls.width(settings) * 2**scale for scale in range(int(settings["scales"]))]
 
     def _crop(self, plane: Tensor, fixation: Tensor, scale: int) -> Tensor:
-        """Crops `(B, G, C, side, side)` of one scale, from the means of its squares."""
+        """Cut crops `(B, G, C, side, side)` of one scale from the means of its squares, `(B, C, h, w)`."""
         step = 2**scale
         # Squares that start before 1 - step or after the last pixel show nothing: they are the border of the plane.
         first = fixation + 0.5 - self.side * step / 2 + step
         sizes = plane.shape[-1], plane.shape[-2]
         reach = torch.tensor([float(n + self.side * step) for n in sizes], dtype=first.dtype, device=first.device)
         first = torch.minimum(torch.maximum(first, -reach), reach)
-        whole = first.detach().floor()
-        share = first - whole
+        square = first.detach().floor()
+        x, y = (first - square)[..., None, None, None].unbind(2)  # shares of the next square
         offsets = torch.arange(self.side, device=plane.device) * step
-        places = []
-        for axis, length in enumerate(sizes):
-            start = whole[..., axis, None].long() + offsets
-            places.append([(start + more).clamp(0, length - 1) for more in (0, 1)])
+        column = square[..., 0, None].long() + offsets
+        row = square[..., 1, None].long() + offsets
         # Rows first: they are contiguous in memory.
-        planes, image = plane.transpose(1, 2), torch.arange(len(plane), device=plane.device)[:, None, None]
-        x, y = share[..., 0, None, None, None], share[..., 1, None, None, None]
-        lines = planes[image, places[1][0]] * (1 - y) + planes[image, places[1][1]] * y
-        columns = [each[..., None, None, :].expand(*lines.shape[:-1], self.side) for each in places[0]]
-        crop = lines.gather(-1, columns[0]) * (1 - x) + lines.gather(-1, columns[1]) * x
-        return crop.transpose(-3, -2).to(plane.dtype)
+        planes = plane.transpose(1, 2)
+        image = torch.arange(len(plane), device=plane.device)[:, None, None]
+        upper = planes[image, row.clamp(0, sizes[1] - 1)]
+        lower = planes[image, (row + 1).clamp(0, sizes[1] - 1)]
+        lines = upper * (1 - y) + lower * y
+        columns = column[..., None, None, :].expand(*lines.shape[:-1], self.side)
+        left = lines.gather(-1, columns.clamp(0, sizes[0] - 1))
+        right = lines.gather(-1, (columns + 1).clamp(0, sizes[0] - 1))
+        return (left * (1 - x) + right * x).transpose(-3, -2).to(plane.dtype)

@@ -42,30 +42,40 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     """
     check_shape(panorama, "panorama", None, None, None, None)
     check(panorama.is_floating_point(), "panorama", "floating-point pixels", panorama.dtype)
-    batch, wide = panorama.shape[0], panorama.shape[-1]
-    check(wide % 2 == 0, "panorama", "an even number of columns, because a pole joins columns half a turn apart", wide)
+    batch = panorama.shape[0]
+    columns = panorama.shape[-1]
+    joins = "an even number of columns, because a pole joins columns half a turn apart"
+    check(columns % 2 == 0, "panorama", joins, columns)
     check_shape(pose, "pose", 3)
-    fits = pose.ndim in (2, 3) and pose.shape[0] == batch
-    check(fits, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
+    by_panorama = pose.ndim in (2, 3) and pose.shape[0] == batch
+    check(by_panorama, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
     poses = as_positions(pose if pose.ndim == 3 else pose[:, None], panorama)
     source = go_around(panorama, even=antialias)
 
-    result = stacked_views(
-        lambda b, g: sample(source[b], poses[b, g], size, antialias=antialias),
-        batch,
-        poses.shape[1],
-        panorama.new_empty(panorama.shape[1], size[1], size[0]),
-    )
-    return result if pose.ndim == 3 else result[:, 0]
+    def view(b: int, g: int) -> Tensor:
+        return sample(source[b], poses[b, g], size, antialias=antialias)
+
+    no_view = panorama.new_empty(panorama.shape[1], size[1], size[0])
+    views = stacked_views(view, batch, poses.shape[1], no_view)
+    return views if pose.ndim == 3 else views[:, 0]
 
 
 def go_around(panorama: Tensor, *, even: bool = True) -> Tensor:
-    """A panorama `(..., H, W)`, smoothed (`_even_rows`), with a border that continues it beyond sides and poles."""
+    """Continue a panorama beyond its sides and poles by a border of one pixel.
+
+    Args:
+        panorama: `(..., H, W)`.
+        even: smooth its rows to one resolution first (`_even_rows`).
+
+    Returns:
+        `(..., H + 2, W + 2)`.
+    """
     panorama = _even_rows(panorama) if even else panorama
     half = panorama.shape[-1] // 2
-    above, below = panorama[..., :1, :].roll(half, -1), panorama[..., -1:, :].roll(half, -1)
-    high = torch.cat([above, panorama, below], -2)
-    return torch.cat([high[..., -1:], high, high[..., :1]], -1)
+    above = panorama[..., :1, :].roll(half, -1)
+    below = panorama[..., -1:, :].roll(half, -1)
+    rows = torch.cat([above, panorama, below], -2)
+    return torch.cat([rows[..., -1:], rows, rows[..., :1]], -1)
 
 
 def _even_rows(panorama: Tensor) -> Tensor:
@@ -75,38 +85,58 @@ def _even_rows(panorama: Tensor) -> Tensor:
     over :math:`\min(1 / \cos\varphi, W)` pixels around it. The integral of a row is piecewise linear, so the mean is
     exact for any width.
     """
-    high, wide = panorama.shape[-2:]
-    latitude = (torch.arange(high, dtype=torch.float64, device=panorama.device) + 0.5) / high - 0.5
-    width = (1 / (latitude * torch.pi).cos()).clamp(max=wide)
+    rows, columns = panorama.shape[-2:]
+    latitude = (torch.arange(rows, dtype=torch.float64, device=panorama.device) + 0.5) / rows - 0.5
+    width = (1 / (latitude * torch.pi).cos()).clamp(max=columns)
     # In float64, because a mean is a small difference of long sums.
     twice = torch.cat([panorama, panorama], -1).double()
     total = F.pad(twice.cumsum(-1), (1, 0))
-    middle = torch.arange(wide, dtype=torch.float64, device=panorama.device) + wide / 2 + 0.5
+    middle = torch.arange(columns, dtype=torch.float64, device=panorama.device) + columns / 2 + 0.5
 
-    def up_to(place: Tensor) -> Tensor:
-        low = place.floor().long().clamp(0, 2 * wide - 1)
-        index = low.expand(*panorama.shape[:-2], high, wide)
-        return total.gather(-1, index) + (place - low) * twice.gather(-1, index)
+    def integral(place: Tensor) -> Tensor:
+        """Integrate each row from its begin to the places `(H, W)`."""
+        pixel = place.floor().long().clamp(0, 2 * columns - 1)
+        index = pixel.expand(*panorama.shape[:-2], rows, columns)
+        return total.gather(-1, index) + (place - pixel) * twice.gather(-1, index)
 
-    means = (up_to(middle + width[:, None] / 2) - up_to(middle - width[:, None] / 2)) / width[:, None]
-    return means.roll(wide // 2, -1).to(panorama)
+    means = (integral(middle + width[:, None] / 2) - integral(middle - width[:, None] / 2)) / width[:, None]
+    return means.roll(columns // 2, -1).to(panorama)
 
 
 def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bool = True) -> Tensor:
-    """A view `(C, h, w)` of a panorama `(C, H + 2, W + 2)` with the border of `go_around`; see `perspective`."""
-    (wide, high), (columns, rows) = (source.shape[-1] - 2, source.shape[-2] - 2), size
+    """Compute one view of one panorama; see `perspective`.
+
+    Args:
+        source: the panorama `(C, H + 2, W + 2)`, with the border of `go_around`.
+        pose: `(3,)`, yaw, pitch and field of view in degrees.
+        size: `(width, height)` of the view, `(w, h)`.
+        antialias: take the mean of several samples for each pixel where the view shrinks the panorama.
+
+    Returns:
+        `(C, h, w)`.
+    """
+    width = source.shape[-1] - 2
+    height = source.shape[-2] - 2
     camera = Camera(pose, size)
-    times = 1
-    if antialias:
-        known = values_known(pose)
-        check(known, "antialias", "False where the pose is not known, as in vmap and torch.export", antialias)
-        times = max(1, math.ceil(wide / (2 * math.pi * float(camera.focal.detach())) - 1e-6))
-    y, x = (
-        (torch.arange(n * times, dtype=pose.dtype, device=pose.device) + 0.5) / times - 0.5 for n in (rows, columns)
-    )
+    samples = _samples(camera, width) if antialias else 1
+    x = _sample_positions(size[0], samples, pose)
+    y = _sample_positions(size[1], samples, pose)
     grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1)
-    points = panorama_points(camera.directions(grid.flatten(0, 1)), (wide, high)).unflatten(0, grid.shape[:2])
-    place = (2 * points + 3) / points.new_tensor([wide + 2, high + 2]) - 1
+    points = panorama_points(camera.directions(grid.flatten(0, 1)), (width, height)).unflatten(0, grid.shape[:2])
+    place = (2 * points + 3) / points.new_tensor([width + 2, height + 2]) - 1
     place = as_positions(place, source)
     view = F.grid_sample(source[None].to(place.dtype), place[None], mode="bilinear", align_corners=False)
-    return (F.avg_pool2d(view, times) if times > 1 else view)[0].to(source.dtype)
+    return (F.avg_pool2d(view, samples) if samples > 1 else view)[0].to(source.dtype)
+
+
+def _samples(camera: Camera, width: int) -> int:
+    """Count the samples along each axis for a pixel of a view: panorama pixels that one in its middle covers."""
+    known = values_known(camera.pose)
+    check(known, "antialias", "False where the pose is not known, as in vmap and torch.export", True)
+    return max(1, math.ceil(width / (2 * math.pi * float(camera.focal.detach())) - 1e-6))
+
+
+def _sample_positions(pixels: int, samples: int, like: Tensor) -> Tensor:
+    """Place several samples in each pixel of a line, evenly, `(pixels · samples,)`."""
+    index = torch.arange(pixels * samples, dtype=like.dtype, device=like.device)
+    return (index + 0.5) / samples - 0.5

@@ -19,7 +19,8 @@ _AHEAD = frozenset({"cpu"})
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 # Input pixels that one tile covers, down and across: with fewer the products are slow, with more they multiply more
 # zeros. Across they are slow sooner, and tiles that enlarge have four times as many output pixels.
-_REDUCED, _EXPANDED = (8, 32), (8, 16)
+_REDUCED = (8, 32)
+_EXPANDED = (8, 16)
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,17 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
 
 
 def reduce(image: Tensor, convention: Convention) -> Tensor:
-    """`pyrdown` without the checks, of what is wide enough (`widened`)."""
+    """Compute `pyrdown` without its checks.
+
+    This is the one place where a level is reduced, by Kornia or by the matrices of `semfov.sensor.lines`.
+
+    Args:
+        image: `(B, C, H, W)`, of half precision only where the device computes with it (`widened`).
+        convention: `kornia` or `opencv`.
+
+    Returns:
+        `(B, C, H', W')`.
+    """
     if _runs_in_kornia(image, convention):
         # Imported when first needed: Kornia takes a quarter of a second.
         from kornia.geometry import transform
@@ -114,13 +125,22 @@ def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "korni
 
 
 def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tensor:
-    """`pyrup` without the checks, of what is wide enough (`widened`)."""
+    """Compute `pyrup` without its checks, the one place where a level is enlarged.
+
+    Args:
+        image: `(B, C, H, W)`, of half precision only where the device computes with it (`widened`).
+        size: `(height, width)` of the result.
+        convention: `kornia` or `opencv`.
+
+    Returns:
+        `(B, C, *size)`.
+    """
     if _runs_in_kornia(image, convention, size):
         from kornia.geometry import transform
 
         return transform.pyrup(image.contiguous())
-    before, after = (image.shape[-2], image.shape[-1]), (size[0], size[1])
-    return separable(image, *expanding(before, after, convention, image.dtype, image.device))
+    before = (image.shape[-2], image.shape[-1])
+    return separable(image, *expanding(before, (size[0], size[1]), convention, image.dtype, image.device))
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
@@ -163,24 +183,31 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     ([(64, 48), (32, 24), (16, 12)], (8, 6))
     """
     _check(image, convention, levels)
-    details, dtype, image = [], image.dtype, widened(image)
+    bands = []
+    level = widened(image)
     for _ in range(levels):
-        smaller = reduce(image, convention)
-        expanded = expand(smaller, (image.shape[-2], image.shape[-1]), convention)
-        # Allocating memory costs more than the subtraction, so it is done only where a gradient or a graph needs it.
-        fresh = expanded.requires_grad or not values_known(expanded)
-        details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
-        image = smaller
-    return Bands(tuple(band.to(dtype) for band in details), image.to(dtype), convention)
+        coarser = reduce(level, convention)
+        expanded = expand(coarser, (level.shape[-2], level.shape[-1]), convention)
+        bands.append(_subtract(level, expanded))
+        level = coarser
+    return Bands(tuple(band.to(image.dtype) for band in bands), level.to(image.dtype), convention)
+
+
+def _subtract(level: Tensor, expanded: Tensor) -> Tensor:
+    """Compute `level - expanded`, which is written over: allocating memory costs more than the subtraction."""
+    # A gradient or a graph needs the tensor as it is.
+    if expanded.requires_grad or not values_known(expanded):
+        return level - expanded
+    return torch.sub(level, expanded, out=expanded)
 
 
 def widened(image: Tensor) -> Tensor:
-    """An image of half precision in float32 on a CPU, which computes with it ten times faster."""
+    """Convert an image of half precision to float32 on a CPU, which computes with it ten times faster."""
     return image.float() if image.dtype in (torch.float16, torch.bfloat16) and image.device.type == "cpu" else image
 
 
 def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int] | None = None) -> bool:
-    """Whether Kornia computes the next level of `image`, or enlarges it to `size`, instead of our matrices."""
+    """Tell whether Kornia computes the next level of `image`, or enlarges it to `size`, instead of our matrices."""
     # Kornia computes its own convention on devices where `benchmarks.pyramid` does not measure ours as faster. Ours
     # computes what Kornia does not define (fewer than three pixels along an axis, other sizes than twice the image's),
     # and where Kornia would be less exact or not deterministic.
@@ -191,7 +218,9 @@ def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int]
     # default. The gradient of reflected borders has no deterministic algorithm on CUDA.
     if channels == 1 or torch.are_deterministic_algorithms_enabled():
         return False
-    return min(height, width) > 2 if size is None else min(height, width) > 1 and tuple(size) == (2 * height, 2 * width)
+    if size is None:
+        return min(height, width) > 2
+    return min(height, width) > 1 and tuple(size) == (2 * height, 2 * width)
 
 
 def _check(image: Tensor, convention: Convention, levels: int | None = None) -> None:
@@ -207,7 +236,7 @@ def _check(image: Tensor, convention: Convention, levels: int | None = None) -> 
 def _reducing(
     height: int, width: int, convention: Convention, dtype: torch.dtype, device: torch.device
 ) -> tuple[Lines, Lines]:
-    """The matrices of `pyrdown` for the columns and the rows of an image."""
+    """Make the matrices of `pyrdown` for the columns and the rows of an image."""
     lines = []
     for count, shift in zip((height, width), _REDUCED, strict=True):
         if convention == "opencv":
@@ -223,16 +252,22 @@ def _reducing(
 def expanding(
     before: tuple[int, int], after: tuple[int, int], convention: Convention, dtype: torch.dtype, device: torch.device
 ) -> tuple[Lines, Lines]:
-    """The matrices of `pyrup` for the columns and the rows of an image of one size that get another."""
+    """Make the matrices of `pyrup` for the columns and the rows of an image.
+
+    Args:
+        before: `(height, width)` of the image.
+        after: `(height, width)` of the result.
+        convention: `kornia` or `opencv`.
+        dtype: dtype of the matrices.
+        device: device of the matrices.
+
+    Returns:
+        The matrix of the columns, and that of the rows.
+    """
     lines = []
     for count, length, shift in zip(before, after, _EXPANDED, strict=True):
         if convention == "opencv":
-            # The blur of a line with zeros in between, mirrored before its first pixel and continued after its last.
-            place = torch.arange(length)[:, None]
-            half = place.div(2, rounding_mode="floor")
-            index = torch.where(place % 2 == 0, half + torch.tensor([-1, 0, 1]), half + torch.tensor([0, 1, 1]))
-            weight = torch.where(place % 2 == 0, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
-            taps = Taps(torch.where(index < 0, min(1, count - 1), index.clamp(max=count - 1)), weight.double())
+            taps = _stuff_and_blur(count, length)
         else:
             taps = _compose(_blur(torch.arange(length), length), _resize(count, length, dtype))
         drift = abs(length - 2 * count)
@@ -240,17 +275,30 @@ def expanding(
     return lines[0], lines[1]
 
 
+def _stuff_and_blur(count: int, length: int) -> Taps:
+    """Make the taps of OpenCV's enlargement: the blur of a line with zeros in between.
+
+    The line is mirrored before its first pixel, and continued after its last one.
+    """
+    place = torch.arange(length)[:, None]
+    half = place.div(2, rounding_mode="floor")
+    even = place % 2 == 0
+    index = torch.where(even, half + torch.tensor([-1, 0, 1]), half + torch.tensor([0, 1, 1]))
+    weight = torch.where(even, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
+    mirrored = torch.where(index < 0, min(1, count - 1), index.clamp(max=count - 1))
+    return Taps(mirrored, weight.double())
+
+
 def _blur(place: Tensor, count: int) -> Taps:
-    """The five taps of the blur at some pixels of a line of `count` pixels, mirrored at its outermost pixels."""
+    """Make the five taps of the blur at some pixels of a line of `count` pixels, mirrored at its outermost pixels."""
     # A line of one or two pixels is mirrored repeatedly, as `BORDER_REFLECT_101` of OpenCV does.
     index = (place[:, None] + torch.arange(-2, 3)).abs() % max(2 * count - 2, 1)
-    return Taps(
-        torch.minimum(index, 2 * count - 2 - index), torch.tensor(_BLUR, dtype=torch.float64).expand(len(place), 5)
-    )
+    weight = torch.tensor(_BLUR, dtype=torch.float64).expand(len(place), 5)
+    return Taps(torch.minimum(index, 2 * count - 2 - index), weight)
 
 
 def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
-    """Taps of linear interpolation from `count` pixels to `length`, pixels as areas, without antialiasing."""
+    """Make the taps of linear interpolation from `count` pixels to `length`, as areas, without antialiasing."""
     # Positions are rounded in the same way as in `torch.nn.functional.interpolate`.
     place = torch.arange(length, dtype=torch.promote_types(dtype, torch.float32)) + 0.5
     place = (place * (torch.tensor(count).to(place) / length) - 0.5).clamp(0, count - 1).double()
@@ -260,6 +308,6 @@ def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
 
 
 def _compose(outer: Taps, inner: Taps) -> Taps:
-    """Taps of `outer` applied to the result of `inner`."""
-    index, weight = inner.index[outer.index], outer.weight[..., None] * inner.weight[outer.index]
-    return Taps(index.flatten(1), weight.flatten(1))
+    """Make the taps of a filter `outer` of the result of a filter `inner`."""
+    weight = outer.weight[..., None] * inner.weight[outer.index]
+    return Taps(inner.index[outer.index].flatten(1), weight.flatten(1))

@@ -13,32 +13,47 @@ from semfov.errors import check, check_shape, values_known
 
 
 def panorama_directions(points: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Directions `(..., 3)`, unit vectors, of pixels `(..., 2)` of an equirectangular panorama.
+    r"""Compute the directions of pixels of an equirectangular panorama.
 
     .. math:: \lambda = 360° \frac{x + ½}{W} - 180°, \quad \varphi = 90° - 180° \frac{y + ½}{H}, \quad
               d = (\cos\varphi \sin\lambda, -\sin\varphi, \cos\varphi \cos\lambda)
 
     where the longitude λ increases to the right from the middle, and the latitude φ increases upwards from the horizon.
+
+    Args:
+        points: `(..., 2)`, in pixels of the panorama.
+        size: its `(width, height)`, `(W, H)`.
+
+    Returns:
+        Unit vectors `(..., 3)`.
     """
     check_shape(points, "points", 2)
     longitude = (points[..., 0] + 0.5) * (2 * torch.pi / size[0]) - torch.pi
     latitude = torch.pi / 2 - (points[..., 1] + 0.5) * (torch.pi / size[1])
-    across = latitude.cos()
-    return torch.stack([across * longitude.sin(), -latitude.sin(), across * longitude.cos()], -1)
+    radius = latitude.cos()  # of the circle of latitude
+    return torch.stack([radius * longitude.sin(), -latitude.sin(), radius * longitude.cos()], -1)
 
 
 def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
-    """Pixels `(..., 2)` of directions `(..., 3)` in an equirectangular panorama, the inverse of `panorama_directions`.
+    """Compute the pixels of directions in an equirectangular panorama, the inverse of `panorama_directions`.
 
-    x is from -½ to W - ½. At a pole x is arbitrary, and no gradient flows through it.
+    Args:
+        directions: `(..., 3)`.
+        size: `(width, height)` of the panorama, `(W, H)`.
+
+    Returns:
+        Points `(..., 2)`; x is from -½ to W - ½. At a pole x is arbitrary, and no gradient flows through it.
     """
     check_shape(directions, "directions", 3)
     x, y, z = directions.unbind(-1)
     squared = x.square() + z.square()
     pole = squared <= 1e-12 * (squared + y.square())
-    one, zero = torch.ones_like(x), torch.zeros_like(x)
-    longitude = torch.atan2(torch.where(pole, zero, x), torch.where(pole, one, z))
-    latitude = torch.atan2(-y, torch.where(pole, zero, torch.where(pole, one, squared).sqrt()))
+    zero = torch.zeros_like(x)
+    unit = torch.ones_like(x)
+    longitude = torch.atan2(torch.where(pole, zero, x), torch.where(pole, unit, z))
+    # The inner choice keeps the gradient of the root finite where the outer one does not take it.
+    radius = torch.where(pole, zero, torch.where(pole, unit, squared).sqrt())
+    latitude = torch.atan2(-y, radius)
     column = (longitude + torch.pi) * (size[0] / (2 * torch.pi)) - 0.5
     # A longitude that is rounded up to half a turn belongs to the other end of the row.
     column = torch.where(column >= size[0] - 0.5, column - size[0], column)
@@ -75,12 +90,26 @@ class Camera:
     def rotation(self) -> Tensor:
         """Rotation R, `(..., 3, 3)`, from the frame of the camera to the frame of the sphere."""
         yaw, pitch = torch.deg2rad(self.pose[..., :2]).unbind(-1)
-        (sy, cy), (sp, cp) = (yaw.sin(), yaw.cos()), (pitch.sin(), pitch.cos())
-        rows = [cy, sy * sp, sy * cp, torch.zeros_like(cy), cp, -sp, -sy, cy * sp, cy * cp]
-        return torch.stack(rows, -1).unflatten(-1, (3, 3))
+        sin_yaw = yaw.sin()
+        cos_yaw = yaw.cos()
+        sin_pitch = pitch.sin()
+        cos_pitch = pitch.cos()
+        entries = [
+            *(cos_yaw, sin_yaw * sin_pitch, sin_yaw * cos_pitch),
+            *(torch.zeros_like(cos_yaw), cos_pitch, -sin_pitch),
+            *(-sin_yaw, cos_yaw * sin_pitch, cos_yaw * cos_pitch),
+        ]
+        return torch.stack(entries, -1).unflatten(-1, (3, 3))
 
     def directions(self, points: Tensor) -> Tensor:
-        """Compute the directions of pixels of the camera's image."""
+        """Compute the directions of pixels of the camera's image.
+
+        Args:
+            points: `(..., N, 2)`, in pixels.
+
+        Returns:
+            Unit vectors `(..., N, 3)` in the frame of the sphere.
+        """
         check_shape(points, "points", None, 2)
         middle = points.new_tensor(self.size) / 2 - 0.5
         flat = (points - middle) / self.focal[..., None, None]
@@ -88,7 +117,14 @@ class Camera:
         return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
 
     def points(self, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the pixels of directions in the camera's image, and whether they are inside it, `(..., N, 2)`."""
+        """Compute the pixels of directions in the camera's image.
+
+        Args:
+            directions: `(..., N, 3)`, in the frame of the sphere.
+
+        Returns:
+            Points `(..., N, 2)`, infinite behind the camera, and whether they are inside the image, `(..., N)`.
+        """
         check_shape(directions, "directions", None, 3)
         rays = _turn(self.rotation.mT, directions)
         ahead = rays[..., 2] > 0
@@ -100,6 +136,7 @@ class Camera:
 
 
 def _turn(rotation: Tensor, rays: Tensor) -> Tensor:
+    """Multiply rays `(..., N, 3)` by a rotation `(..., 3, 3)`."""
     # Autocast would compute a matrix product in 16 bits, which is less exact than a pixel.
     return (rotation[..., None, :, :] * rays[..., None, :]).sum(-1)
 
@@ -111,24 +148,29 @@ class Boxes:
     boxes: Tensor
 
     def __len__(self) -> int:
-        """Number of regions."""
+        """Count the regions."""
         return len(self.boxes)
 
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """The selected regions."""
+        """Select regions."""
         return replace(self, boxes=self.boxes[index])
 
     def samples(self, count: int = 9) -> Tensor:
-        """Points on a regular grid over each region, its borders included, `(M, count², D)`."""
+        """Place `count²` points on a regular grid over each region, its borders included, `(M, count², D)`."""
         share = torch.linspace(0, 1, count).to(self.boxes)
         y, x = torch.meshgrid(share, share, indexing="ij")
-        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
-        return low + torch.stack([x, y], -1).flatten(0, 1) * (high - low) - 0.5
+        return self._points_at(torch.stack([x, y], -1).flatten(0, 1))
+
+    def _points_at(self, shares: Tensor) -> Tensor:
+        """Compute the points `(M, P, 2)` at shares `(P, 2)` of the sides of each region, from its upper left corner."""
+        corner = self.boxes[:, None, :2]
+        return corner + shares * (self.boxes[:, None, 2:] - corner) - 0.5
 
     def contain(self, points: Tensor) -> Tensor:
-        """Whether each region contains each of the points `(N, D)`, `(M, N)` boolean."""
-        low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
-        return ((points >= low) & (points <= high)).all(-1)
+        """Tell whether each region contains each of the points `(N, D)`, `(M, N)` boolean."""
+        upper_left = self.boxes[:, None, :2] - 0.5
+        lower_right = self.boxes[:, None, 2:] - 0.5
+        return ((points >= upper_left) & (points <= lower_right)).all(-1)
 
 
 @dataclass(frozen=True)
@@ -138,25 +180,25 @@ class Regions(Boxes):
     camera: Camera
 
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """The selected regions."""
+        """Select regions."""
         return replace(self, boxes=self.boxes[index], camera=Camera(self.camera.pose[index], self.camera.size))
 
     def contain(self, points: Tensor) -> Tensor:
-        """Whether each region contains each of the directions `(N, 3)`, `(M, N)` boolean."""
+        """Tell whether each region contains each of the directions `(N, 3)`, `(M, N)` boolean."""
         return super().contain(self.camera.points(points)[0])
 
     def samples(self, count: int = 9) -> Tensor:
-        """Directions on a grid over each region, its borders included, `(M, count², 3)`."""
+        """Place `count²` directions on a grid over each region, its borders included, `(M, count², 3)`."""
         return self.camera.directions(super().samples(count))
 
     def outlines(self, count: int = 33) -> Tensor:
-        """Sample directions along the closed border of each region."""
+        """Sample directions along the closed border of each region, `count` on each side, `(M, 4 · count, 3)`."""
         share = torch.linspace(0, 1, count).to(self.boxes)
-        zero, one = torch.zeros_like(share), torch.ones_like(share)
-        sides = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]
-        at = torch.cat([torch.stack(side, -1) for side in sides])
-        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
-        return self.camera.directions(low + at * (high - low) - 0.5)
+        start = torch.zeros_like(share)
+        end = torch.ones_like(share)
+        sides = [(share, start), (end, share), (1 - share, end), (start, 1 - share)]
+        shares = torch.cat([torch.stack(side, -1) for side in sides])
+        return self.camera.directions(self._points_at(shares))
 
     def panorama_boxes(self, size: tuple[int, int]) -> Tensor:
         """Compute the smallest boxes around the regions in an equirectangular panorama, `(M, 4)`.
@@ -170,13 +212,14 @@ class Regions(Boxes):
         width = float(size[0])
         # Neighbouring points of an outline are less than half a turn apart.
         step = (x.diff(dim=-1) + width / 2) % width - width / 2
-        along = torch.cat([x[:, :1], x[:, :1] + step.cumsum(-1)], -1)
-        left, right = along.amin(-1), along.amax(-1)
+        unrolled = torch.cat([x[:, :1], x[:, :1] + step.cumsum(-1)], -1)
+        leftmost = unrolled.amin(-1)
+        rightmost = unrolled.amax(-1)
         poles = x.new_tensor([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
-        up, down = self.contain(poles).unbind(-1)
-        around = up | down
-        first = torch.where(around, torch.zeros_like(left), (left + 0.5) % width)
-        top = torch.where(up, 0.0, y.amin(-1) + 0.5)
-        bottom = torch.where(down, float(size[1]), y.amax(-1) + 0.5)
-        last = torch.where(around, torch.full_like(first, width), first + right - left)
-        return torch.stack([first, top, last, bottom], -1)
+        zenith, nadir = self.contain(poles).unbind(-1)
+        any_pole = zenith | nadir
+        x1 = torch.where(any_pole, torch.zeros_like(leftmost), (leftmost + 0.5) % width)
+        y1 = torch.where(zenith, 0.0, y.amin(-1) + 0.5)
+        x2 = torch.where(any_pole, torch.full_like(x1, width), x1 + rightmost - leftmost)
+        y2 = torch.where(nadir, float(size[1]), y.amax(-1) + 0.5)
+        return torch.stack([x1, y1, x2, y2], -1)
