@@ -7,7 +7,7 @@ from semfov.errors import check_shape
 
 
 def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:
-    r"""Likelihood of every class in every cell, given all detections of a look.
+    r"""Compute the likelihood of every class in every cell, given all detections of a look.
 
     .. math:: \lambda_k(x) = m_k(x) + \sum_l w_l(x) \, \frac{p(S_l \mid k, d_l)}{p(S_l \mid 0, d_l)},
               \qquad \lambda_0(x) = 1
@@ -36,12 +36,13 @@ def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:
     """
     check_shape(ratio, "ratio", None, None, miss.shape[-1])
     check_shape(weight, "weight", *ratio.shape[:2], miss.shape[-2])
-    seen = weight.mT @ ratio[..., 1:]
-    return torch.cat([torch.ones_like(miss[..., :1]), miss[..., 1:] + seen], -1)
+    detected = weight.mT @ ratio[..., 1:]
+    background = torch.ones_like(miss[..., :1])
+    return torch.cat([background, miss[..., 1:] + detected], -1)
 
 
 def refuted(weight: Tensor, covered: Tensor, visited: Tensor, share: Tensor) -> Tensor:
-    r"""Weights of detections after cells were fixated that do not hold the target.
+    r"""Lower the weights of detections after cells were fixated that do not hold the target.
 
     .. math:: w_l(x) \leftarrow w_l(x) \, (1 - \rho \max_{f} c_l(f))
 
@@ -63,5 +64,5 @@ def refuted(weight: Tensor, covered: Tensor, visited: Tensor, share: Tensor) -> 
     """
     check_shape(covered, "covered", *weight.shape)
     check_shape(visited, "visited", weight.shape[0], weight.shape[-1])
-    most = (covered * visited[:, None]).amax(-1, keepdim=True)
-    return weight * (1 - share * most)
+    fixated = (covered * visited[:, None]).amax(-1, keepdim=True)
+    return weight * (1 - share * fixated)

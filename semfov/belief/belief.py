@@ -18,13 +18,21 @@ _DataClass = TypeVar("_DataClass")
 
 
 def with_fields(instance: _DataClass, change: Callable[[Any], Any]) -> _DataClass:
-    """Copy of a data class with every field changed; of a field that is a tuple, every value in it."""
+    """Copy a data class with every field changed; of a field that is a tuple, every value in it.
+
+    Args:
+        instance: the data class.
+        change: maps a value to the new one.
+
+    Returns:
+        The copy.
+    """
 
     def changed(value: Any) -> Any:
-        return tuple(changed(each) for each in value) if isinstance(value, tuple) else change(value)
+        return tuple(changed(part) for part in value) if isinstance(value, tuple) else change(value)
 
-    values = {each.name: changed(getattr(instance, each.name)) for each in fields(instance)}  # type: ignore[arg-type]
-    return replace(instance, **values)  # type: ignore[type-var]
+    names = [field.name for field in fields(instance)]  # type: ignore[arg-type]
+    return replace(instance, **{name: changed(getattr(instance, name)) for name in names})  # type: ignore[type-var]
 
 
 class Belief(ABC):
@@ -46,7 +54,7 @@ class Belief(ABC):
 
     @abstractmethod
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability that each cell holds the target, given all looks.
+        """Give the probability that each cell holds the target, given all looks.
 
         Args:
             target: class 1..K, or a tensor `(B,)` with one class for each episode. A belief about a single target
@@ -57,7 +65,7 @@ class Belief(ABC):
         """
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """Probability that each cell holds the target, given that no fixated cell holds it.
+        """Give the probability that each cell holds the target, given that no fixated cell holds it.
 
         This is the case while a search continues. The base class returns `probability`.
 
@@ -70,7 +78,7 @@ class Belief(ABC):
         return self.probability(target)
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """Probability that the target is anywhere in the image.
+        """Give the probability that the target is anywhere in the image.
 
         The base class returns a lower bound: the probability of the most probable cell.
 
@@ -83,7 +91,7 @@ class Belief(ABC):
         return self.probability(target).amax(-1)
 
     def class_probabilities(self) -> Tensor:
-        """Probability of every class in every cell.
+        """Give the probability of every class in every cell.
 
         Returns:
             `(B, X·Y, K+1)`, background first.
@@ -114,7 +122,7 @@ class Belief(ABC):
         return with_fields(self, mapped)
 
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """The belief of the selected episodes."""
+        """Select the belief of episodes."""
         return self.map(lambda tensor: tensor[index])
 
     def put(self, index: Tensor, other: Self) -> Self:
@@ -132,14 +140,15 @@ class Belief(ABC):
         tensor([[0.5000],
                 [0.7500]])
         """
-        theirs: list[Tensor] = []
+        tensors: list[Tensor] = []
 
         def collect(tensor: Tensor) -> Tensor:
-            theirs.append(tensor)
+            tensors.append(tensor)
             return tensor
 
+        # `map` goes through both beliefs in the same order.
         other.map(collect)
-        rows = iter(theirs)
+        rows = iter(tensors)
         return self.map(lambda tensor: tensor.index_copy(0, index, next(rows)))
 
     def detach(self) -> Self:
@@ -180,11 +189,11 @@ class DirichletBelief(Belief):
         return dirichlet.mean(self.beta)
 
     def class_probabilities(self) -> Tensor:
-        """The posterior of every class."""
+        """Give the posterior of every class, `(B, X·Y, K+1)`."""
         return self.probabilities
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Posterior of the target class in each cell, `(B, X·Y)`."""
+        """Give the posterior of the target class in each cell, `(B, X·Y)`."""
         return pick(self.beta, torch.as_tensor(target)) / self.beta.sum(-1)
 
 
@@ -199,7 +208,18 @@ def dirichlet_belief(belief: Belief) -> DirichletBelief:
 
 
 def pick(values: Tensor, target: Tensor) -> Tensor:
-    """The values of one class along the last dimension: values `(B, ..., K+1)`, target `(B,)` → `(B, ...)`."""
+    """Take the values of one class.
+
+    Args:
+        values: `(B, ..., K+1)`.
+        target: the class, `()`, or one for each episode, `(B,)`.
+
+    Returns:
+        `(B, ...)`.
+
+    Raises:
+        InputError: there is no such class.
+    """
     components = values.shape[-1]
     if values_known(target):
         inside = bool(((target >= 0) & (target < components)).all())
@@ -211,8 +231,18 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
 
 
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """Apply a function to each row `(B, ...)` alone, as rounding depends on the batch; an accelerator takes many."""
-    some = 1 if rows[0].device.type == "cpu" else max(1, _TOGETHER // max(1, rows[0].shape[1:].numel()))
-    if not values_known(*rows) or len(rows[0]) <= some:
+    """Apply a function to each row alone, because rounding depends on the batch; an accelerator takes many rows.
+
+    Args:
+        function: maps tensors `(b, ...)` to one tensor `(b, ...)`.
+        rows: its arguments for all rows, `(B, ...)`.
+
+    Returns:
+        `(B, ...)`.
+    """
+    on_cpu = rows[0].device.type == "cpu"
+    together = 1 if on_cpu else max(1, _TOGETHER // max(1, rows[0].shape[1:].numel()))
+    if not values_known(*rows) or len(rows[0]) <= together:
         return function(*rows)
-    return torch.cat([function(*part) for part in zip(*(row.split(some) for row in rows), strict=True)])
+    parts = zip(*(row.split(together) for row in rows), strict=True)
+    return torch.cat([function(*part) for part in parts])

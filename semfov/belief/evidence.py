@@ -60,24 +60,37 @@ class Evidence(PretrainedForEye):
         self.prior = nn.Parameter(torch.zeros(components))
 
     def _record(self) -> dict[str, Any]:
+        """List what a file holds beside tensors."""
         return {"widths": self.widths, "components": len(self.prior)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """Make the model of a file."""
         model = cls(*record["widths"], components=record["components"], metadata=record["metadata"])
         model.load_state_dict(tensors)
         return model
 
     def evidence(self, features: Tensor) -> Tensor:
-        """Evidence of looks, log odds `(...)`, from their features `(..., 10)` (`look_features`)."""
+        """Compute the evidence of looks, log odds `(...)`, from their features `(..., 10)` (`look_features`)."""
         return self.look(features)[..., 0]
 
     def unseen(self, like: Tensor) -> Tensor:
-        """Evidence of a look from one longer side away without detections, log odds `()`."""
+        """Compute the evidence of a look from one longer side away without detections, log odds `()`."""
         return self.evidence(nothing_seen(like.new_ones(1)))[0]
 
     def read_out(self, reader: nn.Module, nearest: Tensor, gathered: Gathered, columns: int, *more: Tensor) -> Tensor:
-        """Correct the evidence of the closest looks `(B, X·Y)` by a network that reads all gathered evidence."""
+        """Correct the evidence of the closest looks by a network that reads all gathered evidence.
+
+        Args:
+            reader: the network, of `READOUT` inputs and those in `more`.
+            nearest: `(B, X·Y)`, log odds of each cell from its closest look.
+            gathered: evidence of all looks.
+            columns: X, cells in a row.
+            more: further inputs, `(B, X·Y)` or `(B, 1)`.
+
+        Returns:
+            `(B, X·Y)`, log odds.
+        """
         odds = nearest.sigmoid()
         eccentricity, row = _places(columns, nearest.shape[-1] // columns, nearest.dtype, nearest.device)
         inputs = [
@@ -104,43 +117,54 @@ def apply_network(network: nn.Module, inputs: Sequence[Tensor], shape: torch.Siz
     """Apply a network with one output to its inputs, one tensor each, broadcast to `shape`."""
     # Each input is copied in one piece, and the matrix product reads the table transposed. To interleave the inputs
     # takes longer than the product.
-    return network(torch.stack([each.expand(shape) for each in inputs]).flatten(1).mT).view(shape)
+    table = torch.stack([values.expand(shape) for values in inputs]).flatten(1)
+    return network(table.mT).view(shape)
 
 
 def network(inputs: int, width: int, outputs: int = 1) -> nn.Sequential:
-    """A network with two hidden layers of `width` units."""
+    """Make a network with two hidden layers of `width` units."""
     hidden = nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
     return nn.Sequential(*hidden, nn.Linear(width, outputs))
 
 
 def nearness(distance: Tensor) -> Tensor:
-    """Weight in the mean of all looks for a look from a distance, in longer sides of the image: e^(-d/R)."""
+    """Weight a look from a distance d, in longer sides of the image, in the mean of all looks: e^(-d/R)."""
     return (-distance / _REACH).exp()
 
 
 def farther(keep: float) -> float:
-    """Increase of the distance, in longer sides of the image, that multiplies the nearness by `keep`."""
+    """Compute the increase of the distance, in longer sides of the image, that multiplies `nearness` by `keep`."""
     return -math.log(max(keep, sys.float_info.min)) * _REACH
 
 
 def logarithm(odds: Tensor) -> Tensor:
-    """Logarithm of probabilities or odds, kept finite and scaled to about unit size."""
+    """Take the logarithm of probabilities or odds, kept finite and scaled to about unit size."""
     return (odds + 1e-3).log() / 2 + 1
 
 
 def blur(values: Tensor, columns: int, sigma: float) -> Tensor:
-    """Gaussian average `(B, X·Y)` over the neighbourhood, with σ in cells; cells outside the grid count as 0."""
+    """Average maps over the neighbourhood of each cell, with Gaussian weights; cells outside the grid count as 0.
+
+    Args:
+        values: `(B, X·Y)`.
+        columns: X, cells in a row.
+        sigma: σ of the weights, in cells.
+
+    Returns:
+        `(B, X·Y)`.
+    """
     rows = values.shape[-1] // columns
-    across, down = (_averages(length, sigma, values.dtype, values.device) for length in (columns, rows))
+    along_rows = _averages(columns, sigma, values.dtype, values.device)
+    along_columns = _averages(rows, sigma, values.dtype, values.device)
     # One product for the lines of all maps: a convolution of one channel takes eight times as long.
-    blurred = across.mT @ values.reshape(-1, columns).mT
+    blurred = along_rows.mT @ values.reshape(-1, columns).mT
     lines = blurred.unflatten(-1, (-1, rows)).transpose(0, 1).reshape(-1, rows)
-    return (down.mT @ lines.mT).unflatten(-1, (-1, columns)).transpose(0, 1).flatten(1)
+    return (along_columns.mT @ lines.mT).unflatten(-1, (-1, columns)).transpose(0, 1).flatten(1)
 
 
 @constant
 def _averages(length: int, sigma: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix `(length, length)` whose product with a line is its Gaussian average over seven cells."""
+    """Make the matrix `(length, length)` whose product with a line is its Gaussian average over seven cells."""
     steps = torch.arange(-3, 4, device=device).to(dtype)
     kernel = (-steps.square() / (2 * sigma**2)).exp()
     kernel = kernel / kernel.sum()
@@ -151,17 +175,31 @@ def _averages(length: int, sigma: float, dtype: torch.dtype, device: torch.devic
 
 @constant
 def _places(columns: int, rows: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Squared distance of each cell from the centre, and its height, where both sides run from -1 to 1; `(X·Y,)`."""
-    across, down = (
-        torch.linspace(-1, 1, length).to(device, dtype) if length > 1 else torch.zeros(1, dtype=dtype, device=device)
-        for length in (columns, rows)
-    )
-    row, column = down.repeat_interleave(columns), across.repeat(rows)
-    return row.square() + column.square(), row
+    """Place the cells where both sides run from -1 to 1.
+
+    Args:
+        columns: X, cells in a row.
+        rows: Y, cells in a column.
+        dtype: dtype of the results.
+        device: device of the results.
+
+    Returns:
+        Squared distance of each cell from the centre, and its height, `(X·Y,)`.
+    """
+    x = _line(columns, dtype, device).repeat(rows)
+    y = _line(rows, dtype, device).repeat_interleave(columns)
+    return y.square() + x.square(), y
+
+
+def _line(length: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Place cells evenly from -1 to 1, a single one at 0, `(length,)`."""
+    if length == 1:
+        return torch.zeros(1, dtype=dtype, device=device)
+    return torch.linspace(-1, 1, length).to(device, dtype)
 
 
 def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
-    """Largest value in the square about each cell of maps `(T, rows, columns)`."""
+    """Find the largest value in the square of `side` cells about each cell of maps `(T, rows, columns)`."""
     # One axis after the other: fewer comparisons.
-    along = F.max_pool1d(values, side, 1, side // 2)
-    return F.max_pool1d(along.mT, side, 1, side // 2).mT
+    peaks = F.max_pool1d(values, side, 1, side // 2)
+    return F.max_pool1d(peaks.mT, side, 1, side // 2).mT

@@ -35,7 +35,7 @@ def _rule(rule: _Rule) -> _Rule:
 
 @_rule
 def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
-    r"""Kaplan's rule: match the mean of the exact posterior, and keep the parameter of the least likely class.
+    r"""Fuse by Kaplan's rule: match the mean of the exact posterior, and keep the least likely class's parameter.
 
     .. math:: \beta'_k = \beta_k \frac{1 + \lambda_k / D}{1 + \min_j \lambda_j / D}, \quad
               D = \sum_j \beta_j \lambda_j
@@ -68,7 +68,7 @@ def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
 
 @_rule
 def product(beta: Tensor, likelihood: Tensor) -> Tensor:
-    r"""Product rule: Bayes' rule for the mean, with one more unit of evidence.
+    r"""Fuse by the product rule: Bayes' rule for the mean, with one more unit of evidence.
 
     .. math:: \beta'_k = (1 + \sum_j \beta_j) \, \beta_k \lambda_k / \sum_j \beta_j \lambda_j
 
@@ -97,7 +97,7 @@ def product(beta: Tensor, likelihood: Tensor) -> Tensor:
 
 @_rule
 def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
-    r"""Sum rule: count the normalised likelihood as one soft observation.
+    r"""Fuse by the sum rule: count the normalised likelihood as one soft observation.
 
     .. math:: \beta'_k = \beta_k + \lambda_k / \sum_j \lambda_j
 
@@ -122,7 +122,7 @@ def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
 
 @_rule
 def semba(beta: Tensor, likelihood: Tensor) -> Tensor:
-    r"""The rule in the code of SemBA.
+    r"""Fuse by the rule in the code of SemBA.
 
     .. math:: \beta'_k = \beta_k \left(1 + \frac{\lambda_k / D}{1 + \min_j \lambda_j / D}\right), \quad
               D = \sum_j \beta_j \lambda_j

@@ -15,7 +15,20 @@ Footprint = Literal["overlap", "centre", "box_centre", "soft"]
 
 
 class _Layout(NamedTuple):
-    """Columns, then rows, of cells `(X+Y,)`, centres `(X·Y, 2)`, the size of a cell `(2,)`, the longer side `()`."""
+    """Places of the cells, with the dtype and device of what they are compared with.
+
+    The first five are about the lines of cells: first the X columns, then the Y rows.
+
+    Attributes:
+        axis: 0 for columns and 1 for rows, `(X+Y,)`.
+        start: where each line begins along its axis, `(X+Y,)`, in the coordinates of boxes.
+        end: where it ends.
+        middle: its middle.
+        half: half its width.
+        centres: centres of the cells as points, `(X·Y, 2)`.
+        cell: width and height of a cell, `(2,)`.
+        longest: longer side of the image, `()`.
+    """
 
     axis: Tensor
     start: Tensor
@@ -25,6 +38,11 @@ class _Layout(NamedTuple):
     centres: Tensor
     cell: Tensor
     longest: Tensor
+
+    def to(self, dtype: torch.dtype, device: torch.device) -> "_Layout":
+        """Convert the numbers, and move them with the indices to a device."""
+        _, *numbers = self
+        return _Layout(self.axis.to(device), *(values.to(device, dtype) for values in numbers))
 
 
 @dataclass(frozen=True)
@@ -58,7 +76,7 @@ class Grid:
         check(bool((size > 0).all()), "size", "a positive width and height", self.size)
 
     def __len__(self) -> int:
-        """Number of cells, X·Y."""
+        """Count the cells, X·Y."""
         return self.columns * self.rows
 
     @property
@@ -76,22 +94,29 @@ class Grid:
     def edges(self) -> Tensor:
         """Box `(x1, y1, x2, y2)` of every cell, `(X·Y, 4)` or `(B, X·Y, 4)`."""
         layout = self._layout()
-        middle, half = layout.centres + 0.5, layout.cell[..., None, :] / 2
+        middle = layout.centres + 0.5
+        half = layout.cell[..., None, :] / 2
         return torch.cat([middle - half, middle + half], -1)
 
     def _layout(self, like: Tensor | None = None) -> _Layout:
-        """The cells with the dtype and device of a tensor (None: those of the size); one size is laid out only once."""
-        dtype, device = (torch.get_default_dtype(), None) if like is None else (like.dtype, like.device)
+        """Lay out the cells, once for a size in numbers.
+
+        Args:
+            like: a tensor, whose dtype and device the layout takes; None takes those of the size.
+
+        Returns:
+            The layout.
+        """
         if isinstance(self.size, Tensor):
-            made = _layout(self.columns, self.rows, self.extent)
-            return made if like is None else _Layout(made.axis.to(device), *(each.to(like) for each in made[1:]))
-        width, height = self.size
-        return _layout_of_size(
-            self.columns, self.rows, width, height, torch.get_default_dtype(), dtype, device or torch.device("cpu")
-        )
+            layout = _layout(self.columns, self.rows, self.extent)
+            return layout if like is None else layout.to(like.dtype, like.device)
+        default = torch.get_default_dtype()
+        dtype = default if like is None else like.dtype
+        device = torch.device("cpu") if like is None else like.device
+        return _layout_of_size(self.columns, self.rows, *self.size, default, dtype, device)
 
     def cell_of(self, points: Tensor) -> Tensor:
-        """Cell that holds each point; for a point outside the image, the nearest cell.
+        """Find the cell that holds each point; for a point outside the image, the nearest cell.
 
         Args:
             points: `(..., 2)`, as `(x, y)` in pixels; `(B, ..., 2)` for a batch of sizes.
@@ -108,16 +133,16 @@ class Grid:
         check_shape(points, "points", 2)
         check_finite(points, "points")
         points = as_positions(points)
-        values = self._layout(points).cell
-        extra = points.ndim - values.ndim
-        aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
-        step = ((points + 0.5) / aligned.to(points)).floor()
-        column = step[..., 0].clamp(0, self.columns - 1).long()
-        row = step[..., 1].clamp(0, self.rows - 1).long()
+        cell = self._layout(points).cell
+        if cell.ndim > 1:
+            cell = cell.reshape(cell.shape[0], *[1] * (points.ndim - cell.ndim), 2)
+        place = ((points + 0.5) / cell.to(points)).floor()
+        column = place[..., 0].clamp(0, self.columns - 1).long()
+        row = place[..., 1].clamp(0, self.rows - 1).long()
         return row * self.columns + column
 
     def footprint(self, boxes: Tensor, rule: Footprint = "overlap") -> Tensor:
-        r"""Cells that each box covers.
+        r"""Find the cells that each box covers.
 
         - `overlap`: cells that share a positive area with the box. Luzio, Bernardino and Moreno (2024, section IV-A)
           update the cells that a detection overlaps; the other rules are not theirs.
@@ -151,29 +176,31 @@ class Grid:
         lookup(rule, get_args(Footprint), "footprint rule")
         boxes = as_positions(boxes)
         layout = self._layout(boxes)
-        # Both axes at once: for each line the sides of the boxes along its axis.
-        low, high = boxes.index_select(-1, layout.axis), boxes.index_select(-1, layout.axis + 2)
-        start, end, middle, half = (each if each.ndim == 1 else each[:, None] for each in layout[1:5])
+        # Both axes at once: for each line of cells the sides of the boxes along its axis.
+        lower = boxes.index_select(-1, layout.axis)
+        upper = boxes.index_select(-1, layout.axis + 2)
+        lines = (layout.start, layout.end, layout.middle, layout.half)
+        start, end, middle, half = (line if line.ndim == 1 else line[:, None] for line in lines)
         if rule in ("overlap", "soft"):
-            shared = self._both((start < high) & (end > low) & (high > low), torch.logical_and)
+            shared = self._in_cells((start < upper) & (end > lower) & (upper > lower), torch.logical_and)
             if rule == "overlap":
                 return shared
-            offset = (middle - (low + high) / 2) / torch.hypot((high - low) / 2, half)
-            return self._both(-1.5 * offset.square(), torch.add).exp() * shared
-        own = self.cell_of((boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5)
-        central = own[..., None] == torch.arange(len(self), device=boxes.device)
+            offset = (middle - (lower + upper) / 2) / torch.hypot((upper - lower) / 2, half)
+            return self._in_cells(-1.5 * offset.square(), torch.add).exp() * shared
+        central_cell = self.cell_of((boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5)
+        covered = central_cell[..., None] == torch.arange(len(self), device=boxes.device)
         if rule == "centre":
-            inside = self._both((middle >= low) & (middle < high), torch.logical_and)
-            central = inside | (central & ~inside.any(-1, keepdim=True))
-        return central & self._both(high > low, torch.logical_and)
+            inside = self._in_cells((middle >= lower) & (middle < upper), torch.logical_and)
+            covered = inside | (covered & ~inside.any(-1, keepdim=True))
+        return covered & self._in_cells(upper > lower, torch.logical_and)
 
-    def _both(self, lines: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    def _in_cells(self, lines: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Join the values of the columns and rows `(..., X+Y)` in every cell, `(..., X·Y)`."""
-        across, down = lines.split([self.columns, self.rows], -1)
-        return join(across[..., None, :], down[..., :, None]).flatten(-2)
+        columns, rows = lines.split([self.columns, self.rows], -1)
+        return join(columns[..., None, :], rows[..., :, None]).flatten(-2)
 
     def box_distance(self, boxes: Tensor, fixation: Tensor) -> Tensor:
-        """Distance from the centre of each box to the fixation.
+        """Measure the distance from the centre of each box to the fixation.
 
         This is d = ‖(u, v)‖ of Luzio, Bernardino and Moreno (2024, section III-D), here in units of the image's longer
         side, so that one observation model serves every resolution.
@@ -195,13 +222,14 @@ class Grid:
         check_shape(fixation, "fixation", 2)
         check_finite(boxes, "boxes")
         check_finite(fixation, "fixation")
-        boxes, fixation = as_positions(boxes), as_positions(fixation)
+        boxes = as_positions(boxes)
+        fixation = as_positions(fixation)
         centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
         offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
         return offset / self._layout(offset).longest[..., None]
 
     def distance(self, fixation: Tensor) -> Tensor:
-        """Distance from each fixation to the centre of every cell.
+        """Measure the distance from each fixation to the centre of every cell.
 
         Args:
             fixation: `(..., 2)`, as `(x, y)` in pixels; `(B, 2)` for a batch of sizes.
@@ -234,25 +262,35 @@ class Grid:
 
 
 def _layout(columns: int, rows: int, extent: Tensor) -> _Layout:
-    """The cells over images of an extent `(2,)` or `(B, 2)`."""
-    counts, device = (columns, rows), extent.device
-    axis = torch.cat([torch.full((count,), number, device=device) for number, count in enumerate(counts)])
-    place = torch.cat([torch.arange(count, device=device) for count in counts])
-    cell = extent / extent.new_tensor(counts)
+    """Lay out the cells over images.
+
+    Args:
+        columns: X, cells in a row.
+        rows: Y, cells in a column.
+        extent: `(width, height)` of the images, `(2,)` or `(B, 2)`.
+
+    Returns:
+        The layout; its tensors have a leading B for a batch of sizes, all but the axis.
+    """
+    device = extent.device
+    axis = torch.cat([torch.full((columns,), 0, device=device), torch.full((rows,), 1, device=device)])
+    place = torch.cat([torch.arange(columns, device=device), torch.arange(rows, device=device)])
+    cell = extent / extent.new_tensor((columns, rows))
     step = cell.index_select(-1, axis)
     middle = (place + 0.5) * step - 0.5
-    along, down = middle[..., None, :columns], middle[..., columns:, None]
-    centres = torch.stack(torch.broadcast_tensors(along, down), -1).flatten(-3, -2)
+    x = middle[..., None, :columns]
+    y = middle[..., columns:, None]
+    centres = torch.stack(torch.broadcast_tensors(x, y), -1).flatten(-3, -2)
     return _Layout(axis, place * step, (place + 1) * step, middle + 0.5, step / 2, centres, cell, extent.amax(-1))
 
 
 @constant
 def _layout_of_size(
-    columns: int, rows: int, width: float, height: float, made: torch.dtype, dtype: torch.dtype, device: torch.device
+    columns: int, rows: int, width: float, height: float, exact: torch.dtype, dtype: torch.dtype, device: torch.device
 ) -> _Layout:
-    """`_layout` for one size, computed with a dtype before it is converted."""
-    layout = _layout(columns, rows, torch.tensor([width, height], dtype=torch.promote_types(made, torch.float32)))
-    return _Layout(layout.axis.to(device), *(each.to(device, dtype) for each in layout[1:]))
+    """Lay out the cells over an image of one size, with numbers of the dtype `exact`, then converted to `dtype`."""
+    extent = torch.tensor([width, height], dtype=torch.promote_types(exact, torch.float32))
+    return _layout(columns, rows, extent).to(dtype, device)
 
 
 def check_cells(grid: tuple[int, int]) -> None:

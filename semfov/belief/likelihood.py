@@ -22,7 +22,7 @@ class Observation(Protocol):
     """
 
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Likelihoods of the classes, up to a common factor.
+        """Compute likelihoods of the classes, up to a common factor.
 
         Args:
             scores: `(..., K+1)`, score vectors, background first.
@@ -42,7 +42,7 @@ def likelihoods(
     *,
     tempering: float = 1.0,
 ) -> Tensor:
-    r"""Likelihood of every class given each detection, up to a common factor.
+    r"""Compute the likelihood of every class given each detection, up to a common factor.
 
     The likelihoods are the raw scores, or the scores calibrated by an observation model (Luzio, Bernardino and Moreno,
     2024, section III-B and equation 11):

@@ -13,14 +13,22 @@ _FLOOR = 1e-6
 
 
 def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
-    """Highest score of classes `(T,)` among the detections of each look, `(B, T)`; 0 without detections."""
+    """Find the highest score of classes among the detections of each look.
+
+    Args:
+        detections: a batch of B looks.
+        target: a class, or classes `(T,)`.
+
+    Returns:
+        `(B,)`, or `(B, T)`; 0 without detections.
+    """
     scores = detections.scores * detections.mask[..., None]
     highest = scores.amax(1) if scores.shape[1] else scores.new_zeros(len(scores), scores.shape[-1])
     return highest[..., target]
 
 
 def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
-    r"""Ten features that describe the evidence of looks for a target in every cell, `(B, X·Y, 10)`, of about unit size.
+    r"""Describe the evidence of looks for a target in every cell by ten features of about unit size, `(B, X·Y, 10)`.
 
     With the scores :math:`s_l` of detection l, its weight :math:`w_l` in the cell (the `soft` footprint of `Grid`), and
     the detection b of the largest :math:`s_{lt} w_l`, they are: the distance of the fixation; :math:`\ln s_{bt} w_b`;
@@ -36,7 +44,17 @@ def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: 
 
 @one_thread_if_small
 def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets: Tensor) -> Tensor:
-    """`look_features` for several classes `(T,)`: `(B, T, X·Y, 10)`."""
+    """Compute `look_features` for several classes.
+
+    Args:
+        detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
+        fixation: `(B, 2)`, as `(x, y)` in pixels.
+        grid: the cells of one image.
+        targets: `(T,)`, classes 1..K.
+
+    Returns:
+        `(B, T, X·Y, 10)`.
+    """
     batch = detections.mask.shape[0]
     check_shape(fixation, "fixation", batch, 2)
     components = detections.scores.shape[-1]
@@ -53,8 +71,8 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
 
     def of_best(values: Tensor) -> Tensor:
         """Select the value of the best detection of each class in each cell, from `(B, 1 or T, L, 1 or X·Y)`."""
-        wide = values.expand(batch, len(targets), *weight.shape[2:])
-        return wide.gather(2, best[:, :, None])[:, :, 0] * covered
+        by_detection = values.expand(batch, len(targets), *weight.shape[2:])
+        return by_detection.gather(2, best[:, :, None])[:, :, 0] * covered
 
     covered = touches.any(2)
     edges = detections.boxes[..., 2:] - detections.boxes[..., :2]
@@ -71,15 +89,16 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
         2 * ((objectness - score).clamp(min=0) * weight).amax(2),
         (~covered).to(weight.dtype),
     ]
-    return torch.stack([each.expand(batch, len(targets), len(grid)) for each in features], -1)
+    return torch.stack([feature.expand(batch, len(targets), len(grid)) for feature in features], -1)
 
 
 def nothing_seen(distance: Tensor) -> Tensor:
-    """`look_features` `(..., 10)` for a look without detections from distances `(...)`."""
+    """Compute `look_features` `(..., 10)` of a look without detections from distances `(...)`."""
     none = torch.zeros_like(distance)
     least = _log(none)
     return torch.stack([4 * distance, least, least, none, none, none, none, none, none, none + 1], -1)
 
 
 def _log(score: Tensor) -> Tensor:
+    """Take the logarithm of scores, kept finite and scaled to about unit size."""
     return score.clamp(min=_FLOOR).log() / 4 + 1

@@ -84,7 +84,7 @@ class MapEvidence(Evidence):
         self.worth = network(_GAIN, readout_width)
 
     def forward(self, detections: Detections, fixation: Tensor, grid: Grid, targets: Tensor) -> Tensor:
-        """Evidence of each look for several classes in every cell.
+        """Compute the evidence of each look for several classes in every cell.
 
         Args:
             detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
@@ -98,7 +98,7 @@ class MapEvidence(Evidence):
         return self.evidence(class_features(detections, fixation, grid, targets))
 
     def log_odds(self, gathered: Gathered, columns: int, classes: int) -> Tensor:
-        """Log odds of each class in each cell after several looks.
+        """Compute the log odds of each class in each cell after several looks.
 
         Args:
             gathered: evidence of the looks, one row for each episode and class, `(B·T, ...)`.
@@ -109,16 +109,17 @@ class MapEvidence(Evidence):
             `(B, T, X·Y)`.
         """
         nearest = gathered.nearest.unflatten(0, (-1, classes))
-        greatest = nearest.topk(2, 1)
-        leads = torch.arange(classes, device=nearest.device)[:, None] == greatest.indices[:, :1]
-        rival = torch.where(leads, greatest.values[:, 1:], greatest.values[:, :1]).flatten(0, 1)
+        # The strongest rival of the class that leads in a cell is the second one, and that of the others is the first.
+        strongest = nearest.topk(2, 1)
+        leads = torch.arange(classes, device=nearest.device)[:, None] == strongest.indices[:, :1]
+        rival = torch.where(leads, strongest.values[:, 1:], strongest.values[:, :1]).flatten(0, 1)
         read = self.read_out(self.read, gathered.nearest, gathered, columns, rival / 2 + 1)
         return read.unflatten(0, (-1, classes))
 
     def emptiness(
         self, log_odds: Tensor, distance: Tensor, looks: Tensor, columns: int, stands_for: Tensor | None = None
     ) -> Tensor:
-        """Log odds that a cell holds no object.
+        """Compute the log odds that a cell holds no object.
 
         Args:
             log_odds: `(B, T, X·Y)`, log odds of the classes (`log_odds`).
@@ -130,8 +131,8 @@ class MapEvidence(Evidence):
         Returns:
             `(B, X·Y)`.
         """
-        each = torch.nn.functional.logsigmoid(-log_odds)
-        none = (each if stands_for is None else each * stands_for[..., None]).sum(1)
+        not_class = torch.nn.functional.logsigmoid(-log_odds)
+        none = (not_class if stands_for is None else not_class * stands_for[..., None]).sum(1)
         anything = -torch.expm1(none)
         first, second = log_odds.topk(2, 1).values.unbind(1)
         inputs = [
@@ -148,7 +149,7 @@ class MapEvidence(Evidence):
         return none - anything.clamp(min=1e-6).log() + apply_network(self.void, inputs, first.shape)
 
     def gain(self, probabilities: Tensor, closest: Tensor, looks: Tensor, distance: Tensor) -> Tensor:
-        """Expected increase in the number of correctly classified cells after one more look, cell by cell.
+        """Predict how many more cells will be classified correctly after one more look, cell by cell.
 
         Args:
             probabilities: `(B, X·Y, K+1)`, class probabilities of a map, background first.
@@ -159,7 +160,8 @@ class MapEvidence(Evidence):
         Returns:
             `(B, F, X·Y)`; the sum over the cells is the expected increase for a fixation.
         """
-        objects, nothing = probabilities[..., 1:].topk(2, -1).values, probabilities[..., 0]
+        objects = probabilities[..., 1:].topk(2, -1).values
+        nothing = probabilities[..., 0]
         nearer = (closest[:, None] - distance).clamp(min=0)
         inputs = [
             logarithm(objects[..., 0])[:, None],

@@ -50,7 +50,19 @@ class Prior:
 
     @classmethod
     def of(cls, share: float | None, shares: Tensor | None, target: int) -> Self:
-        """Compare a share with that of the fit, of shares `(K,)` by class; None changes nothing."""
+        """Compare a share with that of the fit.
+
+        Args:
+            share: share of the searches whose target is there; None changes nothing.
+            shares: `(K,)`, by class, those of the fit; None if they are not known.
+            target: class 1..K.
+
+        Returns:
+            Both shares.
+
+        Raises:
+            InputError: the share is no probability between 0 and 1, or those of the fit are not known.
+        """
         check_prior(share)
         if share is None:
             return cls()
@@ -61,7 +73,7 @@ class Prior:
 
     @property
     def changes_nothing(self) -> bool:
-        """Whether the shares are the same."""
+        """True if the shares are the same."""
         return self.share == self.fitted
 
     @property
@@ -86,10 +98,11 @@ class Prior:
         if self.changes_nothing:
             return place
         if isinstance(place, Tensor):
-            whole = torch.maximum(torch.as_tensor(place), torch.as_tensor(presence))
-            return place * (self(whole) / whole.clamp(min=torch.finfo(whole.dtype).tiny))
-        pair = torch.tensor([place, presence], dtype=torch.float64)
-        return float(self.place(pair[0], pair[1]))
+            # No place is more probable than the picture, which two fits may contradict.
+            picture = torch.maximum(torch.as_tensor(place), torch.as_tensor(presence))
+            return place * (self(picture) / picture.clamp(min=torch.finfo(picture.dtype).tiny))
+        exact = torch.tensor([place, presence], dtype=torch.float64)
+        return float(self.place(exact[0], exact[1]))
 
 
 def check_prior(prior: float | None) -> None:
@@ -99,4 +112,5 @@ def check_prior(prior: float | None) -> None:
 
 
 def _logit(share: float) -> float:
+    """Compute the log odds of a share."""
     return math.log(share) - math.log1p(-share)

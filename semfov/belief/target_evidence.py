@@ -22,7 +22,13 @@ _EMPTY = -8.0
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds on probabilities at which a search decides."""
+    """Thresholds on probabilities at which a search decides.
+
+    Attributes:
+        confirm: least probability of the picture, or of a place after a closer look, for `found`.
+        give_up: probability of a cell or a place below which it is not worth a look.
+        place: least probability of the place of a target that is found, or of one that is worth a closer look.
+    """
 
     confirm: float
     give_up: float
@@ -106,7 +112,7 @@ class TargetEvidence(Evidence):
         self.judge = network(_PRESENCE, readout_width)
 
     def forward(self, detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
-        """Evidence of each look for the target in every cell.
+        """Compute the evidence of each look for the target in every cell.
 
         Args:
             detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
@@ -120,7 +126,7 @@ class TargetEvidence(Evidence):
         return self.evidence(look_features(detections, fixation, grid, target))
 
     def log_odds(self, gathered: Gathered, columns: int) -> Tensor:
-        """Log odds of the target in each cell after several looks.
+        """Compute the log odds of the target in each cell after several looks.
 
         Args:
             gathered: evidence of the looks.
@@ -132,7 +138,7 @@ class TargetEvidence(Evidence):
         return self.read_out(self.read, gathered.nearest, gathered, columns)
 
     def chance(self, gathered: Gathered, columns: int) -> Tensor:
-        """Log odds of the target in each cell, given that no fixated cell holds it.
+        """Compute the log odds of the target in each cell, given that no fixated cell holds it.
 
         Args:
             gathered: evidence of the looks.
@@ -142,11 +148,12 @@ class TargetEvidence(Evidence):
             `(B, X·Y)`; the values of fixated cells have no meaning.
         """
         visited = gathered.visited
-        beside = blur(visited.to(gathered.nearest), columns, 0.6)
-        return self.read_out(self.guide, gathered.nearest.masked_fill(visited, _EMPTY), gathered, columns, beside)
+        fixated_nearby = blur(visited.to(gathered.nearest), columns, 0.6)
+        nearest = gathered.nearest.masked_fill(visited, _EMPTY)
+        return self.read_out(self.guide, nearest, gathered, columns, fixated_nearby)
 
     def presence(self, log_odds: Tensor, gathered: Gathered) -> Tensor:
-        """Log odds that the target is anywhere in the image.
+        """Compute the log odds that the target is anywhere in the image.
 
         Args:
             log_odds: `(B, X·Y)`, log odds of the cells (`log_odds`).
@@ -167,19 +174,22 @@ class TargetEvidence(Evidence):
             self.prior[gathered.target],
             logarithm(gathered.score),
         ]
-        value: Tensor = self.judge(torch.stack(inputs, -1))
-        return peak + value[..., 0]
+        correction: Tensor = self.judge(torch.stack(inputs, -1))
+        return peak + correction[..., 0]
 
     def _record(self) -> dict[str, Any]:
-        return {**super()._record(), "thresholds": self.thresholds and asdict(self.thresholds)}
+        """List what a file holds beside tensors."""
+        thresholds = None if self.thresholds is None else asdict(self.thresholds)
+        return {**super()._record(), "thresholds": thresholds}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        at = record["thresholds"]
+        """Make the model of a file."""
+        thresholds = record["thresholds"]
         model = cls(
             *record["widths"],
             components=record["components"],
-            thresholds=at and Thresholds(**at),
+            thresholds=None if thresholds is None else Thresholds(**thresholds),
             shares=tensors.get("shares"),
             metadata=record["metadata"],
         )

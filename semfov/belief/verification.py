@@ -61,7 +61,7 @@ class Verification(PretrainedForEye):
         self.linear = nn.Linear(CLOSER_FEATURES, 2)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Log odds after closer looks.
+        """Compute the log odds after closer looks.
 
         Args:
             features: `(..., 7)` (`closer_features`).
@@ -72,10 +72,12 @@ class Verification(PretrainedForEye):
         return self.linear(features)
 
     def _record(self) -> dict[str, Any]:
+        """List what a file holds beside tensors."""
         return {"thresholds": None if self.thresholds is None else asdict(self.thresholds)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """Make the model of a file."""
         thresholds = None if record["thresholds"] is None else Thresholds(**record["thresholds"])
         model = cls(thresholds=thresholds, metadata=record["metadata"])
         model.load_state_dict(tensors)
@@ -85,38 +87,69 @@ class Verification(PretrainedForEye):
 def closer_features(
     presence: float, cell: float, evidence: float, closer: Detections, box: Tensor, target: int
 ) -> tuple[Tensor, Tensor]:
-    r"""Features `(7,)` of a closer look at a place, and the box `(4,)` of the target in it.
+    r"""Describe a closer look at a place by seven features, and find the target in it.
 
     Detection m has the largest score times overlap o with the examined box. The features are the logits, within 0.001,
     of: the picture and the cell holding the target, and the evidence there, all before; :math:`s_{mt} o_m`,
     :math:`\max_l s_{lt}`, :math:`\max_l o_l \max_{k \ne t} s_{lk}` and :math:`s_{mt}`.
+
+    Args:
+        presence: probability that the picture holds the target, before the look.
+        cell: probability that the cell of the place holds it.
+        evidence: evidence there, as a probability.
+        closer: detections of the look, a batch of one, boxes in pixels of the picture.
+        box: the examined place, `(4,)`.
+        target: class 1..K.
+
+    Returns:
+        Features `(7,)`, and the box of the target `(4,)`: that of detection m if it overlaps the examined one enough.
     """
-    real = closer.mask[0]
-    boxes, scores = closer.boxes[0][real], closer.scores[0][real]
     before = [presence, cell, evidence]
-    after = [0.0] * 4
-    if len(boxes):
-        score = scores[:, target]
-        best, overlap = _best_detection(boxes, score, box)
-        other = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
-        after = [
-            float(each) for each in (score[best] * overlap[best], score.max(), (overlap * other).max(), score[best])
-        ]
-        if float(overlap[best]) >= _MATCHED:
-            box = boxes[best]
-    return box.new_tensor([*before, *after]).logit(_FLOOR), box
+    boxes = closer.boxes[0][closer.mask[0]]
+    scores = closer.scores[0][closer.mask[0]]
+    if not len(boxes):
+        return box.new_tensor([*before, 0.0, 0.0, 0.0, 0.0]).logit(_FLOOR), box
+    score = scores[:, target]
+    best, overlap = _best_detection(boxes, score, box)
+    rival = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
+    after = [
+        float(score[best] * overlap[best]),
+        float(score.max()),
+        float((overlap * rival).max()),
+        float(score[best]),
+    ]
+    shown = boxes[best] if float(overlap[best]) >= _MATCHED else box
+    return shown.new_tensor([*before, *after]).logit(_FLOOR), shown
 
 
 def _best_detection(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:
-    r"""Detection that best shows the target in a box, :math:`m = \arg\max_l s_l o_l`, and all overlaps o `(L,)`."""
+    r"""Find the detection that best shows the target in a box, :math:`m = \arg\max_l s_l o_l`.
+
+    Args:
+        boxes: `(L, 4)`, of the detections.
+        scores: s, `(L,)`, of the target.
+        box: the box, `(4,)`.
+
+    Returns:
+        The number m of the detection, and the overlaps o of all of them with the box, `(L,)`.
+    """
     overlap = box_iou(boxes, box[None])[:, 0]
     return int((scores * overlap).argmax()), overlap
 
 
 def follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
-    """Move the box `(4,)` of a target to the middle of the detection that best shows it; a closer look sizes better."""
-    real = detections.mask[0]
-    boxes, scores = detections.boxes[0][real], detections.scores[0][real, target]
+    """Move the box of a target to the middle of the detection that best shows it, and keep its size.
+
+    Args:
+        box: `(4,)`, from a closer look, which sizes objects better.
+        detections: those of another look, a batch of one.
+        target: class 1..K.
+
+    Returns:
+        The box `(4,)`, where it was if no detection overlaps it enough.
+    """
+    boxes = detections.boxes[0][detections.mask[0]]
+    scores = detections.scores[0][detections.mask[0], target]
     if not len(boxes):
         return box
     best, overlap = _best_detection(boxes, scores, box)

@@ -145,7 +145,7 @@ class Given(Choice):
 
 
 def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance: float = 1e-6) -> Tensor:
-    r"""Cell with the highest acquisition value among those not visited (inhibition of return).
+    r"""Choose the cell with the highest acquisition value among those not visited (inhibition of return).
 
     .. math:: f = \arg\max_{x \notin \mathcal V} a(x)
 
@@ -173,9 +173,9 @@ def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance
     if values_known(values, visited):
         unusable = torch.isnan(values) & ~visited
         check(not bool(unusable.any()), "values", "numbers for all cells not visited", f"{int(unusable.sum())} NaN")
-    left = values.masked_fill(visited, -torch.inf)
-    best = left.amax(-1, keepdim=True)
-    tied = (left >= best - tolerance * best.abs()) & ~visited
+    candidates = values.masked_fill(visited, -torch.inf)
+    best = candidates.amax(-1, keepdim=True)
+    tied = (candidates >= best - tolerance * best.abs()) & ~visited
     choice = torch.where(tied, noise, -1.0).argmax(-1)
     return torch.where(visited.all(-1), -1, choice)
 
@@ -221,14 +221,17 @@ def soft_fixation(
     weights = ((logits + gumbel.to(logits)).masked_fill(visited, -torch.inf) / temperature).softmax(-1)
     cell = weights.argmax(-1)
     soft = weights @ centres.to(weights)
-    return (centres.to(weights)[cell] + (soft - soft.detach()) if hard else soft), cell
+    if not hard:
+        return soft, cell
+    # The value is the centre, and the gradient is that of the soft point.
+    return centres.to(weights)[cell] + (soft - soft.detach()), cell
 
 
 def drawn_from(noise: Tensor) -> _Noise:
-    """Random numbers from a table `(B, shifts, X·Y)`, so that an episode repeats."""
+    """Take random numbers from a table `(B, shifts, X·Y)`, so that an episode repeats."""
     return lambda shift, episodes: noise[episodes, shift]
 
 
 def drawn_by(generator: torch.Generator, cells: int, like: Tensor) -> _Noise:
-    """Random numbers from a generator as they are needed, with the dtype and device of `like`."""
+    """Draw random numbers from a generator as they are needed, with the dtype and device of `like`."""
     return lambda shift, episodes: torch.rand(len(episodes), cells, generator=generator).to(like)

@@ -1,5 +1,6 @@
 """Policies: where to look, by an acquisition function, for any target on any grid."""
 
+from collections.abc import Mapping
 from typing import Any, get_args
 
 from torch import Tensor, nn
@@ -60,27 +61,40 @@ class Policy(nn.Module):
         kind = getattr(function, "__name__", function)
         check(issubclass(function, AcquisitionFunction), "function", "a class of acquisition functions", kind)
         self.function = function
-        takes = self.function.takes
-        needed = MapEvidence if self.function.needs_map else FovealObservationModel
-        if "model" in takes and not isinstance(model, needed):
-            words = "a learned map" if self.function.needs_map else "an observation model"
-            got = "none" if model is None else f"a {type(model).__name__}"
-            raise InputError(f"policy {self.name!r}: expected {words}, got {got}")
-        self.model = model if "model" in takes else None
-        own = [name for name in takes if name not in ("target", "model", "grid")]
-        taken = [name for name in own if name in ("samples", "calibrated") or hasattr(self, name)]
-        check(not taken, "function", "one whose settings have other names than what a policy has", ", ".join(taken))
-        self._given = [lookup(name, own, f"setting of policy {self.name!r}") for name in settings]
+        self.model = self._model_for(model)
+        self._check_settings(settings)
         if samples is not None:
-            check("likelihoods" in takes, "samples", f"None for policy {self.name!r}, which predicts no look", samples)
+            predicts = "likelihoods" in function.takes
+            check(predicts, "samples", f"None for policy {self.name!r}, which predicts no look", samples)
             assert isinstance(model, FovealObservationModel)
             settings["likelihoods"] = sampled_likelihoods(model, samples, calibrated=calibrated)
-            self._given.append("likelihoods")
+        self._settings = list(settings)
         for name, value in settings.items():
             if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
                 self.register_buffer(name, value, persistent=False)
             else:
                 setattr(self, name, value)
+
+    def _model_for(
+        self, model: FovealObservationModel | MapEvidence | None
+    ) -> FovealObservationModel | MapEvidence | None:
+        """Check the model that the function is made from; None if it is made from none."""
+        if "model" not in self.function.takes:
+            return None
+        needed = MapEvidence if self.function.needs_map else FovealObservationModel
+        if not isinstance(model, needed):
+            words = "a learned map" if self.function.needs_map else "an observation model"
+            got = "none" if model is None else f"a {type(model).__name__}"
+            raise InputError(f"policy {self.name!r}: expected {words}, got {got}")
+        return model
+
+    def _check_settings(self, settings: Mapping[str, object]) -> None:
+        """Check that the function has these settings, and none with a name that a policy has itself."""
+        names = [name for name in self.function.takes if name not in ("target", "model", "grid")]
+        taken = [name for name in names if name in ("samples", "calibrated") or hasattr(self, name)]
+        check(not taken, "function", "one whose settings have other names than what a policy has", ", ".join(taken))
+        for name in settings:
+            lookup(name, names, f"setting of policy {self.name!r}")
 
     @property
     def name(self) -> str:
@@ -88,7 +102,7 @@ class Policy(nn.Module):
         return self.function.name or self.function.__name__
 
     def extra_repr(self) -> str:
-        """The name."""
+        """Write the name."""
         return repr(self.name)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
@@ -104,22 +118,23 @@ class Policy(nn.Module):
         Raises:
             InputError: the function needs a target or a setting, and has none, or has one of another type.
         """
-        given = {"target": target, "model": self.model, "grid": grid}
-        given = {name: value for name, value in given.items() if value is not None and name in self.function.takes}
-        given |= {name: getattr(self, name) for name in self._given}
-        for name, parameter in self.function.takes.items():
-            if given.get(name) is None and parameter.default is parameter.empty:
-                needed = {"target": "a target to search for"}.get(name, f"{name} of a scene")
+        scene = {"target": target, "model": self.model, "grid": grid}
+        takes = self.function.takes
+        arguments: dict[str, Any] = {name: part for name, part in scene.items() if part is not None and name in takes}
+        arguments |= {name: getattr(self, name) for name in self._settings}
+        for name, parameter in takes.items():
+            if arguments.get(name) is None and parameter.default is parameter.empty:
+                needed = "a target to search for" if name == "target" else f"{name} of a scene"
                 raise InputError(f"policy {self.name!r}: expected {needed}, got none")
         try:
-            return self.function(**given)
+            return self.function(**arguments)
         except TypeError as error:
-            expected = f"values that fit {', '.join(given)}"
+            expected = f"values that fit {', '.join(arguments)}"
             raise InputError(f"policy {self.name!r}: expected {expected}, got others ({error})") from error
 
 
 def policy_names(task: Task) -> list[str]:
-    """Names of the acquisition functions for a task, in the order of registration.
+    """List the names of the acquisition functions for a task, in the order of registration.
 
     Args:
         task: `search` or `exploration`.

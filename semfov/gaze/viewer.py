@@ -39,7 +39,11 @@ class Viewer(Choice):
         start: Tensor,
         generator: torch.Generator | None = None,
     ) -> None:
-        self.model, self.terms, self.grid, self.generator = model, terms, grid, generator
+        self.model = model
+        self.terms = terms
+        self.grid = grid
+        self.generator = generator
+        # All fixations so far, `(B, n, 2)`; an episode that has ended repeats its last one.
         self.path = grid.centres.to(model.read)[start][:, None]
 
     @torch.no_grad()
@@ -48,12 +52,13 @@ class Viewer(Choice):
     ) -> tuple[Tensor, Tensor]:
         """Return the centre of the drawn cell and the cell; any cell where all were visited."""
         size = int(self.grid.size[1]), int(self.grid.size[0])
-        rows, free = episodes.to(self.path.device), ~visited.to(self.path.device)
+        rows = episodes.to(self.path.device)
+        free = ~visited.to(self.path.device)
         log = torch.stack([*self.model.given(self.terms, size, self.path[rows]).values()]).sum(0)
         density = cell_saliency(log.flatten(1).double().softmax(1).view_as(log), self.grid.columns, self.grid.rows)
-        # Where nothing is left, or the rest has no probability, all that is left is alike.
-        left = (density + torch.finfo(density.dtype).tiny) * (free | ~free.any(-1, keepdim=True))
-        cell = left.cpu().multinomial(1, generator=self.generator)[:, 0].to(visited.device)
+        # Where all cells were visited, or those that were not have no probability, all of them are alike.
+        weights = (density + torch.finfo(density.dtype).tiny) * (free | ~free.any(-1, keepdim=True))
+        cell = weights.cpu().multinomial(1, generator=self.generator)[:, 0].to(visited.device)
         following = self.path[:, -1].clone()
         following[rows] = centres[cell].to(following)
         self.path = torch.cat([self.path, following[:, None]], 1)

@@ -68,7 +68,8 @@ def fit_discriminative(
     >>> trained.calibrate(overconfident[0], torch.tensor(0.0)).detach()
     tensor([0.4000, 0.6000])
     """
-    components, levels = len(model.classes) + 1, len(model.edges) + 1
+    components = len(model.classes) + 1
+    levels = len(model.edges) + 1
     check_shape(scores, "scores", None, components)
     samples = len(scores)
     check(samples > 0, "scores", "at least one sample", samples)
@@ -85,11 +86,16 @@ def fit_discriminative(
     level = model.level(distance)
     groups = [(evidence[level == n], labels[level == n]) for n in range(levels)]
 
+    # The variables are u, v, and the common part and the parts by level of c. They are scaled by the curvature of the
+    # objective, with which L-BFGS converges faster.
     unit = torch.eye(components).to(scores)
     start = unit.log1p()[:, None]
-    weak, tied = scores.new_tensor(bias_decay), scores.new_tensor(level_decay)
-    precisions = [torch.where(unit[:, None] > 0, bias_decay, decay), tied, weak, weak]
-    scales = [(c + p).rsqrt() for c, p in zip(_curvatures(groups, start.exp()), precisions, strict=True)]
+    common_precision = torch.where(unit[:, None] > 0, bias_decay, decay)
+    level_precision = scores.new_tensor(level_decay)
+    bias_precision = scores.new_tensor(bias_decay)
+    precisions = [common_precision, level_precision, bias_precision, bias_precision]
+    curvatures = _curvatures(groups, start.exp())
+    scales = [(c + p).rsqrt() for c, p in zip(curvatures, precisions, strict=True)]
     variables = [torch.zeros_like(scale, requires_grad=True) for scale in scales]
     optimiser = torch.optim.LBFGS(
         variables,
@@ -101,12 +107,19 @@ def fit_discriminative(
     )
 
     def current() -> list[Tensor]:
+        """Scale the variables back."""
         return [v * scale for v, scale in zip(variables, scales, strict=True)]
 
+    def parameters(values: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Compute α and c from the variables."""
+        u, v, common_bias, level_bias = values
+        return (start + u + v).exp(), common_bias + level_bias
+
     def loss() -> Tensor:
+        """Compute the negative log posterior for each sample, and its gradient."""
         optimiser.zero_grad()
-        across, within, common, own = values = current()
-        alpha, constant = (start + across + within).exp(), common + own
+        values = current()
+        alpha, constant = parameters(values)
         total = torch.stack([(p * v.square()).sum() for p, v in zip(precisions, values, strict=True)]).sum() / 2
         for n, (rows, truth) in enumerate(groups):
             logits = F.linear(rows, alpha[:, n] - 1, constant[:, n])
@@ -118,8 +131,7 @@ def fit_discriminative(
     with torch.enable_grad():
         optimiser.step(loss)
 
-    across, within, common, own = (value.detach() for value in current())
-    alpha, constant = (start + across + within).exp(), common + own
+    alpha, constant = parameters([value.detach() for value in current()])
     # c = ln π - (log normaliser of Dir(α)) + (shift by the floor); solve for ln π.
     shift = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest
     trained = {"decay": decay, "level_decay": level_decay, "bias_decay": bias_decay, "iterations": iterations}
@@ -136,12 +148,23 @@ def fit_discriminative(
 
 
 def _curvatures(groups: list[tuple[Tensor, Tensor]], alpha: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Diagonal of the Hessian of the cross-entropy at the start; scaled by it, L-BFGS converges faster."""
-    weights, constants = [], []
+    """Compute the diagonal of the Hessian of the cross-entropy at the start.
+
+    Args:
+        groups: log scores `(M_n, K+1)` and labels of the samples of each level.
+        alpha: `(K+1, 1, K+1)`, the parameters at the start.
+
+    Returns:
+        The curvatures along u `(K+1, 1, K+1)`, v `(K+1, N, K+1)`, the common part of c `(K+1, 1)` and its parts by
+        level `(K+1, N)`.
+    """
+    weights = []
+    constants = []
     for rows, _ in groups:
         p = F.linear(rows, alpha[:, 0] - 1).softmax(-1)
-        spread = (p * (1 - p)).t()
-        weights.append(spread @ rows.square() * alpha[:, 0].square())
-        constants.append(spread.sum(-1))
-    weight, constant = torch.stack(weights, 1), torch.stack(constants, 1)
+        variance = (p * (1 - p)).t()
+        weights.append(variance @ rows.square() * alpha[:, 0].square())
+        constants.append(variance.sum(-1))
+    weight = torch.stack(weights, 1)
+    constant = torch.stack(constants, 1)
     return weight.sum(1, keepdim=True), weight, constant.sum(1, keepdim=True), constant

@@ -153,7 +153,8 @@ def entropy(alpha: Tensor) -> Tensor:
     >>> entropy(torch.tensor([1.0, 1.0]))
     tensor(0.)
     """
-    constant, exact = _log_normaliser(alpha, "alpha", _LARGEST), alpha.double()
+    constant = _log_normaliser(alpha, "alpha", _LARGEST)
+    exact = alpha.double()
     surprise = exact.digamma() - exact.sum(-1, keepdim=True).digamma()
     return (constant - ((exact - 1) * surprise).sum(-1)).to(alpha.dtype)
 
@@ -183,9 +184,10 @@ def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
     check_tensor(alpha, "alpha")
     check_shape(other, "other", alpha.shape[-1])
     constants = _log_normaliser(other, "other", _LARGEST) - _log_normaliser(alpha, "alpha", _LARGEST)
-    exact, dtype = alpha.double(), torch.promote_types(alpha.dtype, other.dtype)
-    expected = exact.digamma() - exact.sum(-1, keepdim=True).digamma()
-    return (constants + ((exact - other.double()) * expected).sum(-1)).to(dtype)
+    exact = alpha.double()
+    expected_log = exact.digamma() - exact.sum(-1, keepdim=True).digamma()
+    divergence = constants + ((exact - other.double()) * expected_log).sum(-1)
+    return divergence.to(torch.promote_types(alpha.dtype, other.dtype))
 
 
 def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
@@ -216,12 +218,20 @@ def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
 
 
 def divergence_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
-    """`kl_from_symmetric` without the checks."""
+    """Compute `kl_from_symmetric` without the checks.
+
+    Args:
+        alpha: `(..., K)`, parameters, positive.
+        parameter: c, positive.
+
+    Returns:
+        `(...)`, divergences in nats.
+    """
     base = alpha.shape[-1] * parameter
     # There are few sums and their terms are large: double precision costs little here.
     total = alpha.sum(-1).double()
-    whole = (total - base) * total.digamma() - total.lgamma() + math.lgamma(base)
-    return log_gamma_divergence(alpha, parameter).sum(-1) - whole.to(alpha)
+    of_total = (total - base) * total.digamma() - total.lgamma() + math.lgamma(base)
+    return log_gamma_divergence(alpha, parameter).sum(-1) - of_total.to(alpha)
 
 
 def floor(scores: Tensor, epsilon: float) -> Tensor:
@@ -253,19 +263,22 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
 
 
 def _log_normaliser(alpha: Tensor, argument: str, largest: float = math.inf) -> Tensor:
-    """`log_normaliser` in float64: ln Γ of large parameters is far larger than the differences that are wanted."""
+    """Compute `log_normaliser` in float64: ln Γ of large parameters is far larger than the differences wanted."""
     _check_parameters(alpha, argument, largest)
     exact = alpha.double()
     return exact.lgamma().sum(-1) - exact.sum(-1).lgamma()
 
 
-def _check_parameters(alpha: Tensor, argument: str, largest: float = math.inf) -> None:
+def _check_parameters(alpha: Tensor, argument: str, bound: float = math.inf) -> None:
+    """Raise `InputError` unless parameters `(..., K)` are positive, finite and at most `bound`."""
     check_shape(alpha, argument, None)
     check(alpha.shape[-1] > 0, argument, "at least one parameter", "none")
     floating = alpha.is_floating_point()
     check(floating, argument, "floating-point parameters", f"{alpha.dtype}; give {argument}.float()")
     if alpha.numel() and values_known(alpha):
         # The minimum and the maximum of a tensor with a NaN are NaN.
-        least, most = torch.stack(alpha.detach().aminmax()).tolist()
-        check(least > 0 and most < math.inf, argument, "positive, finite parameters", f"{least:g} to {most:g}")
-        check(most <= largest, argument, f"parameters up to {largest:g}", f"{most:g}; beyond, rounding is all there is")
+        least, largest = torch.stack(alpha.detach().aminmax()).tolist()
+        positive = least > 0 and largest < math.inf
+        check(positive, argument, "positive, finite parameters", f"{least:g} to {largest:g}")
+        got = f"{largest:g}; beyond, rounding is all there is"
+        check(largest <= bound, argument, f"parameters up to {bound:g}", got)

@@ -136,32 +136,22 @@ class FovealObservationModel(Pretrained):
         self.metadata = dict(metadata or {})
         self.log_alpha = nn.Parameter(alpha.detach().log())
         self.register_buffer("edges", borders)
-        given: dict[str, Tensor] = {}
-        for name, table, size in [
-            ("log_prior", log_prior, shape[:2]),
-            ("expected", expected, shape),
-            ("miss_rate", miss_rate, shape[:2]),
-            ("exponents", exponents, shape[1:2]),
-            ("miss_odds", miss_odds, shape[:2]),
-        ]:
-            if table is not None:
-                check(tuple(table.shape) == size, name, f"shape {size}", tuple(table.shape))
-                check_finite(table, name)
-                given[name] = table.detach().to(alpha).clone()
-        for name in given.keys() & {"exponents", "miss_odds"}:
-            check(bool((given[name] > 0).all()), name, "positive numbers", float(given[name].min()))
-        rates, share = given.get("miss_rate"), torch.as_tensor(refutation).detach().to(alpha).clone()
-        unlikely = rates is not None and not bool(((rates >= 0) & (rates <= 1)).all())
-        check(not unlikely, "miss_rate", "probabilities", "numbers outside [0, 1]")
-        check(0 <= float(share) <= 1, "refutation", "a number from 0 to 1", refutation)
-        self.register_buffer("expected", given.get("expected"))
+        priors = _table(log_prior, "log_prior", shape[:2], alpha)
+        rates = _table(miss_rate, "miss_rate", shape[:2], alpha)
+        odds = _table(miss_odds, "miss_odds", shape[:2], alpha)
+        powers = _table(exponents, "exponents", shape[1:2], alpha)
+        refuted = torch.as_tensor(refutation).detach().to(alpha).clone()
+        if rates is not None:
+            probable = bool(((rates >= 0) & (rates <= 1)).all())
+            check(probable, "miss_rate", "probabilities", "numbers outside [0, 1]")
+        check(0 <= float(refuted) <= 1, "refutation", "a number from 0 to 1", refutation)
+        self.register_buffer("expected", _table(expected, "expected", shape, alpha))
         self.register_buffer("miss_rate", rates)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
-        self.log_prior = nn.Parameter(given.get("log_prior", alpha.new_zeros(shape[:2])))
-        self.log_exponents = nn.Parameter(given.get("exponents", alpha.new_ones(shape[1:2])).log())
-        odds = given.get("miss_odds")
+        self.log_prior = nn.Parameter(alpha.new_zeros(shape[:2]) if priors is None else priors)
+        self.log_exponents = nn.Parameter((alpha.new_ones(shape[1:2]) if powers is None else powers).log())
         self.log_miss = None if odds is None else nn.Parameter(odds.log())
-        self.refutation = nn.Parameter(share)
+        self.refutation = nn.Parameter(refuted)
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
@@ -185,7 +175,7 @@ class FovealObservationModel(Pretrained):
         return self.log_alpha.exp()
 
     def level(self, distance: Tensor) -> Tensor:
-        """Level of each distance.
+        """Find the level of each distance.
 
         Args:
             distance: `(...)`, in units of the image's longer side, 0 or more.
@@ -197,18 +187,21 @@ class FovealObservationModel(Pretrained):
             InputError: a distance is negative, NaN, or so large that it must be in pixels.
         """
         if distance.numel() and values_known(distance):
-            least, most = torch.stack(distance.detach().aminmax()).tolist()
+            least, largest = torch.stack(distance.detach().aminmax()).tolist()
             check(least >= 0, "distance", "numbers from 0 up", "NaN or a negative number")
-            got = f"{most:g}; divide distances in pixels by it"
-            check(most < _MOST_DISTANCE or most == float("inf"), "distance", "units of the image's longer side", got)
+            near = largest < _MOST_DISTANCE or largest == float("inf")
+            got = f"{largest:g}; divide distances in pixels by it"
+            check(near, "distance", "units of the image's longer side", got)
         return self._level(distance)
 
     def _level(self, distance: Tensor) -> Tensor:
-        """`level` without checks, which wait for a GPU."""
+        """Find the level without checks, which wait for a GPU."""
         return torch.bucketize(distance.to(self.edges).contiguous(), self.edges)
 
     def log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Log likelihood of every class k, `ln Dir(S | α_{k,d})` (Luzio, Bernardino and Moreno, 2024, equation 9).
+        """Compute the log likelihood of every class k, `ln Dir(S | α_{k,d})`.
+
+        It is the logarithm of equation 9 of Luzio, Bernardino and Moreno (2024).
 
         Args:
             scores: `(..., K+1)`, points of the simplex; raised to at least `epsilon`.
@@ -230,13 +223,13 @@ class FovealObservationModel(Pretrained):
         weight, constant = self._linear()
         log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
         # One product for all levels and a selection cost less than gathering a matrix for each detection.
-        every = F.linear(log_scores, weight, constant).unflatten(-1, (-1, components))
+        by_level = F.linear(log_scores, weight, constant).unflatten(-1, (-1, components))
         level = self.level(distance)
         index = level[..., None, None].expand(*level.shape, 1, components)
-        return every.gather(-2, index).squeeze(-2).to(scores.dtype)
+        return by_level.gather(-2, index).squeeze(-2).to(scores.dtype)
 
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Calibrated scores: the posterior probability of every class.
+        """Calibrate scores: compute the posterior probability of every class.
 
         With a uniform prior and τ = 1 they are proportional to the likelihoods, and fusion needs no more. They are
         differentiable in the scores and the parameters. The distance chooses a level, so no gradient flows through it.
@@ -251,14 +244,15 @@ class FovealObservationModel(Pretrained):
         Raises:
             InputError: shapes do not fit, or a score is negative or not finite.
         """
-        likelihood, level = self.log_likelihood(scores, distance), self._level(distance)
+        likelihood = self.log_likelihood(scores, distance)
+        level = self._level(distance)
         # An embedding, since indices of tensors are no part of `torch.func`.
         exponents = F.embedding(level, self.log_exponents.exp()[:, None]).to(likelihood)
         logits = likelihood * self.tempering * exponents
         return (logits + F.embedding(level, self.log_prior.t())).softmax(-1).to(scores.dtype)
 
     def expected_scores(self) -> Tensor:
-        """Expected score vector of every class at every level, `E[S | C = k, d]`.
+        """Compute the expected score vector of every class at every level, `E[S | C = k, d]`.
 
         In the published model it is the mean of the Dirichlet, `α_kd / Σ_j α_kdj`, the first factor in equation 16 of
         Luzio, Bernardino and Moreno (2024).
@@ -269,7 +263,7 @@ class FovealObservationModel(Pretrained):
         return self.log_alpha.softmax(-1) if self.expected is None else self.expected
 
     def miss_likelihood(self, distance: Tensor) -> Tensor:
-        """Likelihood of every class where nothing is detected: its miss rate at that distance.
+        """Compute the likelihood of every class where nothing is detected: its miss rate at that distance.
 
         Args:
             distance: `(...)`, in units of the image's longer side.
@@ -285,7 +279,7 @@ class FovealObservationModel(Pretrained):
         return F.embedding(self.level(distance), self.miss_rate.t())
 
     def miss_odds(self, distance: Tensor) -> Tensor:
-        """Odds of a miss: how probable it is that nothing is detected, for every class relative to background.
+        """Compute the odds of a miss: how probable it is that nothing is detected, relative to background.
 
         Args:
             distance: `(...)`, in units of the image's longer side.
@@ -350,7 +344,8 @@ class FovealObservationModel(Pretrained):
             InputError: the statistics are for another table or epsilon, or a setting is out of range.
         """
         components, levels = self.log_alpha.shape[:2]
-        required, got = ((components, levels), self.epsilon), (statistics.shape, statistics.epsilon)
+        required = ((components, levels), self.epsilon)
+        got = (statistics.shape, statistics.epsilon)
         check(got == required, "statistics", f"shape and epsilon {required}", got)
         check(0 < tempering <= _MOST_TEMPERING, "tempering", f"a number above 0, up to {_MOST_TEMPERING}", tempering)
         lookup(expected, ["dirichlet", "empirical"], "kind of expected scores")
@@ -392,10 +387,12 @@ class FovealObservationModel(Pretrained):
         compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}), self.title)
 
     def _record(self) -> dict[str, Any]:
+        """List what a file holds beside tensors."""
         return {"classes": self.classes, "epsilon": self.epsilon}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """Make the model of a file."""
         model = cls(
             tensors["log_alpha"].exp(),
             tensors["edges"],
@@ -431,7 +428,7 @@ class FovealObservationModel(Pretrained):
         return model
 
     def extra_repr(self) -> str:
-        """Sizes for the `repr` of the module.
+        """Write the sizes for the `repr` of the module.
 
         Returns:
             Numbers of classes and levels, and ε.
@@ -452,7 +449,10 @@ class FovealObservationModel(Pretrained):
         return super().train(mode)
 
     def _linear(self) -> tuple[Tensor, Tensor]:
-        """Weights and constants of the log likelihoods (`_linear_map`), kept in `eval` mode and without gradients."""
+        """Compute weights and constants of the log likelihoods (`_linear_map`).
+
+        They are kept in `eval` mode and without gradients.
+        """
         parameter = self.log_alpha
         if self.training or (torch.is_grad_enabled() and parameter.requires_grad) or torch.compiler.is_exporting():
             return _linear_map(self.alpha)
@@ -505,8 +505,27 @@ class FoldedObservationModel(FovealObservationModel):
         return self.weight, self.constant
 
 
+def _table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor) -> Tensor | None:
+    """Check a table that may be left out, and copy it; odds and exponents must be positive."""
+    if table is None:
+        return None
+    check(tuple(table.shape) == shape, name, f"shape {shape}", tuple(table.shape))
+    check_finite(table, name)
+    copied = table.detach().to(like).clone()
+    if name in ("exponents", "miss_odds"):
+        check(bool((copied > 0).all()), name, "positive numbers", float(copied.min()))
+    return copied
+
+
 def _linear_map(alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights `(N (K+1), K+1)` and constants of the log likelihoods as a linear map of log scores, level by level."""
+    """Write the log likelihoods as a linear map of log scores, level by level.
+
+    Args:
+        alpha: `(K+1, N, K+1)`.
+
+    Returns:
+        Weights `(N (K+1), K+1)` and constants `(N (K+1),)`.
+    """
     by_level = alpha.transpose(0, 1)
     # ln Γ of large parameters is much larger than the differences between likelihoods: compute it in float64.
     constant = -log_normaliser(by_level.to(torch.float64)).to(alpha.dtype)
@@ -517,15 +536,17 @@ _KEPT = WeakIdKeyDictionary()  # linear maps by the parameters they are made of,
 
 
 def _kept_map(log_alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """`_linear_map` of parameters `ln α`, computed once for each of their states, without gradients."""
+    """Compute `_linear_map` of parameters `ln α` once for each of their states, without gradients."""
     if log_alpha.is_inference():
+        # Such tensors do not count their changes.
         return _linear_map(log_alpha.exp())
     state = log_alpha._version, log_alpha.data_ptr()
-    kept: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = _KEPT.get(log_alpha)
-    if kept is None or kept[0] != state:
+    entry: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = _KEPT.get(log_alpha)
+    if entry is None or entry[0] != state:
         with torch.inference_mode(False), torch.no_grad():
-            kept = _KEPT[log_alpha] = state, _linear_map(log_alpha.exp())
-    return kept[1]
+            entry = (state, _linear_map(log_alpha.exp()))
+        _KEPT[log_alpha] = entry
+    return entry[1]
 
 
 # An operation into which compilation does not look, and whose results a compiled graph may write over.

@@ -8,20 +8,33 @@ from semfov.errors import check_shape
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """Intersection over union of every pair of boxes, `(M, N)`; 0 for boxes without area."""
+    """Compute the intersection over union of every pair of boxes.
+
+    Args:
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)`.
+        others: `(N, 4)`, in the same frame.
+
+    Returns:
+        `(M, N)`; 0 for boxes without area.
+    """
     check_shape(boxes, "boxes", None, 4)
     check_shape(others, "others", None, 4)
-    boxes, others = (as_positions(each) for each in (boxes, others))
-    low = torch.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = torch.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    shared = (high - low).clamp(min=0).prod(-1)
-    area, other_area = ((b[:, 2:] - b[:, :2]).clamp(min=0).prod(-1) for b in (boxes, others))
-    union = area[:, None] + other_area[None] - shared
+    first = as_positions(boxes)
+    second = as_positions(others)
+    upper_left = torch.maximum(first[:, None, :2], second[None, :, :2])
+    lower_right = torch.minimum(first[:, None, 2:], second[None, :, 2:])
+    shared = (lower_right - upper_left).clamp(min=0).prod(-1)
+    union = _area(first)[:, None] + _area(second)[None] - shared
     return torch.where(union > 0, shared / union, 0.0)
 
 
+def _area(boxes: Tensor) -> Tensor:
+    """Compute the areas of boxes `(N, 4)`, `(N,)`."""
+    return (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(-1)
+
+
 def match(boxes: Tensor, truth: Tensor, labels: Tensor, *, iou: float = 0.5) -> Tensor:
-    """True class of each detection, 0 (background) for a detection that matches no object.
+    """Find the true class of each detection, 0 (background) for a detection that matches no object.
 
     Each detection in turn, the most confident first, is matched to the object that it overlaps most among the objects
     not matched yet, if their intersection over union is at least `iou`. No object is matched twice. The detected class

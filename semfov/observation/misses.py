@@ -50,13 +50,13 @@ class MissCounts:
         cells = len(detected)
         check_shape(objects, "objects", len(labels), cells)
         check_shape(level, "level", cells)
-        there = torch.zeros(len(self.total), cells, dtype=torch.bool)
-        there[0] = ~objects.any(0)
+        present = torch.zeros(len(self.total), cells, dtype=torch.bool)  # classes in each cell
+        present[0] = ~objects.any(0)
         for label in labels.unique():
-            there[label] = objects[labels == label].any(0)
+            present[label] = objects[labels == label].any(0)
         one_hot = torch.nn.functional.one_hot(level, self.total.shape[1])
-        self.total += there.long() @ one_hot
-        self.missed += (there & ~detected).long() @ one_hot
+        self.total += present.long() @ one_hot
+        self.missed += (present & ~detected).long() @ one_hot
         return self
 
     @classmethod
@@ -72,9 +72,9 @@ class MissCounts:
             New counts: the sum.
         """
         merged = cls(components, levels)
-        for each in counts:
-            merged.missed += each.missed
-            merged.total += each.total
+        for part in counts:
+            merged.missed += part.missed
+            merged.total += part.total
         return merged
 
     def rates(self, shrinkage: float = 50.0) -> Tensor:
@@ -102,7 +102,8 @@ class MissCounts:
                 [0.5000]])
         """
         check(shrinkage > 0, "shrinkage", "a positive number", shrinkage)
-        missed, total = self.missed.double(), self.total.double()
+        missed = self.missed.double()
+        total = self.total.double()
         pooled = (1 + missed[1:].sum(0)) / (2 + total[1:].sum(0))
         objects = (missed[1:] + shrinkage * pooled) / (total[1:] + shrinkage)
         background = (1 + missed[:1]) / (2 + total[:1])

@@ -24,7 +24,7 @@ _ROUNDS = 60
 
 
 def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1e8) -> Tensor:
-    r"""Maximum-likelihood parameters of Dirichlets, given the mean logarithms of their samples.
+    r"""Fit Dirichlets by maximum likelihood, given the mean logarithms of their samples.
 
     .. math:: \max_\alpha \; \ln\Gamma(A) - \sum_k \ln\Gamma(\alpha_k) + \sum_k (\alpha_k - 1) g_k, \quad
               A = \sum_k \alpha_k, \quad g_k = \frac{1}{n} \sum_i \ln s_{ik}
@@ -86,8 +86,9 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
         solved = solve(rows[~capped].clone())
     alpha[~capped] = solved
     if mean_log.requires_grad and torch.is_grad_enabled():
-        moved = mean_log.to(torch.float64).reshape(-1, components)
-        alpha = alpha + _response(alpha, moved - rows, capped)
+        # The difference is 0, and its gradient is that of the solution.
+        change = mean_log.to(torch.float64).reshape(-1, components) - rows
+        alpha = alpha + _response(alpha, change, capped)
     return alpha.reshape(mean_log.shape).to(mean_log.dtype)
 
 
@@ -122,7 +123,7 @@ def shrink(mean_log: Tensor, count: Tensor, parent: Tensor, strength: float) -> 
 
 
 def vacuous(components: int) -> Tensor:
-    """Mean log scores of Dir(1, ..., 1), the uniform density on the simplex: `ψ(1) - ψ(K)`.
+    """Compute the mean log scores of Dir(1, ..., 1), the uniform density on the simplex: `ψ(1) - ψ(K)`.
 
     Args:
         components: K, the length of the score vectors.
@@ -138,7 +139,7 @@ def vacuous(components: int) -> Tensor:
 
 
 def inverse_digamma(y: Tensor) -> Tensor:
-    """Inverse of the digamma function: the positive x with ψ(x) = y, by Newton's method (Minka 2000, appendix C).
+    """Invert the digamma function: find the positive x with ψ(x) = y, by Newton's method (Minka 2000, appendix C).
 
     Args:
         y: `(...)`, any numbers.
@@ -156,11 +157,12 @@ def inverse_digamma(y: Tensor) -> Tensor:
 
 
 def _guess(y: Tensor) -> Tensor:
+    """Guess the inverse of the digamma function: two asymptotes that meet at `_KNEE`."""
     return torch.where(y >= _KNEE, y.exp() + 0.5, -1 / (y.clamp(max=_KNEE) + _EULER))
 
 
 def _at_precision(rows: Tensor, precision: float) -> Tensor:
-    """Maximum under the constraint Σ α = precision: ψ(α_k) = y + g_k, with y chosen to satisfy it."""
+    """Find the maximum under the constraint Σ α = precision: ψ(α_k) = y + g_k, with y chosen to satisfy it."""
     level = math.log(precision) - rows.logsumexp(-1, keepdim=True)
     for _ in range(_ROUNDS):
         alpha = inverse_digamma(level + rows)
@@ -173,7 +175,7 @@ def _at_precision(rows: Tensor, precision: float) -> Tensor:
 
 
 def _first_guess(rows: Tensor) -> Tensor:
-    """Parameters within about ten per cent: A = Σ ψ⁻¹(ψ(A) + g), solved with an approximate inverse of ψ."""
+    """Guess α within about ten per cent: A = Σ ψ⁻¹(ψ(A) + g), solved with an approximate inverse of ψ."""
     slack = (-torch.expm1(rows.logsumexp(-1, keepdim=True))).clamp(min=torch.finfo(rows.dtype).eps)
     log_precision = ((rows.shape[-1] - 1) / 2 / slack).log()
     for _ in range(3):
@@ -189,14 +191,16 @@ def _first_guess(rows: Tensor) -> Tensor:
 
 
 def _residual(alpha: Tensor, rows: Tensor) -> Tensor:
-    """Gradient of the mean log likelihood with respect to α: ψ(A) - ψ(α_k) + g_k."""
+    """Compute the gradient of the mean log likelihood with respect to α: ψ(A) - ψ(α_k) + g_k."""
     return alpha.sum(-1, keepdim=True).digamma() - alpha.digamma() + rows
 
 
 def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Tensor:
     """Solve `(diag ψ'(α) - ψ'(A)) x = change`; for rows that are `capped` under the constraint Σ x = 0."""
     rates = torch.polygamma(1, alpha).reciprocal()
-    total, precision = rates.sum(-1, keepdim=True), alpha.sum(-1, keepdim=True)
+    total = rates.sum(-1, keepdim=True)
+    precision = alpha.sum(-1, keepdim=True)
+    # The matrix is diagonal plus rank one: the Sherman-Morrison formula inverts it.
     outer = 1 / (1 / torch.polygamma(1, precision) - total)
     if capped is not None:
         outer = torch.where(capped[:, None], -1 / total, outer)
@@ -205,32 +209,37 @@ def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Te
 
 
 def _tolerance(precision: Tensor) -> Tensor:
-    """Relative change of the parameters at which the iteration stops; rounding of ψ alone causes about 1e-15 A."""
+    """Give the relative change of α at which iterations stop; rounding of ψ alone causes about 1e-15 A."""
     return 1e-8 + 1e-14 * precision
 
 
 def _objective(alpha: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean log likelihood of each row, without the constant Σ g, and a bound on its rounding error."""
-    outer, inner, linear = alpha.sum(-1).lgamma(), alpha.lgamma(), alpha * rows
-    value = outer + (linear - inner).sum(-1)
-    size = outer.abs() + (inner.abs() + linear.abs()).sum(-1)
+    """Compute the mean log likelihood of each row, without the constant Σ g, and a bound on its rounding error."""
+    of_total = alpha.sum(-1).lgamma()
+    of_each = alpha.lgamma()
+    linear = alpha * rows
+    value = of_total + (linear - of_each).sum(-1)
+    size = of_total.abs() + (of_each.abs() + linear.abs()).sum(-1)
     return value, 16 * torch.finfo(alpha.dtype).eps * size
 
 
 def _newton(rows: Tensor) -> Tensor:
+    """Maximise by Newton's method on ln α; rows that have converged leave the iteration."""
     result = _first_guess(rows)
     active = torch.arange(len(rows), device=rows.device)
     alpha = result.clone()
     for _ in range(_ROUNDS):
         step = _response(alpha, _residual(alpha, rows)) / alpha
         length = step.abs().amax(-1)
-        going = length > _tolerance(alpha.sum(-1))
         # Indices: a GPU is waited for whenever a mask is used.
-        far, going = (length > _SAFE).nonzero()[:, 0], going.nonzero()[:, 0]
-        step[far] = _climbing(alpha[far], step[far], rows[far])
+        going = (length > _tolerance(alpha.sum(-1))).nonzero()[:, 0]
+        long = (length > _SAFE).nonzero()[:, 0]
+        step[long] = _climbing(alpha[long], step[long], rows[long])
         alpha = alpha * step.exp()
         result[active] = alpha
-        active, alpha, rows = active[going], alpha[going], rows[going]
+        active = active[going]
+        alpha = alpha[going]
+        rows = rows[going]
         if len(active) == 0:
             return result
     raise _not_converged("newton", len(active))
@@ -249,6 +258,7 @@ def _climbing(alpha: Tensor, step: Tensor, rows: Tensor) -> Tensor:
 
 
 def _fixed_point(rows: Tensor) -> Tensor:
+    """Maximise by Minka's fixed-point iteration, extrapolated; rows that have converged leave the iteration."""
     result = torch.empty_like(rows)
     active = torch.arange(len(rows), device=rows.device)
     precision = _first_guess(rows).sum(-1)
@@ -257,18 +267,21 @@ def _fixed_point(rows: Tensor) -> Tensor:
         result[active] = alpha
         total = alpha.sum(-1)
         # Share of an error that is left after the round: d ln(Σ α) / d ln(A).
-        left = precision * torch.polygamma(1, precision) * torch.polygamma(1, alpha).reciprocal().sum(-1) / total
-        step = (total / precision).log() / (1 - left).clamp(min=torch.finfo(rows.dtype).eps)
+        share = precision * torch.polygamma(1, precision) * torch.polygamma(1, alpha).reciprocal().sum(-1) / total
+        step = (total / precision).log() / (1 - share).clamp(min=torch.finfo(rows.dtype).eps)
         going = step.abs() > _tolerance(total)
         precision = (precision * step.clamp(-_LONGEST, _LONGEST).exp())[going]
-        active, rows = active[going], rows[going]
+        active = active[going]
+        rows = rows[going]
         if len(active) == 0:
             return result
     raise _not_converged("fixed_point", len(active))
 
 
 def _gradient(rows: Tensor) -> Tensor:
-    alpha, distance = _first_guess(rows), torch.inf
+    """Maximise by L-BFGS, started anew until a step of Newton's method would be short."""
+    alpha = _first_guess(rows)
+    distance = torch.inf
     for _ in range(_ROUNDS if len(rows) else 0):
         # Close to the maximum the likelihood changes by less than its rounding error, so a line search would stall.
         alpha = _descend(alpha, rows, "strong_wolfe" if distance > 1e-3 else None)
@@ -282,36 +295,42 @@ def _gradient(rows: Tensor) -> Tensor:
 
 
 def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
-    """One run of L-BFGS on ln α, in coordinates in which the Fisher information `diag(α² ψ'(α)) - ψ'(A) α αᵀ` is 1."""
+    """Run L-BFGS on ln α, in coordinates in which the Fisher information `diag(α² ψ'(α)) - ψ'(A) α αᵀ` is 1."""
     rates = torch.polygamma(1, start).reciprocal()
     total = rates.sum(-1, keepdim=True)
     rest = (1 - torch.polygamma(1, start.sum(-1, keepdim=True)) * total).clamp(min=torch.finfo(rows.dtype).eps)
-    across, along = rates.sqrt() / start, rates / start * (total * rest).rsqrt()
+    offset_scale = rates.sqrt() / start
+    shift_scale = rates / start * (total * rest).rsqrt()
     offset = torch.zeros_like(rows, requires_grad=True)
     shift = torch.zeros_like(total, requires_grad=True)
-    outer, inner = start.sum(-1).lgamma(), start.lgamma()
+    of_total = start.sum(-1).lgamma()
+    of_each = start.lgamma()
     optimiser = torch.optim.LBFGS(
         [offset, shift], max_iter=25, tolerance_grad=1e-13, tolerance_change=0, line_search_fn=line_search
     )
 
     def current() -> Tensor:
-        return start * (offset * across + shift * along).exp()
+        """Compute α from the variables."""
+        return start * (offset * offset_scale + shift * shift_scale).exp()
 
     @torch.enable_grad()
     def loss() -> Tensor:
+        """Compute how much less likely than the start α is, and the gradient."""
         optimiser.zero_grad()
         alpha = current()
         # Differences are taken term by term: the difference of two sums would lose digits.
-        gain = (alpha.sum(-1).lgamma() - outer) - (alpha.lgamma() - inner).sum(-1) + ((alpha - start) * rows).sum(-1)
-        lost = -gain.sum()
-        lost.backward()
-        return lost
+        linear = ((alpha - start) * rows).sum(-1)
+        gain = (alpha.sum(-1).lgamma() - of_total) - (alpha.lgamma() - of_each).sum(-1) + linear
+        decrease = -gain.sum()
+        decrease.backward()
+        return decrease
 
     optimiser.step(loss)
     return current().detach()
 
 
 def _not_converged(method: str, rows: int) -> SemfovError:
+    """Make the error of a method that did not converge for some rows."""
     return SemfovError(
         f"mle: expected method {method!r} to converge within {_ROUNDS} rounds, got {rows} Dirichlets that did not; "
         "try another method"

@@ -9,7 +9,7 @@ from semfov.observation.foveal import FovealObservationModel
 
 
 def visibility(model: FovealObservationModel) -> Tensor:
-    r"""Detectability index d' of every class against background, at every level of distance.
+    r"""Compute the detectability index d' of every class against background, at every level of distance.
 
     The signal in a cell is the log likelihood ratio of target and background given the detection there, R = ln Dir(S |
     α_k) - ln Dir(S | α_0). Without a detection there is no signal, R = 0, as in a belief that fuses detections alone.
@@ -51,16 +51,19 @@ def visibility(model: FovealObservationModel) -> Tensor:
         raise InputError(
             "model: expected an observation model with miss rates (fit one with `train.fit_fom`), got one without"
         )
-    alpha, background = model.alpha, model.alpha[:1]
-    target = _mixed(*_log_ratio_moments(alpha, alpha, background), model.miss_rate)
-    nothing = _mixed(*_log_ratio_moments(background, alpha, background), model.miss_rate[:1])
-    spread = ((target[1] + nothing[1]) / 2).sqrt()
-    apart = target[0] - nothing[0]
-    return torch.where(spread > 0, apart / spread.clamp(min=torch.finfo(spread.dtype).tiny), 0.0)
+    target = model.alpha
+    background = target[:1]
+    moments = _log_ratio_moments(target, target, background)
+    signal_mean, signal_variance = _mixed(*moments, model.miss_rate)
+    moments = _log_ratio_moments(background, target, background)
+    noise_mean, noise_variance = _mixed(*moments, model.miss_rate[:1])
+    deviation = ((signal_variance + noise_variance) / 2).sqrt()
+    difference = signal_mean - noise_mean
+    return torch.where(deviation > 0, difference / deviation.clamp(min=torch.finfo(deviation.dtype).tiny), 0.0)
 
 
 def _log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S drawn from Dir(alpha)."""
+    """Compute mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S from Dir(alpha)."""
     # ln p/q under r is KL(r || q) - KL(r || p).
     mean = kl_divergence(alpha, background) - kl_divergence(alpha, target)
     weight = target - background
@@ -71,6 +74,6 @@ def _log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tup
 
 
 def _mixed(mean: Tensor, variance: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of a variable that is 0 with probability `missed` and otherwise has the given moments."""
+    """Compute mean and variance of a variable that is 0 with probability `missed`, and else has these moments."""
     detected = 1 - missed
     return detected * mean, detected * (variance + missed * mean.square())

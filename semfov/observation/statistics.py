@@ -76,17 +76,7 @@ class DirichletStatistics:
         check(not bool((scores < 0).any()), "scores", "no negative numbers", "some")
         check(not bool(off.any()), "scores", "vectors that sum to 1", f"{int(off.sum())} that do not")
         scores = scores.reshape(-1, self.components)
-        indices = (index,) if isinstance(index, Tensor) else tuple(index)
-        sizes = (self.count.numel(),) if isinstance(index, Tensor) else self.shape
-        check(len(indices) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(indices))
-        cells, samples = torch.zeros(len(scores), dtype=torch.int64, device=indices[0].device), len(scores)
-        for row, size in zip(indices, sizes, strict=True):
-            whole = not row.is_floating_point() and row.dtype != torch.bool
-            check(whole and row.shape == (samples,), "index", f"({samples},) integers", (row.dtype, row.shape))
-            inside = bool(((row >= 0) & (row < size)).all())
-            check(inside, "index", f"numbers from 0 to {size - 1}", "one outside")
-            cells = cells * size + row
-        cells = cells.to(self.count.device)
+        cells = self._cells(index, len(scores)).to(self.count.device)
         count = self.count + torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
         self._check_room(count)
         raised = scores.to(self.count.device, torch.float64).clamp(min=self.epsilon).contiguous()
@@ -97,6 +87,20 @@ class DirichletStatistics:
         self.count = count
         self.sums.view(3, -1, self.components).index_add_(1, cells, terms.round().to(torch.int64))
         return self
+
+    def _cells(self, index: Tensor | Sequence[Tensor], samples: int) -> Tensor:
+        """Check the cells of samples (`update`), and number them row by row, `(samples,)`."""
+        indices = (index,) if isinstance(index, Tensor) else tuple(index)
+        sizes = (self.count.numel(),) if isinstance(index, Tensor) else self.shape
+        check(len(indices) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(indices))
+        cells = torch.zeros(samples, dtype=torch.int64, device=indices[0].device)
+        for row, size in zip(indices, sizes, strict=True):
+            integer = not row.is_floating_point() and row.dtype != torch.bool
+            check(integer and row.shape == (samples,), "index", f"({samples},) integers", (row.dtype, row.shape))
+            inside = bool(((row >= 0) & (row < size)).all())
+            check(inside, "index", f"numbers from 0 to {size - 1}", "one outside")
+            cells = cells * size + row
+        return cells
 
     def merge(self, other: "DirichletStatistics") -> Self:
         """Add the sums of other samples.
@@ -110,8 +114,9 @@ class DirichletStatistics:
         Raises:
             InputError: the other table has another shape, number of components or epsilon, or a sum would overflow.
         """
-        mine, theirs = (self.shape, self.components, self.epsilon), (other.shape, other.components, other.epsilon)
-        check(mine == theirs, "other", f"statistics of shape, components and epsilon {mine}", theirs)
+        required = (self.shape, self.components, self.epsilon)
+        got = (other.shape, other.components, other.epsilon)
+        check(got == required, "other", f"statistics of shape, components and epsilon {required}", got)
         count = self.count + other.count.to(self.count.device)
         self._check_room(count)
         self.count = count
@@ -148,7 +153,8 @@ class DirichletStatistics:
         check(len(self.shape) > 1, "dim", "a table of two dimensions or more", self.shape)
         dim = range(len(self.shape))[dim]
         pooled = DirichletStatistics(self.shape[:dim] + self.shape[dim + 1 :], self.components, epsilon=self.epsilon)
-        pooled.count, pooled.sums = self.count.sum(dim), self.sums.sum(dim + 1)
+        pooled.count = self.count.sum(dim)
+        pooled.sums = self.sums.sum(dim + 1)
         self._check_room(pooled.count)
         return pooled
 
@@ -159,8 +165,8 @@ class DirichletStatistics:
             path: the file.
             record: JSON values to save with the statistics.
         """
-        own = {"kind": "dirichlet-statistics", "epsilon": self.epsilon, "fraction_bits": _FRACTION_BITS}
-        write_file(path, {"count": self.count, "sums": self.sums}, {**record, **own})
+        settings = {"kind": "dirichlet-statistics", "epsilon": self.epsilon, "fraction_bits": _FRACTION_BITS}
+        write_file(path, {"count": self.count, "sums": self.sums}, {**record, **settings})
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> tuple[Self, dict[str, Any]]:
@@ -176,22 +182,24 @@ class DirichletStatistics:
             DataError: the file is missing or damaged, or was not written by `save`.
         """
         tensors, record = read(path, "dirichlet-statistics")
-        count, sums = tensors.get("count"), tensors.get("sums")
+        count = tensors.get("count")
+        sums = tensors.get("sums")
         if count is None or sums is None or count.ndim < 1 or sums.shape[:-1] != (3, *count.shape):
             shapes = {name: tuple(t.shape) for name, t in tensors.items()}
             raise DataError(f"{path}: expected tensors `count` and `sums` of matching shapes, got {shapes}")
-        whole = Field(tuple(count.shape), torch.int64, low=0)
+        fields = {
+            "count": Field(tuple(count.shape), torch.int64, low=0),
+            "sums": Field(tuple(sums.shape), torch.int64),
+        }
         try:
-            Schema(
-                {"count": whole, "sums": Field(tuple(sums.shape), torch.int64)},
-                {"epsilon": Number(above=0, high=1)},
-            ).check(tensors, record)
+            Schema(fields, {"epsilon": Number(above=0, high=1)}).check(tensors, record)
         except InputError as error:
             raise DataError(f"{path}: expected a complete file of Dirichlet statistics, got: {error}") from None
         if record.get("fraction_bits") != _FRACTION_BITS:
             raise DataError(f"{path}: expected sums in units of 2^-{_FRACTION_BITS}, got {record.get('fraction_bits')}")
         statistics = cls(tuple(count.shape), sums.shape[-1], epsilon=record["epsilon"])
-        statistics.count, statistics.sums = count, sums
+        statistics.count = count
+        statistics.sums = sums
         return statistics, record
 
     def __eq__(self, other: object) -> bool:
@@ -209,6 +217,7 @@ class DirichletStatistics:
         return f"DirichletStatistics(shape={self.shape}, components={self.components}, samples={samples})"
 
     def _mean(self, which: int) -> Tensor:
+        """Divide one of the three `sums` by the count."""
         return self.sums[which].to(torch.float64) / 2.0**_FRACTION_BITS / self.count[..., None]
 
     def _check_room(self, count: Tensor) -> None:

@@ -12,6 +12,15 @@ _Constant = TypeVar("_Constant")
 _Settings = TypeVarTuple("_Settings")
 
 
+def mark_constant(function: Callable[..., object]) -> None:
+    """Mark a function of settings as one that the compiler calls, instead of tracing it.
+
+    `torch.compiler.assume_constant_result` does nothing else, but it imports the compiler, which takes a second even
+    for users who compile nothing.
+    """
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
 def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Settings], _Constant]:
     """Cache the results of a function of sizes and settings.
 
@@ -37,9 +46,10 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
         with torch.inference_mode(False), torch.no_grad():
             return function(*settings)
 
-    @torch.compiler.assume_constant_result  # type: ignore[untyped-decorator]
     def remember_in_graph(*settings: Any) -> Any:
         return remember(*settings)
+
+    mark_constant(remember_in_graph)
 
     @wraps(function)
     def call(*settings: *_Settings) -> _Constant:

@@ -41,12 +41,14 @@ class _AnyBelief(Belief):
     def presence(self, target: int | Tensor) -> Tensor:
         return self._any(lambda belief, index: belief.presence(index))
 
-    def _each(self) -> list[tuple[Belief, int, float]]:
+    def by_class(self) -> list[tuple[Belief, int, float]]:
+        """List the belief about each class, the class and its weight."""
         beliefs = self.inner if len(self.inner) > 1 else self.inner * len(self.weights)
         return [(belief, index, weight) for belief, (index, weight) in zip(beliefs, self.weights.items(), strict=True)]
 
     def _any(self, probability: Callable[[Belief, int], Tensor]) -> Tensor:
-        missing = [1 - weight * probability(belief, index) for belief, index, weight in self._each()]
+        """Compute the probability of any class that is meant from a probability of each."""
+        missing = [1 - weight * probability(belief, index) for belief, index, weight in self.by_class()]
         return 1 - torch.stack(missing).prod(0)
 
 
@@ -84,31 +86,45 @@ class AnyOf(Observer):
         return self.observer.thresholds
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> _AnyBelief:
-        """The first belief of the inner observer, for each class."""
+        """Make the first belief of the inner observer, for each class."""
         inner = tuple(self.observer.start(batch, grid, like) for _ in self._targets)
         return _AnyBelief(inner, self.weights, inner[0].closest)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _AnyLook:
-        """Evidence for each class; `target` is ignored."""
+        """Weigh the evidence for each class; `target` is ignored."""
         return _AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._targets))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> _AnyBelief:
         """Fade the beliefs of the inner observer."""
-        return self._each(belief, look, lambda each, of: self.observer.fade(each, of, keep, visited))
+
+        def faded(inner: Belief, inner_look: Look) -> Belief:
+            return self.observer.fade(inner, inner_look, keep, visited)
+
+        return self._change(belief, look, faded)
 
     def update(self, belief: Belief, look: Look) -> _AnyBelief:
         """Update the beliefs of the inner observer."""
-        return self._each(belief, look, self.observer.update)
+        return self._change(belief, look, self.observer.update)
 
-    def _each(self, belief: Belief, look: Look, change: Callable[[Belief, Look], Belief]) -> _AnyBelief:
-        belief, look = own(belief, _AnyBelief, "belief"), own(look, _AnyLook, "look")
-        inner = tuple(change(each, of) for each, of in zip(belief.inner, look.inner, strict=True))
-        return replace(belief, inner=inner, closest=inner[0].closest)
+    def _change(self, belief: Belief, look: Look, change: Callable[[Belief, Look], Belief]) -> _AnyBelief:
+        """Change the beliefs of the inner observer by its looks."""
+        any_belief = own(belief, _AnyBelief, "belief")
+        any_look = own(look, _AnyLook, "look")
+        inner = tuple(change(*pair) for pair in zip(any_belief.inner, any_look.inner, strict=True))
+        return replace(any_belief, inner=inner, closest=inner[0].closest)
 
 
 def class_meant(belief: Belief, target: int) -> int:
-    """The class that a search is about: of several the one with the most probable cell, weights included."""
+    """Find the class that a search is about.
+
+    Args:
+        belief: the belief of the search, of one episode.
+        target: its target, 1..K.
+
+    Returns:
+        The target; of several (`AnyOf`) the one with the most probable cell, weights included.
+    """
     if not isinstance(belief, _AnyBelief):
         return target
-    peaks = [weight * each.probability(index).amax(-1) for each, index, weight in belief._each()]
+    peaks = [weight * inner.probability(index).amax(-1) for inner, index, weight in belief.by_class()]
     return list(belief.weights)[int(torch.stack(peaks).argmax(0))]

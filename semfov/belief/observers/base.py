@@ -30,7 +30,7 @@ class Look:
     """
 
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """The selected looks of the batch."""
+        """Select looks of the batch."""
         return with_fields(self, lambda value: value[index] if isinstance(value, Tensor | Look) else value)
 
     @classmethod
@@ -50,10 +50,13 @@ class Look:
                 return torch.cat(list(values))
             if isinstance(first, Look):
                 return type(first).join(values)
-            return tuple(joined(part) for part in zip(*values, strict=True)) if isinstance(first, tuple) else first
+            if isinstance(first, tuple):
+                return tuple(joined(part) for part in zip(*values, strict=True))
+            return first
 
-        names = [each.name for each in fields(cls)]  # type: ignore[arg-type]
-        return replace(looks[0], **{name: joined([getattr(look, name) for look in looks]) for name in names})  # type: ignore[type-var]
+        names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+        changes = {name: joined([getattr(look, name) for look in looks]) for name in names}
+        return replace(looks[0], **changes)  # type: ignore[type-var]
 
 
 class Observer(nn.Module, ABC):
@@ -165,7 +168,19 @@ class Observer(nn.Module, ABC):
 
 
 def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
-    """Check that a belief or a look is of the kind that an observer makes."""
+    """Check that a belief or a look is of the kind that an observer makes.
+
+    Args:
+        value: the belief or the look.
+        kind: its class.
+        argument: name of the argument, for the message.
+
+    Returns:
+        The value.
+
+    Raises:
+        InputError: it is of another kind.
+    """
     if not isinstance(value, kind):
         raise InputError(
             f"{argument}: expected {kind.__name__}, got {type(value).__name__}; use the belief and the looks of one "

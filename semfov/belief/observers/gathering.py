@@ -18,7 +18,16 @@ _Model = TypeVar("_Model", bound=Evidence)
 
 @dataclass(frozen=True)
 class EvidenceLook(Look):
-    """Evidence `(B, X·Y)` of looks about a class, or `(B, T, X·Y)`; distance `(B, X·Y)`, score `(B,)` or `(B, T)`."""
+    """Evidence of B looks about a class, or about T classes.
+
+    Attributes:
+        evidence: log odds of each cell, `(B, X·Y)` or `(B, T, X·Y)`.
+        distance: from the fixation to each cell, `(B, X·Y)`, in longer sides of the image.
+        score: highest score of the class in the look, `(B,)` or `(B, T)`.
+        fixated: the fixated cell, `(B,)`.
+        target: the class, `(B,)` or `(B, T)`.
+        columns: X, cells in a row.
+    """
 
     evidence: Tensor
     distance: Tensor
@@ -30,7 +39,18 @@ class EvidenceLook(Look):
 
 @dataclass(frozen=True)
 class GatheredBelief(Belief, ABC):
-    """Base of beliefs from all looks; cells `(B, X·Y)` or `(B, K, X·Y)`, score `(B,)` or `(B, K)`, looks `(B,)`."""
+    """Base of beliefs from all looks, about a class, or with a row for each of K classes.
+
+    Attributes:
+        closest: distance from each cell to its closest fixation, `(B, X·Y)`; infinite before the first look.
+        nearest: evidence of each cell's closest look, `(B, X·Y)` or `(B, K, X·Y)`.
+        best: strongest evidence of any look, of the same shape.
+        total: sum of the evidence of all looks, weighted by `nearness`, of the same shape.
+        weight: sum of these weights, `(B, X·Y)`.
+        score: highest score of the class in any look, `(B,)` or `(B, K)`.
+        looks: number of looks, `(B,)`.
+        visited: fixated cells, `(B, X·Y)` boolean.
+    """
 
     closest: Tensor
     nearest: Tensor
@@ -51,13 +71,24 @@ class Gatherer(Observer, Generic[_Model]):
         self.together = together
 
     def nothing(self, batch: int, grid: Grid, like: Tensor, *classes: int) -> dict[str, Tensor]:
-        """Gathered evidence before the first look, for one class, or with a row for each of several `classes`."""
-        cells, each = like.new_zeros(batch, len(grid)), like.new_zeros(batch, *classes, len(grid))
+        """Make the attributes of `GatheredBelief` before the first look.
+
+        Args:
+            batch: B, number of episodes.
+            grid: the cells.
+            like: a tensor, whose dtype and device they take.
+            classes: nothing for one class; K for a row for each of K classes.
+
+        Returns:
+            The attributes by name.
+        """
+        cells = like.new_zeros(batch, len(grid))
+        by_class = like.new_zeros(batch, *classes, len(grid))
         return {
             "closest": cells + torch.inf,
-            "nearest": each,
-            "best": each - torch.inf,
-            "total": each,
+            "nearest": by_class,
+            "best": by_class - torch.inf,
+            "total": by_class,
             "weight": cells,
             "score": like.new_zeros(batch, *classes),
             "looks": like.new_zeros(batch),
@@ -65,19 +96,28 @@ class Gatherer(Observer, Generic[_Model]):
         }
 
     def gather(self, belief: GatheredBelief, look: EvidenceLook) -> tuple[dict[str, Tensor], list[Tensor]]:
-        """Gather one more look: the attributes of `GatheredBelief`, and the inputs of `Gathered` up to the class."""
+        """Gather one more look.
+
+        Args:
+            belief: from the looks so far.
+            look: the next look in each episode.
+
+        Returns:
+            The attributes of `GatheredBelief` by name, and the fields of `Gathered` in order, but for the last one,
+            the class.
+        """
 
         def by_cell(values: Tensor) -> Tensor:
-            """`(B, X·Y)`, the same for all classes."""
+            """Broadcast `(B, X·Y)` over the classes of the look."""
             return values if look.evidence.ndim == values.ndim else values[:, None]
 
-        near = self.each(nearness, look.distance)
+        weight = self.each(nearness, look.distance)
         gathered = {
             "closest": torch.minimum(look.distance, belief.closest),
             "nearest": torch.where(by_cell(look.distance < belief.closest), look.evidence, belief.nearest),
             "best": torch.maximum(look.evidence, belief.best),
-            "total": belief.total + by_cell(near) * look.evidence,
-            "weight": belief.weight + near,
+            "total": belief.total + by_cell(weight) * look.evidence,
+            "weight": belief.weight + weight,
             "score": torch.maximum(look.score, belief.score),
             "looks": belief.looks + 1,
             "visited": belief.visited.scatter(-1, look.fixated[:, None], True),
@@ -97,5 +137,5 @@ class Gatherer(Observer, Generic[_Model]):
         return replace(belief, **faded, closest=fields["closest"] + farther(keep), visited=visited)  # type: ignore[type-var]
 
     def each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-        """Apply a function to the rows of tensors `(B, ...)`: one by one (`one_by_one`), or all at once."""
+        """Apply a function to tensors `(B, ...)`, row by row (`one_by_one`), or with `together` all at once."""
         return function(*rows) if self.together else one_by_one(function, *rows)

@@ -50,39 +50,53 @@ class LearnedMap(Gatherer[MapEvidence]):
     """
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> MapBelief:
-        """The same probability for every class in every cell, and no evidence."""
+        """Begin with the same probability for every class in every cell, and no evidence."""
         classes = len(self.model.prior) - 1
         even = like.new_full((batch, len(grid), classes + 1), 1 / (classes + 1))
         # One row for all classes; it broadcasts over the classes of the first look.
         return MapBelief(**self.nothing(batch, grid, like, 1), probabilities=even)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> MapLook:
-        """Evidence for all classes, the same for every target."""
-        targets = torch.arange(1, len(self.model.prior), device=fixation.device)
-        by_class = self.each(
-            lambda boxes, scores, mask, point: self.model(Detections(boxes, scores, mask), point, grid, targets),
-            *(detections.boxes, detections.scores, detections.mask, fixation),
+        """Weigh the evidence for all classes, the same for every target."""
+        classes = torch.arange(1, len(self.model.prior), device=fixation.device)
+
+        def evidence(boxes: Tensor, scores: Tensor, mask: Tensor, point: Tensor) -> Tensor:
+            return self.model(Detections(boxes, scores, mask), point, grid, classes)
+
+        targets = classes.expand(len(fixation), -1)
+        return MapLook(
+            evidence=self.each(evidence, detections.boxes, detections.scores, detections.mask, fixation),
+            distance=grid.distance(fixation),
+            score=highest_score(detections, classes),
+            fixated=grid.cell_of(fixation),
+            target=targets,
+            columns=grid.columns,
+            stands_for=torch.ones_like(targets),
         )
-        every = targets.expand(len(fixation), -1)
-        where = grid.distance(fixation), highest_score(detections, targets), grid.cell_of(fixation)
-        return MapLook(by_class, *where, every, grid.columns, torch.ones_like(every))
 
     def update(self, belief: Belief, look: Look) -> MapBelief:
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
-        belief, look = own(belief, MapBelief, "belief"), own(look, MapLook, "look")
-        columns = look.columns
-        all_looks, inputs = self.gather(belief, look)
+        map_look = own(look, MapLook, "look")
+        columns = map_look.columns
+        all_looks, inputs = self.gather(own(belief, MapBelief, "belief"), map_look)
 
         def probabilities(*gathered: Tensor) -> Tensor:
-            """Probabilities `(B, X·Y, T+1)` from the gathered evidence, whose rows are of T classes each."""
-            *by_class, closest, score, looks, visited, targets, stands_for = gathered
-            classes = by_class[0].shape[1]
-            nearest, best, mean = (values.flatten(0, 1) for values in by_class)
-            distance, number, seen = (values.repeat_interleave(classes, 0) for values in (closest, looks, visited))
-            rows = Gathered(nearest, best, mean, distance, score.flatten(), number, seen, targets.flatten())
+            """Compute probabilities `(B, X·Y, T+1)` from the gathered evidence, whose rows are of T classes each."""
+            nearest, best, mean, closest, score, looks, visited, targets, stands_for = gathered
+            classes = nearest.shape[1]
+            rows = Gathered(
+                nearest.flatten(0, 1),
+                best.flatten(0, 1),
+                mean.flatten(0, 1),
+                closest.repeat_interleave(classes, 0),
+                score.flatten(),
+                looks.repeat_interleave(classes, 0),
+                visited.repeat_interleave(classes, 0),
+                targets.flatten(),
+            )
             cells = self.model.log_odds(rows, columns, classes)
             nothing = self.model.emptiness(cells, closest, looks, columns, stands_for)
             return torch.cat([nothing[:, None], cells], 1).sigmoid().transpose(1, 2)
 
-        values = self.each(probabilities, *inputs, look.target, look.stands_for)
+        values = self.each(probabilities, *inputs, map_look.target, map_look.stands_for)
         return MapBelief(**all_looks, probabilities=values)

@@ -28,7 +28,13 @@ _WEAK = 1e-5  # Dirichlet parameter of a prior that one look outweighs
 
 @dataclass(frozen=True)
 class SemanticLook(Look):
-    """Likelihoods of a batch of looks `(B, L, K+1)`, scaled, and the cells that they update `(B, L, X·Y)` (`fuse`)."""
+    """Likelihoods of a batch of looks.
+
+    Attributes:
+        likelihood: of the classes given each detection, `(B, L, K+1)`, scaled.
+        footprint: the cells that each detection updates, `(B, L, X·Y)` (`fuse`).
+        distance: from the fixation to each cell, `(B, X·Y)`.
+    """
 
     likelihood: Tensor
     footprint: Tensor
@@ -37,14 +43,15 @@ class SemanticLook(Look):
     @classmethod
     def join(cls, looks: Sequence[Self]) -> Self:
         """Concatenate several batches of looks, padded to the largest number of detections."""
-        most = max(look.likelihood.shape[-2] for look in looks)
+        detections = max(look.likelihood.shape[-2] for look in looks)
 
         def joined(name: str) -> Tensor:
             values = [getattr(look, name) for look in looks]
-            by_detection = name in ("likelihood", "footprint", "covered")
-            return torch.cat([pad(each, (0, 0, 0, most - each.shape[-2])) if by_detection else each for each in values])
+            if name in ("likelihood", "footprint", "covered"):
+                values = [pad(value, (0, 0, 0, detections - value.shape[-2])) for value in values]
+            return torch.cat(values)
 
-        return cls(*(joined(each.name) for each in fields(cls)))
+        return cls(*(joined(field.name) for field in fields(cls)))
 
 
 @dataclass(frozen=True)
@@ -159,14 +166,14 @@ class Semantic(Observer):
         )
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> DirichletBelief:
-        """The prior in every cell."""
+        """Begin with the prior in every cell."""
         beta = like.new_full((batch, len(grid), self.components), self.prior)
         if self.association == "each":
             return DirichletBelief(beta)
         return AssociatedBelief(beta, visited=torch.zeros_like(beta[..., 0], dtype=torch.bool))
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SemanticLook:
-        """Likelihoods of the detections (`likelihoods`), the same for every target."""
+        """Compute the likelihoods of the detections (`likelihoods`), the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.observation, tempering=self.tempering)
         cells = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
         distance = grid.distance(fixation).to(likelihood)
@@ -178,34 +185,54 @@ class Semantic(Observer):
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
         """Fuse one more look in each episode."""
-        belief, look = dirichlet_belief(belief), own(look, SemanticLook, "look")
-        before = belief.beta if self.memory == "all" else torch.full_like(belief.beta, self.prior)
-        changes = {}
+        old = dirichlet_belief(belief)
+        semantic = own(look, SemanticLook, "look")
+        before = old.beta if self.memory == "all" else torch.full_like(old.beta, self.prior)
+        changes: dict[str, Tensor] = {}
         if self.association == "each":
-            fused = self._fuse_each(before, look)
+            fused = self._fuse_each(before, semantic)
         else:
-            fixated = own(look, AssociatedLook, "look").fixated[:, None]
-            changes["visited"] = own(belief, AssociatedBelief, "belief").visited.scatter(1, fixated, True)
-            fused = self._fuse_one(before, own(look, AssociatedLook, "look"), changes["visited"])
+            associated = own(look, AssociatedLook, "look")
+            visited = own(belief, AssociatedBelief, "belief").visited.scatter(1, associated.fixated[:, None], True)
+            fused = self._fuse_one(before, associated, visited)
+            changes["visited"] = visited
         if self.memory == "closest":
-            fused = torch.where((look.distance < belief.closest)[..., None], fused, belief.beta)
-        return replace(belief, beta=fused, closest=torch.minimum(belief.closest, look.distance), **changes)
+            fused = torch.where((semantic.distance < old.closest)[..., None], fused, old.beta)
+        return replace(old, beta=fused, closest=torch.minimum(old.closest, semantic.distance), **changes)
 
     def _fuse_each(self, before: Tensor, look: SemanticLook) -> Tensor:
-        """Fuse the detections one after another, and misses in cells without any; before `(B, X·Y, K+1)`."""
+        """Fuse the detections one after another, and misses in cells without any.
+
+        Args:
+            before: Dirichlet parameters `(B, X·Y, K+1)`.
+            look: the look of each episode.
+
+        Returns:
+            New parameters.
+        """
         fused = fuse_scaled(before, look.likelihood.to(before.dtype), look.footprint, self.fusion)
         if self.misses is None:
             return fused
-        nothing = ~(look.footprint > 0).any(-2)
-        unseen = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(before.dtype))
-        return torch.where(nothing[..., None], unseen, fused)
+        empty = ~(look.footprint > 0).any(-2)
+        missed = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(before.dtype))
+        return torch.where(empty[..., None], missed, fused)
 
     def _fuse_one(self, before: Tensor, look: AssociatedLook, visited: Tensor) -> Tensor:
-        """Fuse one likelihood for each cell, in which all detections of a look and a miss are alternatives."""
+        """Fuse one likelihood for each cell, in which all detections of a look and a miss are alternatives.
+
+        Args:
+            before: Dirichlet parameters `(B, X·Y, K+1)`.
+            look: the look of each episode.
+            visited: cells that were fixated up to this look, `(B, X·Y)` boolean.
+
+        Returns:
+            New parameters.
+        """
         assert self.misses is not None
-        ratio, footprint, covered = (each.to(before) for each in (look.likelihood, look.footprint, look.covered))
-        weight = refuted(footprint, covered, visited, self.misses.refutation.clamp(0, 1).to(before))
-        likelihood = one_of(ratio, weight, self.misses.miss_odds(look.distance).to(before))
+        share = self.misses.refutation.clamp(0, 1).to(before)
+        weight = refuted(look.footprint.to(before), look.covered.to(before), visited, share)
+        odds = self.misses.miss_odds(look.distance).to(before)
+        likelihood = one_of(look.likelihood.to(before), weight, odds)
         return RULES[self.fusion](before, likelihood / likelihood.amax(-1, keepdim=True))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
@@ -221,5 +248,5 @@ class Semantic(Observer):
         return replace(belief, beta=beta, closest=belief.closest + farther(keep), **changes)
 
     def extra_repr(self) -> str:
-        """Prior, fusion rule, footprint and tempering."""
+        """Write prior, fusion rule, footprint and tempering."""
         return f"prior={self.prior:g}, fusion={self.fusion}, footprint={self.footprint}, tempering={self.tempering:g}"

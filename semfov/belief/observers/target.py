@@ -24,7 +24,13 @@ class TargetLook(EvidenceLook):
 
 @dataclass(frozen=True)
 class TargetBelief(GatheredBelief):
-    """Belief about a single target: in each cell, there if no fixated cell holds it `(B, X·Y)`, and anywhere `(B,)`."""
+    """Belief about a single target.
+
+    Attributes:
+        present: probability that each cell holds it, `(B, X·Y)`.
+        following: the same if no fixated cell holds it, `(B, X·Y)`.
+        anywhere: probability that the image holds it, `(B,)`.
+    """
 
     present: Tensor
     following: Tensor
@@ -67,12 +73,13 @@ class Target(Gatherer[TargetEvidence]):
         return self.model.thresholds
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> TargetBelief:
-        """Even odds in every cell, and no evidence."""
-        even, anywhere = like.new_full((batch, len(grid)), 0.5), like.new_full((batch,), 0.5)
+        """Begin with even odds in every cell, and no evidence."""
+        even = like.new_full((batch, len(grid)), 0.5)
+        anywhere = like.new_full((batch,), 0.5)
         return TargetBelief(**self.nothing(batch, grid, like), present=even, following=even, anywhere=anywhere)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> TargetLook:
-        """Evidence for the target, which must be given."""
+        """Weigh the evidence for the target, which must be given."""
         if target is None:
             raise InputError("target: expected a class to search for, got None")
         evidence = self.model(detections, fixation, grid, target)
@@ -82,19 +89,21 @@ class Target(Gatherer[TargetEvidence]):
 
     def update(self, belief: Belief, look: Look) -> TargetBelief:
         """Gather the evidence of one more look, and compute the probabilities from all of it."""
-        belief, look = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
-        columns = look.columns
-        all_looks, inputs = self.gather(belief, look)
+        target_look = own(look, TargetLook, "look")
+        columns = target_look.columns
+        all_looks, inputs = self.gather(own(belief, TargetBelief, "belief"), target_look)
 
-        def probabilities(*gathered: Tensor) -> Tensor:
-            what = Gathered(*gathered)
-            cells = self.model.log_odds(what, columns)
-            image = self.model.presence(cells, what)[:, None]
-            return torch.cat([cells, self.model.chance(what, columns), image], -1).sigmoid()
+        def probabilities(*rows: Tensor) -> Tensor:
+            """Compute the fields of the belief from the gathered evidence, side by side, `(B, 2 X·Y + 1)`."""
+            gathered = Gathered(*rows)
+            cells = self.model.log_odds(gathered, columns)
+            image = self.model.presence(cells, gathered)[:, None]
+            return torch.cat([cells, self.model.chance(gathered, columns), image], -1).sigmoid()
 
-        values = self.each(probabilities, *inputs, look.target)
-        number = all_looks["closest"].shape[-1]
-        present, following, anywhere = values[:, :number], values[:, number:-1], values[:, -1]
+        values = self.each(probabilities, *inputs, target_look.target)
+        cells = all_looks["closest"].shape[-1]
+        present, following = values[:, :-1].split(cells, -1)
+        anywhere = values[:, -1]
         return TargetBelief(
             **all_looks,
             present=self.prior.place(present, anywhere[:, None]),

@@ -45,7 +45,8 @@ class ExpectedAccuracy(AcquisitionFunction):
     tensor(1)
     """
 
-    name, tasks = "expected-accuracy", ("exploration",)
+    name = "expected-accuracy"
+    tasks = ("exploration",)
     levels: Tensor
     miss: Tensor
     named: Tensor
@@ -60,10 +61,10 @@ class ExpectedAccuracy(AcquisitionFunction):
         self.register_buffer("named", (1 - model.miss_rate[1:]) * right[1:])
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(..., X·Y)`, in cells, for a belief `(..., X·Y, K+1)`."""
-        belief = dirichlet_belief(belief)
-        check_shape(belief.beta, "beta", self.levels.shape[-1], None)
-        objects = belief.probabilities[..., 1:]
+        """Compute values `(..., X·Y)`, in cells, for a belief `(..., X·Y, K+1)`."""
+        dirichlet = dirichlet_belief(belief)
+        check_shape(dirichlet.beta, "beta", self.levels.shape[-1], None)
+        objects = dirichlet.probabilities[..., 1:]
         detected = objects @ self.named.to(objects)
         missed = (objects[..., None] * self.miss.to(objects)).amax(-2)
         gain = (detected + missed - objects.amax(-1, keepdim=True)).clamp(min=0)
@@ -91,7 +92,9 @@ class ExpectedGain(AcquisitionFunction):
     torch.Size([1, 3])
     """
 
-    name, tasks, needs_map = "expected-gain", ("exploration",), True
+    name = "expected-gain"
+    tasks = ("exploration",)
+    needs_map = True
     distance: Tensor
 
     def __init__(self, model: MapEvidence, grid: Grid) -> None:
@@ -100,12 +103,11 @@ class ExpectedGain(AcquisitionFunction):
         self.register_buffer("distance", grid.cell_distance)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)`, in cells, for a belief of `semfov.observers.LearnedMap`."""
-        belief = own(belief, MapBelief, "belief")
-        distance = self.distance.to(belief.closest)
-        return one_by_one(
-            lambda probabilities, closest, looks: self.model.gain(probabilities, closest, looks, distance).sum(-1),
-            belief.probabilities,
-            belief.closest,
-            belief.looks,
-        )
+        """Compute values `(B, X·Y)`, in cells, for a belief of `semfov.observers.LearnedMap`."""
+        learned = own(belief, MapBelief, "belief")
+        distance = self.distance.to(learned.closest)
+
+        def gain(probabilities: Tensor, closest: Tensor, looks: Tensor) -> Tensor:
+            return self.model.gain(probabilities, closest, looks, distance).sum(-1)
+
+        return one_by_one(gain, learned.probabilities, learned.closest, learned.looks)

@@ -39,7 +39,8 @@ class AcquisitionFunction(nn.Module, ABC):
     >>> import torch
     >>> from semfov import DirichletBelief, Grid, acquisition, policies
     >>> class Background(acquisition.AcquisitionFunction):
-    ...     name, tasks = "background", ("search", "exploration")
+    ...     name = "background"
+    ...     tasks = ("search", "exploration")
     ...     def forward(self, belief, visited):
     ...         return belief.class_probabilities()[..., 0]
     >>> look = policies.Policy("background")(None, Grid(2, 1, (20, 10)))
@@ -59,25 +60,31 @@ class AcquisitionFunction(nn.Module, ABC):
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         parameters = signature(cls).parameters
-        kinds = {each.kind for each in parameters.values()}
-        named = {n: each for n, each in parameters.items() if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+        kinds = {parameter.kind for parameter in parameters.values()}
+        stars = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+        named = {name: parameter for name, parameter in parameters.items() if parameter.kind not in stars}
         # What it passes on by `**` are arguments of its base.
         cls.takes = {**getattr(cls, "takes", {}), **named} if Parameter.VAR_KEYWORD in kinds else named
         cls.needs_model = "model" in cls.takes and not cls.needs_map
         if cls.__dict__.get("name"):
-            taken = FUNCTIONS.get(cls.name, cls)
-            # A cell of a notebook that is run again defines its class again.
-            again = taken.__qualname__ == cls.__qualname__
-            check(again, "name", f"one not taken by {taken.__qualname__}", repr(cls.name))
             by_name = Parameter.VAR_POSITIONAL not in kinds or Parameter.VAR_KEYWORD in kinds
-            check(by_name, "__init__", "arguments that can be given by name", f"{cls.__qualname__}{signature(cls)}")
-            known = isinstance(cls.tasks, tuple) and set(cls.tasks) <= set(get_args(Task))
-            check(known, "tasks", f"a tuple of {' and '.join(get_args(Task))}", repr(cls.tasks))
-            FUNCTIONS[cls.name] = cls
+            cls._register(by_name)
+
+    @classmethod
+    def _register(cls, by_name: bool) -> None:
+        """Check the name, the arguments and the tasks of a subclass, and register it."""
+        owner = FUNCTIONS.get(cls.name, cls)
+        # A cell of a notebook that is run again defines its class again.
+        same = owner.__qualname__ == cls.__qualname__
+        check(same, "name", f"one not taken by {owner.__qualname__}", repr(cls.name))
+        check(by_name, "__init__", "arguments that can be given by name", f"{cls.__qualname__}{signature(cls)}")
+        listed = isinstance(cls.tasks, tuple) and set(cls.tasks) <= set(get_args(Task))
+        check(listed, "tasks", f"a tuple of {' and '.join(get_args(Task))}", repr(cls.tasks))
+        FUNCTIONS[cls.name] = cls
 
     @abstractmethod
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Value of fixating each cell next.
+        """Compute the value of fixating each cell next.
 
         Args:
             belief: belief of B episodes after their last look.

@@ -36,7 +36,8 @@ class CloserLook(AcquisitionFunction):
     1
     """
 
-    name, tasks = "closer-look", ("exploration",)
+    name = "closer-look"
+    tasks = ("exploration",)
     seen: Tensor
 
     def __init__(self, grid: Grid, fovea: float = 100 / 640) -> None:
@@ -46,10 +47,11 @@ class CloserLook(AcquisitionFunction):
         self.register_buffer("seen", acuity(grid.cell_distance, fovea))
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)` for a belief about all classes, which knows each cell's closest look."""
+        """Compute values `(B, X·Y)` for a belief about all classes, which knows each cell's closest look."""
         return one_by_one(self._values, belief.class_probabilities(), belief.closest)
 
     def _values(self, probabilities: Tensor, closest: Tensor) -> Tensor:
+        """Compute the values from class probabilities `(B, X·Y, K+1)` and distances of the closest looks `(B, X·Y)`."""
         objects = probabilities[..., 1:]
         unknown = 1 - objects.amax(-1) / objects.sum(-1)
         gain = (self.seen.to(objects) - acuity(closest, self.fovea)[..., None]).clamp(min=0)
@@ -57,5 +59,5 @@ class CloserLook(AcquisitionFunction):
 
 
 def acuity(distance: Tensor, fovea: float) -> Tensor:
-    """Relative acuity `exp(-max(d / r - 1, 0))` at distances d for a fovea of width r, in one unit."""
+    """Compute the relative acuity `exp(-max(d / r - 1, 0))` at distances d for a fovea of width r, in one unit."""
     return (1 - distance / fovea).clamp(max=0).exp()

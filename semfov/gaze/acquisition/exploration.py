@@ -50,7 +50,8 @@ class KLDivergence(Lookahead):
     tensor(1)
     """
 
-    name, tasks = "kl", ("exploration",)
+    name = "kl"
+    tasks = ("exploration",)
 
     def __init__(
         self, model: FovealObservationModel, grid: Grid, *, prior: float = 0.5, likelihoods: Tensor | None = None
@@ -60,11 +61,11 @@ class KLDivergence(Lookahead):
         self.prior = prior
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Divergence from the prior after the look."""
+        """Compute the divergence from the prior after the look."""
         return divergence_from_symmetric(outlook.next_beta, self.prior)
 
     def present(self, beta: Tensor) -> Tensor:
-        """Divergence from the prior."""
+        """Compute the divergence from the prior."""
         return divergence_from_symmetric(beta, self.prior)
 
 
@@ -89,10 +90,11 @@ class BayesianSurprise(Lookahead):
     tensor(1)
     """
 
-    name, tasks = "surprise", ("exploration",)
+    name = "surprise"
+    tasks = ("exploration",)
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Divergence of the predicted posterior from the present one."""
+        """Compute the divergence of the predicted posterior from the present one."""
         return _divergence(outlook)
 
 
@@ -118,7 +120,8 @@ class NegativeEntropy(Lookahead):
     tensor(1)
     """
 
-    name, tasks = "negative-entropy", ("exploration",)
+    name = "negative-entropy"
+    tasks = ("exploration",)
 
     def cell_values(self, outlook: Outlook) -> Tensor:
         """Decrease of the entropy."""
@@ -147,14 +150,15 @@ class TwoPeaks(Lookahead):
     tensor(1)
     """
 
-    name, tasks = "two-peaks", ("exploration",)
+    name = "two-peaks"
+    tasks = ("exploration",)
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Absolute change of the margin."""
+        """Compute the absolute change of the margin."""
         return (_lead(outlook.next_mean) - _lead(outlook.mean)[..., None]).abs()
 
     def pool(self, values: Tensor) -> Tensor:
-        """The largest change over the map."""
+        """Take the largest change over the map."""
         return values.amax(-2)
 
 
@@ -182,7 +186,8 @@ class UpperConfidenceBound(Lookahead):
     torch.Size([3])
     """
 
-    name, tasks = "upper-confidence-bound", ("exploration",)
+    name = "upper-confidence-bound"
+    tasks = ("exploration",)
 
     def __init__(self, model: FovealObservationModel, grid: Grid, *, kappa: float = 2.0) -> None:
         super().__init__(model, grid)
@@ -190,16 +195,16 @@ class UpperConfidenceBound(Lookahead):
         self.kappa = kappa
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """The bound after the look."""
+        """Compute the bound after the look."""
         return self._bound(outlook.next_mean, outlook.next_total)
 
     def present(self, beta: Tensor) -> Tensor:
-        """The bound."""
+        """Compute the bound."""
         total = beta.sum(-1)
         return self._bound(beta / total[..., None], total)
 
     def _bound(self, mean: Tensor, total: Tensor) -> Tensor:
-        """U of beliefs with means `(..., K+1)`."""
+        """Compute U of beliefs with means `(..., K+1)` and sums of the parameters `(...)`."""
         peak = mean.amax(-1)
         return peak + self.kappa * _deviation(peak, total)
 
@@ -230,7 +235,8 @@ class ProbabilityOfImprovement(Lookahead):
     tensor(1)
     """
 
-    name, tasks = "probability-of-improvement", ("exploration",)
+    name = "probability-of-improvement"
+    tasks = ("exploration",)
 
     def __init__(self, model: FovealObservationModel, grid: Grid, *, margin: float = 0.0) -> None:
         super().__init__(model, grid)
@@ -238,14 +244,14 @@ class ProbabilityOfImprovement(Lookahead):
         self.margin = margin
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Probability of improvement."""
+        """Compute the probability of improvement."""
         peak = outlook.next_mean.amax(-1)
         gain = peak - outlook.mean.amax(-1)[..., None] - self.margin
         return torch.special.ndtr(gain / _deviation(peak, outlook.next_total))
 
 
 def _divergence(outlook: Outlook) -> Tensor:
-    r"""Divergence of the predicted means from the present ones, in nats, `(..., X·Y, N)`.
+    r"""Compute the divergence of the predicted means from the present ones, in nats, `(..., X·Y, N)`.
 
     It is computed as :math:`\sum_k p_k ((1 + e_k) \ln(1 + e_k) - e_k)` with :math:`e_k = p'_k / p_k - 1`. No term of
     this sum is negative, so small divergences are not differences of large numbers.
@@ -257,12 +263,12 @@ def _divergence(outlook: Outlook) -> Tensor:
 
 
 def _lead(mean: Tensor) -> Tensor:
-    """Margin of the most probable class of means `(..., K+1)`: its probability minus the second largest one."""
+    """Compute the margin of the most probable class of means `(..., K+1)`: its probability minus the second largest."""
     first, place = mean.max(-1, keepdim=True)
     return first[..., 0] - mean.scatter(-1, place, -torch.inf).amax(-1)
 
 
 def _deviation(peak: Tensor, total: Tensor) -> Tensor:
-    """Standard deviation of a class probability under a Dirichlet, from its mean and the sum of the parameters."""
+    """Compute the standard deviation of a class probability under a Dirichlet, from its mean and the sum of β."""
     variance = peak * (1 - peak) / (total + 1)
     return variance.clamp(min=torch.finfo(variance.dtype).tiny).sqrt()

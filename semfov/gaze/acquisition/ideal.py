@@ -28,14 +28,15 @@ class _SignalSearch(AcquisitionFunction):
         self.register_buffer("signal", visibility(model).detach()[self.target][..., level])
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)`."""
-        place = belief.chance(self.target).masked_fill(visited, 0)  # as the search went on, the target was not there
+        """Compute values `(B, X·Y)`."""
+        # As the search went on, the target was not in a fixated cell.
+        place = belief.chance(self.target).masked_fill(visited, 0)
         place = place / place.sum(-1, keepdim=True).clamp(min=torch.finfo(place.dtype).tiny)
         return one_by_one(self.values, place, self.signal.to(place).expand(len(place), -1, -1))
 
     @abstractmethod
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
-        """Values `(B, X·Y)` for the prior of the place `(B, X·Y)` and d' `(B, f, x)`."""
+        """Compute values `(B, X·Y)` from the prior of the place `(B, X·Y)` and d' `(B, f, x)`."""
 
 
 class EntropyLimit(_SignalSearch):
@@ -61,10 +62,12 @@ class EntropyLimit(_SignalSearch):
     tensor(1)
     """
 
-    name, tasks, by_place = "entropy-limit", ("search",), True
+    name = "entropy-limit"
+    tasks = ("search",)
+    by_place = True
 
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
-        """The sum, in nats."""
+        """Compute the sum, in nats."""
         return (signal.square() @ place[..., None])[..., 0] / 2
 
 
@@ -100,7 +103,9 @@ class CorrectLocalisation(_SignalSearch):
     tensor(1)
     """
 
-    name, tasks, by_place = "ideal-observer", ("search",), True
+    name = "ideal-observer"
+    tasks = ("search",)
+    by_place = True
 
     def __init__(self, target: int | Tensor, model: FovealObservationModel, grid: Grid, *, nodes: int = 64) -> None:
         super().__init__(target, model, grid)
@@ -108,20 +113,30 @@ class CorrectLocalisation(_SignalSearch):
         self.nodes = nodes
 
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
-        """The integral, computed for one fixation at a time."""
+        """Compute the integral, for one fixation at a time."""
         return torch.stack([_correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)], -1)
 
 
 def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> Tensor:
-    """`CorrectLocalisation` for one fixation, from the prior of the place and d' `(..., X·Y)` → `(...)`."""
+    """Compute `CorrectLocalisation` for one fixation.
+
+    Args:
+        place: q, the prior of the place, `(..., X·Y)`.
+        signal: d' in each cell, `(..., X·Y)`.
+        nodes: number of values of the noise w.
+
+    Returns:
+        `(...)`.
+    """
     noise = torch.linspace(-5, 5, nodes, dtype=place.dtype, device=place.device)
     weight = (-noise.square() / 2).softmax(0)
     d = signal.clamp(min=_LEAST_SIGNAL)
     # Dimensions: the cell x of the target, every other cell y, and the noise w in x.
-    log, half = place.clamp(min=torch.finfo(place.dtype).tiny).log(), d.square() / 2
-    ahead = log[..., :, None] - log[..., None, :] + half[..., :, None] + half[..., None, :]
-    heard = (d[..., None] * noise)[..., None, :]
-    beaten = torch.special.ndtr((ahead[..., None] + heard) / d[..., None, :, None])
+    log = place.clamp(min=torch.finfo(place.dtype).tiny).log()
+    half = d.square() / 2
+    lead = log[..., :, None] - log[..., None, :] + half[..., :, None] + half[..., None, :]
+    response = (d[..., None] * noise)[..., None, :]
+    beaten = torch.special.ndtr((lead[..., None] + response) / d[..., None, :, None])
     itself = torch.eye(place.shape[-1], dtype=torch.bool, device=place.device)[..., None]
     right = torch.where(itself, 1.0, beaten).prod(-2) @ weight
     return (place * right).sum(-1)

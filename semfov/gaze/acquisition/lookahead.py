@@ -21,13 +21,21 @@ _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, ho
 
 
 class Outlook(NamedTuple):
-    """The present belief, and that after a look from each of N levels of distance; by M samples N M in place of N."""
+    """The present belief about cells, and that after a look from each of N levels; by M samples N M in place of N.
+
+    Attributes:
+        beta: Dirichlet parameters of the present belief, `(..., X·Y, K+1)`.
+        total: their sums T, `(..., X·Y)`.
+        mean: their mean p, `(..., X·Y, K+1)`.
+        likelihood: likelihoods of the looks, `(..., X·Y, N, K+1)`.
+        scale: means of the likelihoods under the present belief, `(..., X·Y, N, 1)`; r is likelihood over scale.
+    """
 
     beta: Tensor
     total: Tensor
     mean: Tensor
-    likelihood: Tensor  # (..., X·Y, N, K+1)
-    scale: Tensor  # their means under the present belief, (..., X·Y, N, 1)
+    likelihood: Tensor
+    scale: Tensor
 
     @property
     def growth(self) -> Tensor:
@@ -42,38 +50,56 @@ class Outlook(NamedTuple):
     @property
     def next_total(self) -> Tensor:
         """Sum of the parameters after Kaplan's update, `T' = (T + 1) / (1 + min r / T)`, `(..., X·Y, N)`."""
-        total, least = self.total[..., None], self.likelihood.amin(-1) / self.scale[..., 0]
+        total = self.total[..., None]
+        least = self.likelihood.amin(-1) / self.scale[..., 0]
         return (total + 1) / (1 + least / total)
 
     @property
     def next_beta(self) -> Tensor:
         """Parameters after Kaplan's update, `β' = β + β (r - min r) / (T + min r)`, `(..., X·Y, N, K+1)`."""
-        beta, least = self.beta[..., None, :], self.likelihood.amin(-1, keepdim=True)
+        beta = self.beta[..., None, :]
+        least = self.likelihood.amin(-1, keepdim=True)
+        # Likelihoods are not divided by their scale: that would be one more pass over the largest tensor.
         share = (self.likelihood - least).mul_(1 / (self.total[..., None, None] * self.scale + least))
         return torch.addcmul(beta, beta, share)
 
 
 def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
-    r"""Simulate Kaplan's update of every cell `(..., X·Y, K+1)` with the expected scores `(K+1, N, K+1)`.
+    r"""Simulate Kaplan's update of every cell with the expected scores.
 
     .. math:: \bar S_n = \sum_k p_k \, E[S \mid k, n], \qquad p'_k = \frac{T p_k + p_k r_k}{T + 1}, \quad
               r_k = \frac{\bar S_{n,k}}{\sum_j p_j \bar S_{n,j}}
 
     The expected scores enter Kaplan's rule without calibration (Luzio, Bernardino and Moreno, 2024, the equation of
     :math:`\bar S^x`, "which can then be applied with Kaplan's rule").
+
+    Args:
+        beta: the present belief, `(..., X·Y, K+1)`.
+        expected: E[S | k, n], `(K+1, N, K+1)`.
+
+    Returns:
+        The belief after a look from each level.
     """
     total, mean = _total_and_mean(beta)
     return _outlook(beta, total, mean, _expected_looks(mean, expected))
 
 
 def _total_and_mean(beta: Tensor) -> tuple[Tensor, Tensor]:
-    """Sums `(..., X·Y)` of the parameters of a belief, and its means."""
+    """Compute the sums `(..., X·Y)` of the parameters of a belief, and its means."""
     total = beta.sum(-1)
     return total, beta / total[..., None]
 
 
 def _expected_looks(mean: Tensor, expected: Tensor) -> Tensor:
-    """The expected scores of a look at every cell from every level, `(..., X·Y, N, K+1)`."""
+    """Compute the expected scores of a look at every cell from every level.
+
+    Args:
+        mean: class probabilities of the cells, `(..., X·Y, K+1)`.
+        expected: E[S | k, n], `(K+1, N, K+1)`.
+
+    Returns:
+        `(..., X·Y, N, K+1)`.
+    """
     components = mean.shape[-1]
     check(expected.shape[0] == components, "model", f"{components} classes, as the belief has", expected.shape[0])
     table = expected.to(mean).flatten(1)
@@ -82,7 +108,7 @@ def _expected_looks(mean: Tensor, expected: Tensor) -> Tensor:
 
 
 def _outlook(beta: Tensor, total: Tensor, mean: Tensor, likelihood: Tensor) -> Outlook:
-    """The belief after looks with these likelihoods, `(..., X·Y, N, K+1)`."""
+    """Make the belief after looks with these likelihoods, `(..., X·Y, N, K+1)`."""
     return Outlook(beta, total, mean, likelihood, (mean[..., None, :] @ likelihood.mT).mT)
 
 
@@ -93,7 +119,15 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
 
     The classes are drawn at M equally spaced points of their cumulative distribution. These points move with the number
     of visited cells `(..., X·Y)`, and are the same in all cells, so that cells with the same belief have the same
-    value. The likelihoods `(K+1, N, M, K+1)` are those of `sampled_likelihoods`.
+    value.
+
+    Args:
+        beta: the present belief, `(..., X·Y, K+1)`.
+        likelihoods: of M looks at each class from each level, `(K+1, N, M, K+1)` (`sampled_likelihoods`).
+        visited: cells that were fixated, `(..., X·Y)` boolean.
+
+    Returns:
+        The belief after each of the M looks from each level, `(..., X·Y, N M, K+1)`.
     """
     components = beta.shape[-1]
     check_shape(likelihoods, "likelihoods", components, None, None, components)
@@ -110,12 +144,23 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
 def sampled_likelihoods(
     model: FovealObservationModel, samples: int, *, calibrated: bool = True, seed: int = 0
 ) -> Tensor:
-    r"""Likelihoods `(K+1, N, M, K+1)` of M looks at an object of each class from each level of distance.
+    r"""Draw looks at an object of each class from each level of distance, and compute their likelihoods.
 
     .. math:: S_{knm} \sim \mathrm{Dir}(\alpha_{kn}), \qquad \lambda_{knm} = P(C = \cdot \mid S_{knm}, n)
 
-    The model's Dirichlets must be densities of the scores, as after a fit by maximum likelihood. Likelihoods that are
-    not calibrated are the scores S themselves.
+    The model's Dirichlets must be densities of the scores, as after a fit by maximum likelihood.
+
+    Args:
+        model: the observation model.
+        samples: M, number of looks for each class and level.
+        calibrated: calibrate the scores; otherwise the likelihoods are the scores S themselves.
+        seed: seed of the random generator.
+
+    Returns:
+        `(K+1, N, M, K+1)`.
+
+    Raises:
+        InputError: the number is out of range, or the model's Dirichlets are no densities of the scores.
     """
     check_whole(samples, "samples", 1, 1 << 16)
     if model.expected is not None:
@@ -148,70 +193,100 @@ class Lookahead(AcquisitionFunction):
 
     @one_thread_if_small
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
+        """Compute the value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
         expected = self.model.expected_scores() if self.likelihoods is None else None
 
-        def values(maps: Tensor, visited: Tensor) -> Tensor:
-            after = self._after_drawn(maps, visited) if expected is None else self._after_expected(maps, expected)
-            cells = maps.split(_fitting(_BLOCK, maps, maps.shape[-1]), -2)
-            change = after - torch.cat([self.present(each) for each in cells], -1)[..., None]
-            fixations = self.levels.split(_fitting(_PAIRS, maps, maps.shape[-2]), -1)
+        def values(maps: Tensor, fixated: Tensor) -> Tensor:
+            after = self._after_drawn(maps, fixated) if expected is None else self._after_expected(maps, expected)
+            change = after - self._at_present(maps)[..., None]
+            fixations = self.levels.split(_block(_PAIRS, maps, maps.shape[-2]), -1)
             return torch.cat([self.pool(at_levels(change, levels)) for levels in fixations], -1)
 
         if beta.ndim == 2 or self.levels.ndim > 2:
             return values(beta, visited)
         # One map at a time stays in the processor's cache; a batch at once takes four times as long.
-        turns = visited.expand(beta.shape[:-1]).flatten(0, -2)
-        return one_by_one(values, beta.flatten(0, -3), turns).view(beta.shape[:-1])
+        by_map = visited.expand(beta.shape[:-1]).flatten(0, -2)
+        return one_by_one(values, beta.flatten(0, -3), by_map).view(beta.shape[:-1])
+
+    def _at_present(self, beta: Tensor) -> Tensor:
+        """Compute `present`, a block of cells at a time."""
+        blocks = beta.split(_block(_BLOCK, beta, beta.shape[-1]), -2)
+        return torch.cat([self.present(cells) for cells in blocks], -1)
 
     def _after_expected(self, beta: Tensor, expected: Tensor) -> Tensor:
-        """`cell_values` of the looks with the expected scores `(K+1, N, K+1)`."""
+        """Compute `cell_values` of the looks with the expected scores, a block of cells and of levels at a time.
+
+        Args:
+            beta: the present belief, `(..., X·Y, K+1)`.
+            expected: E[S | k, n], `(K+1, N, K+1)`.
+
+        Returns:
+            `(..., X·Y, N)`.
+        """
         total, mean = _total_and_mean(beta)
-        some, rows = _fitting(_PRODUCT, beta, beta.shape[-1]), []
-        for part in zip(beta.split(some, -2), total.split(some, -1), mean.split(some, -2), strict=True):
-            tables = expected.split(_fitting(_PRODUCT, beta, part[0].numel()), 1)
-            rows.append(torch.cat([self._by_cells(*part, _expected_looks(part[2], table)) for table in tables], -1))
+        cells = _block(_PRODUCT, beta, beta.shape[-1])
+        rows = []
+        for part, part_total, part_mean in zip(
+            beta.split(cells, -2), total.split(cells, -1), mean.split(cells, -2), strict=True
+        ):
+            columns = []
+            for levels in expected.split(_block(_PRODUCT, beta, part.numel()), 1):
+                likelihood = _expected_looks(part_mean, levels)
+                columns.append(self._by_cells(part, part_total, part_mean, likelihood))
+            rows.append(torch.cat(columns, -1))
         return torch.cat(rows, -2)
 
     def _by_cells(self, beta: Tensor, total: Tensor, mean: Tensor, likelihood: Tensor) -> Tensor:
-        """`cell_values` of looks with these likelihoods `(..., X·Y, N, K+1)`, some cells at a time."""
-        some = _fitting(_BLOCK, beta, likelihood.shape[-2:].numel())
+        """Compute `cell_values` of looks with likelihoods `(..., X·Y, N, K+1)`, a block of cells at a time."""
+        cells = _block(_BLOCK, beta, likelihood.shape[-2:].numel())
         blocks = zip(
-            beta.split(some, -2), total.split(some, -1), mean.split(some, -2), likelihood.split(some, -3), strict=True
+            beta.split(cells, -2),
+            total.split(cells, -1),
+            mean.split(cells, -2),
+            likelihood.split(cells, -3),
+            strict=True,
         )
         return torch.cat([self.cell_values(_outlook(*block)) for block in blocks], -2)
 
     def _after_drawn(self, beta: Tensor, visited: Tensor) -> Tensor:
-        """Mean of `cell_values` over the drawn looks of each level."""
+        """Compute the mean of `cell_values` over the drawn looks of each level, a block of cells at a time."""
         drawn = self.likelihoods
         assert drawn is not None
-        pieces = [
-            self.cell_values(look_ahead_by_samples(cells, drawn, visited))
-            for cells in beta.split(_fitting(_BLOCK, beta, drawn.shape[1:].numel()), -2)
-        ]
+        blocks = beta.split(_block(_BLOCK, beta, drawn.shape[1:].numel()), -2)
+        values = [self.cell_values(look_ahead_by_samples(cells, drawn, visited)) for cells in blocks]
         # The values of the M looks of a level stand side by side.
-        return torch.cat(pieces, -2).unflatten(-1, drawn.shape[1:3]).mean(-1)
+        return torch.cat(values, -2).unflatten(-1, drawn.shape[1:3]).mean(-1)
 
     @abstractmethod
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Value of each cell after a look from each level, `(..., X·Y, N)`, `present` not subtracted."""
+        """Compute the value of each cell after a look from each level, `(..., X·Y, N)`, `present` not subtracted."""
 
     def present(self, beta: Tensor) -> Tensor:
-        """Value of the present belief about each cell, `(..., X·Y)`, which is subtracted from those of looks."""
+        """Compute the value of the present belief about each cell, `(..., X·Y)`, to subtract from those of looks."""
         return beta.new_zeros(beta.shape[:-1])
 
     def pool(self, values: Tensor) -> Tensor:
-        """Value of each fixation `(..., X·Y)`: the sum over the map of the values `(..., seen cell, fixation)`."""
+        """Sum the values `(..., seen cell, fixation)` over the map: the value of each fixation, `(..., X·Y)`."""
         return values.sum(-2)
 
 
-def _fitting(limit: int, maps: Tensor, elements: int) -> int:
-    """How many things of so many elements are worked on at once: up to the limit on a CPU, else all."""
-    return max(1, limit // max(1, elements)) if values_known(maps) and maps.device.type == "cpu" else 1 << 40
+def _block(limit: int, maps: Tensor, elements: int) -> int:
+    """Count how many things of so many elements are worked on at once: up to the limit on a CPU, else all."""
+    if values_known(maps) and maps.device.type == "cpu":
+        return max(1, limit // max(1, elements))
+    return 1 << 40
 
 
 def at_levels(values: Tensor, levels: Tensor) -> Tensor:
-    """Value `(..., seen cell, fixation)` of every cell `(..., X·Y, N)` at its level of distance from each fixation."""
+    """Look up the value of every cell at its level of distance from each fixation.
+
+    Args:
+        values: `(..., X·Y, N)`, of each cell from each level.
+        levels: `(..., X·Y, X·Y)`, level of each cell from each fixation.
+
+    Returns:
+        `(..., X·Y, X·Y)`, by seen cell and fixation.
+    """
     return values.gather(-1, levels.expand(*values.shape[:-1], levels.shape[-1]))

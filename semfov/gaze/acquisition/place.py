@@ -27,14 +27,14 @@ class _TargetVisibility(AcquisitionFunction):
         self.register_buffer("visibility", 1 - model.miss_rate[self.target][..., level])
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)`."""
+        """Compute values `(B, X·Y)`."""
         present = belief.probability(self.target)
         visibility = self.visibility.to(present).expand(len(present), -1, -1)
         return one_by_one(self.values, present, visibility)
 
     @abstractmethod
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
-        """Values `(B, X·Y)` for the target's probability `(B, X·Y)` and its visibility `(B, f, x)`."""
+        """Compute values `(B, X·Y)` from the target's probability `(B, X·Y)` and its visibility `(B, f, x)`."""
 
 
 class FovealHit(_TargetVisibility):
@@ -57,10 +57,12 @@ class FovealHit(_TargetVisibility):
     tensor(1)
     """
 
-    name, tasks, by_place = "foveal-hit", ("search",), True
+    name = "foveal-hit"
+    tasks = ("search",)
+    by_place = True
 
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
-        """Probability of a detection."""
+        """Compute the probability of a detection."""
         return -torch.expm1(torch.log1p(-present[..., None, :] * visibility).sum(-1))
 
 
@@ -89,13 +91,15 @@ class PlaceInformation(_TargetVisibility):
     tensor(1)
     """
 
-    name, tasks, by_place = "place-information", ("search",), True
+    name = "place-information"
+    tasks = ("search",)
+    by_place = True
 
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
-        """Expected decrease of the entropy of the place, in nats."""
+        """Compute the expected decrease of the entropy of the place, in nats."""
         place = present / present.sum(-1, keepdim=True)
         missed = place[..., None, :] * (1 - visibility)
         nothing = missed.sum(-1)
         # P(no detection) H(q') = -Σ m ln m + P ln P with m = q (1 - v)
-        left = torch.xlogy(nothing, nothing) - torch.xlogy(missed, missed).sum(-1)
-        return -torch.xlogy(place, place).sum(-1, keepdim=True) - left
+        remaining = torch.xlogy(nothing, nothing) - torch.xlogy(missed, missed).sum(-1)
+        return -torch.xlogy(place, place).sum(-1, keepdim=True) - remaining

@@ -49,8 +49,9 @@ class SaliencyPrior(AcquisitionFunction):
         self.register_buffer("log_prior", (raised / raised.sum(-1, keepdim=True)).log())
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)`."""
+        """Compute values `(B, X·Y)`."""
         value: Tensor = self.acquisition(belief, visited)
         check_shape(self.log_prior, "saliency", value.shape[-1])
         least = torch.finfo(value.dtype).tiny
-        return one_by_one(lambda row: row.clamp(min=least).log(), value) + self.weight * self.log_prior.to(value)
+        log_value = one_by_one(lambda row: row.clamp(min=least).log(), value)
+        return log_value + self.weight * self.log_prior.to(value)

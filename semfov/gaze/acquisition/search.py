@@ -28,7 +28,8 @@ class TargetPosterior(AcquisitionFunction):
     tensor([[0.7500, 0.5000]])
     """
 
-    name, tasks = "non-predictive", ("search",)
+    name = "non-predictive"
+    tasks = ("search",)
     target: Tensor
 
     def __init__(self, target: int | Tensor) -> None:
@@ -36,7 +37,7 @@ class TargetPosterior(AcquisitionFunction):
         self.register_buffer("target", torch.as_tensor(target))
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)`."""
+        """Compute values `(B, X·Y)`."""
         return belief.chance(self.target)
 
 
@@ -71,7 +72,8 @@ class PredictedTargetPosterior(AcquisitionFunction):
     tensor(0)
     """
 
-    name, tasks = "predictive", ("search",)
+    name = "predictive"
+    tasks = ("search",)
     target: Tensor
     likelihoods: Tensor | None
 
@@ -84,7 +86,7 @@ class PredictedTargetPosterior(AcquisitionFunction):
         self.register_buffer("likelihoods", likelihoods, persistent=False)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
+        """Compute values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         if self.likelihoods is None:
             outlook = look_ahead(beta, self.model.expected_scores()[:, :1])
@@ -120,7 +122,8 @@ class NeighbourhoodPosterior(AcquisitionFunction):
     tensor(1)
     """
 
-    name, tasks = "neighbourhood", ("search",)
+    name = "neighbourhood"
+    tasks = ("search",)
     target: Tensor
     levels: Tensor
     kernel: Tensor
@@ -136,7 +139,7 @@ class NeighbourhoodPosterior(AcquisitionFunction):
         self.register_buffer("kernel", (-torch.cdist(place, place).square() / (2 * sigma**2)).exp())
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
+        """Compute values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
         outlook = look_ahead(beta, self.model.expected_scores())

@@ -16,10 +16,12 @@ class Uniform(AcquisitionFunction):
     tensor([[0., 0., 0.]])
     """
 
-    name, tasks, by_belief = "random", ("search", "exploration"), False
+    name = "random"
+    tasks = ("search", "exploration")
+    by_belief = False
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Zeros `(..., X·Y)`."""
+        """Give zeros `(..., X·Y)`."""
         return belief.closest.new_zeros(belief.closest.shape)
 
 
@@ -36,7 +38,9 @@ class Static(AcquisitionFunction):
     tensor([[0.1000, 0.7000, 0.2000]])
     """
 
-    name, tasks, by_belief = "saliency", ("search", "exploration"), False
+    name = "saliency"
+    tasks = ("search", "exploration")
+    by_belief = False
     values: Tensor
 
     def __init__(self, values: Tensor) -> None:
@@ -44,6 +48,6 @@ class Static(AcquisitionFunction):
         self.register_buffer("values", values)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """The values `(..., X·Y)`, for a belief about the same number of cells."""
+        """Give the values `(..., X·Y)`, for a belief about the same number of cells."""
         check_shape(self.values, "values", belief.closest.shape[-1])
         return self.values.expand(belief.closest.shape)

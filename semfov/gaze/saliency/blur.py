@@ -12,7 +12,10 @@ _TILE = 24
 
 
 def _gaussian_kernel(sigma: float) -> Tensor:
-    """Weights of a Gaussian, as many as OpenCV takes for floats; Kornia's blur would take twice as long on a CPU."""
+    """Compute the weights of a Gaussian, as many as OpenCV takes for floats.
+
+    They are products with lines (`semfov.sensor.lines`); Kornia's blur would take twice as long on a CPU.
+    """
     # Imported when first needed: Kornia takes a quarter of a second.
     from kornia.filters import get_gaussian_kernel1d
 
@@ -20,12 +23,22 @@ def _gaussian_kernel(sigma: float) -> Tensor:
 
 
 def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
-    """Blur an image `(B, C, H, W)` with a Gaussian: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`."""
+    """Blur an image with a Gaussian: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
+
+    Args:
+        image: `(B, C, H, W)`.
+        sigma: standard deviation in pixels.
+        halve: keep every second pixel alone.
+
+    Returns:
+        `(B, C, H', W')`.
+    """
     check_shape(image, "image", None, None, None, None)
     check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
     check(sigma > 0, "sigma", "a positive number of pixels", sigma)
-    height, width = (_blurring(n, sigma, 2 if halve else 1, image.dtype, image.device) for n in image.shape[-2:])
-    return separable(image, height, width)
+    step = 2 if halve else 1
+    vertical, horizontal = (_blurring(count, sigma, step, image.dtype, image.device) for count in image.shape[-2:])
+    return separable(image, vertical, horizontal)
 
 
 def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -33,15 +46,17 @@ def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
     check_shape(image, "image", None, None)
     if tuple(image.shape[-2:]) == tuple(size):
         return image
-    lengths = zip(image.shape[-2:], size, strict=True)
-    return separable(image, *(_enlarging(count, length, image.dtype, image.device) for count, length in lengths))
+    vertical = _enlarging(image.shape[-2], size[0], image.dtype, image.device)
+    horizontal = _enlarging(image.shape[-1], size[1], image.dtype, image.device)
+    return separable(image, vertical, horizontal)
 
 
 @constant
 def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: torch.device) -> Lines:
-    """Linear map that blurs lines of `count` pixels and keeps one pixel of every `step`; border pixels are repeated."""
+    """Make the matrix that blurs lines of `count` pixels and keeps one of every `step`; border pixels are repeated."""
     kernel = _gaussian_kernel(sigma)
-    length, reach = max(count // step, 1), len(kernel) // 2
+    length = max(count // step, 1)
+    reach = len(kernel) // 2
     index = torch.arange(length)[:, None] * step + torch.arange(len(kernel)) - reach
     taps = Taps(index.clamp(0, count - 1), kernel.expand(length, -1))
     return banded(taps, count, _TILE, _TILE * step, reach, dtype, device)
@@ -49,14 +64,14 @@ def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: t
 
 @constant
 def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Lines:
-    """Linear map of Keys' cubic interpolation (a = -0.75) of pixels as areas; border pixels are repeated."""
+    """Make the matrix of Keys' cubic interpolation (a = -0.75) of pixels as areas; border pixels are repeated."""
     place = (torch.arange(length).double() + 0.5) * (count / length) - 0.5
     index = place.floor().long()[:, None] + torch.arange(-1, 3)
     distance = (place[:, None] - index).abs()
     a = -0.75
-    near = ((a + 2) * distance - (a + 3)) * distance**2 + 1
-    far = a * (((distance - 5) * distance + 8) * distance - 4)
-    taps = Taps(index.clamp(0, count - 1), torch.where(distance <= 1, near, far))
+    inner = ((a + 2) * distance - (a + 3)) * distance**2 + 1
+    outer = a * (((distance - 5) * distance + 8) * distance - 4)
+    taps = Taps(index.clamp(0, count - 1), torch.where(distance <= 1, inner, outer))
     ratio, rest = divmod(length, count)
     # Tiles are evenly spaced only where the ratio is a whole number.
     shift = count if rest else max(_TILE // ratio, 1)
@@ -64,8 +79,16 @@ def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device
 
 
 def rescale(saliency: Tensor, flat: float = 0.0) -> Tensor:
-    """Shift and scale maps to [0, 1]; saliency `(..., H, W)`."""
-    low, high = saliency.amin((-2, -1), keepdim=True), saliency.amax((-2, -1), keepdim=True)
-    span = high - low
+    """Shift and scale maps to [0, 1].
+
+    Args:
+        saliency: `(..., H, W)`.
+        flat: maps with at most this range become 0.
+
+    Returns:
+        `(..., H, W)`.
+    """
+    least = saliency.amin((-2, -1), keepdim=True)
+    span = saliency.amax((-2, -1), keepdim=True) - least
     # Division by infinity sets a flat map to 0, and its gradient too.
-    return (saliency - low) / torch.where(span > flat, span, torch.inf)
+    return (saliency - least) / torch.where(span > flat, span, torch.inf)

@@ -11,7 +11,7 @@ Reduction = Literal["mean", "max"]
 
 
 def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reduction = "mean") -> Tensor:
-    """Saliency of each of `columns` × `rows` equal cells of the image, numbered row by row.
+    """Compute the saliency of each of `columns` × `rows` equal cells of the image, numbered row by row.
 
     Args:
         saliency: `(B, H, W)`, of any size.
@@ -49,7 +49,7 @@ def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reductio
 
 
 def _shares(pixels: int, cells: int, like: Tensor) -> Tensor:
-    """Fraction of each cell's length that each pixel covers, `(cells, pixels)`; rows sum to 1."""
+    """Compute the fraction of each cell's length that each pixel covers, `(cells, pixels)`; rows sum to 1."""
     # Lengths are scaled so that the borders of both pixels and cells are whole numbers.
     pixel = torch.arange(pixels, device=like.device) * cells
     cell = torch.arange(cells, device=like.device)[:, None] * pixels

@@ -6,7 +6,7 @@ from functools import cache
 from math import ceil, floor
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -141,7 +141,7 @@ class FixationDensity(Pretrained):
 
     @classmethod
     def for_detector(cls, detector: Detector) -> Self:
-        """The model that is shipped for a detector.
+        """Give the model that is shipped for a detector.
 
         Args:
             detector: the detector.
@@ -162,7 +162,8 @@ class FixationDensity(Pretrained):
         Args:
             detector: the detector whose feature maps are read.
         """
-        fitted, settings = self.metadata.get("detector", {}), detector.settings()
+        fitted = self.metadata.get("detector", {})
+        settings = detector.settings()
         check_same_detector(fitted, {name: settings.get(name) for name in fitted}, self.title)
 
     def forward(
@@ -173,7 +174,7 @@ class FixationDensity(Pretrained):
         *,
         without: Sequence[str] = (),
     ) -> Tensor:
-        """Log density of the next fixation over the pixels of the picture.
+        """Compute the log density of the next fixation over the pixels of the picture.
 
         Args:
             features: `Detector.features` of the pictures, or maps by name that cover the whole picture.
@@ -192,12 +193,12 @@ class FixationDensity(Pretrained):
             if isinstance(features, FeatureMaps):
                 size = features.placement.size[1], features.placement.size[0]
             else:
-                size = max((int(each.shape[-2]), int(each.shape[-1])) for each in features.values())
+                size = max((int(maps.shape[-2]), int(maps.shape[-1])) for maps in features.values())
         terms = self.terms(features, size, scanpath)
         for name in without:
             check(name in ("map", "centre bias", "oculomotor biases"), "without", "terms of the model", repr(name))
-        kept = [term for name, term in terms.items() if name not in without]
-        total = torch.stack(kept).sum(0) if kept else torch.zeros_like(terms["map"])
+        summands = [term for name, term in terms.items() if name not in without]
+        total = torch.stack(summands).sum(0) if summands else torch.zeros_like(terms["map"])
         if total.shape[-2:] != size:
             total = F.interpolate(total[:, None], size, mode="bilinear", align_corners=False)[:, 0]
         return total - total.flatten(1).logsumexp(1)[:, None, None]
@@ -205,7 +206,7 @@ class FixationDensity(Pretrained):
     def terms(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], scanpath: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Terms of the log density by name, up to a constant.
+        """Compute the terms of the log density by name, up to a constant.
 
         Args:
             features: as for `forward`.
@@ -223,7 +224,7 @@ class FixationDensity(Pretrained):
         return terms
 
     def map(self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int]) -> Tensor:
-        """The map m over the cells of pictures.
+        """Compute the map m over the cells of pictures.
 
         Args:
             features: as for `forward`.
@@ -237,7 +238,7 @@ class FixationDensity(Pretrained):
     def readouts(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], read: Tensor | None = None
     ) -> Tensor:
-        """The readouts, whose mean is the map once it is blurred.
+        """Compute the readouts, whose mean is the map once it is blurred.
 
         Args:
             features: as for `forward`.
@@ -250,34 +251,42 @@ class FixationDensity(Pretrained):
         Raises:
             InputError: a feature map is missing or has another number of channels.
         """
+        cells = cells_of(size)
+        hidden: Tensor | None = None
+        for shape, units in self._units(features, self.read if read is None else read).items():
+            on_picture = _on_picture(units, features, shape, cells)
+            hidden = on_picture + self.shift[:, None, None] if hidden is None else hidden.add_(on_picture)
+        assert hidden is not None
+        hidden = F.relu_(hidden).flatten(2).unflatten(1, (-1, self.mix.shape[-1]))
+        hidden = F.relu_(self.mix @ hidden + self.mix_shift[..., None])
+        return (self.out[:, None] @ hidden)[:, :, 0].unflatten(-1, cells)
+
+    def _units(self, features: FeatureMaps | Mapping[str, Tensor], read: Tensor) -> dict[tuple[int, int], Tensor]:
+        """Convolve each map, where the picture is, and sum the results of maps of one shape.
+
+        Args:
+            features: as for `forward`.
+            read: weights of the channels of all maps, `(U, C)`.
+
+        Returns:
+            `(B, U, h, w)` by the shape of the maps, which are larger where the picture does not fill them.
+        """
         maps = features.maps if isinstance(features, FeatureMaps) else features
-        rows, columns = cells_of(size)
-        joined: dict[tuple[int, int], Tensor] = {}
-        weights = (self.read if read is None else read).split([*self.layers.values()], 1)
+        by_shape: dict[tuple[int, int], Tensor] = {}
+        weights = read.split([*self.layers.values()], 1)
         for (name, channels), weight in zip(self.layers.items(), weights, strict=True):
             if name not in maps:
                 raise InputError(f"features: expected the map {name!r}, got {', '.join(maps)}")
             check_shape(maps[name], f"features[{name!r}]", None, channels, None, None)
             shape = (int(maps[name].shape[-2]), int(maps[name].shape[-1]))
-            (_, top, bottom), (_, left, right) = _placed(features, shape)
-            value = F.conv2d(maps[name][..., top:bottom, left:right].to(weight), weight[..., None, None])
-            joined[shape] = joined[shape].add_(value) if shape in joined else value
-        hidden: Tensor | None = None
-        for shape, value in joined.items():
-            for axis, ((start, end), first, last) in enumerate(_placed(features, shape)):
-                if (start, end) != (0, shape[axis]) or shape[axis] != (rows, columns)[axis]:
-                    line = _interpolation((rows, columns)[axis], start, end, shape[axis], value.dtype, value.device)
-                    line = line[:, first:last]
-                    value = value @ line.mT if axis else line @ value
-            hidden = value + self.shift[:, None, None] if hidden is None else hidden.add_(value)
-        assert hidden is not None
-        units = self.mix.shape[-1]
-        hidden = F.relu_(hidden).flatten(2).unflatten(1, (-1, units))
-        hidden = F.relu_(self.mix @ hidden + self.mix_shift[..., None])
-        return (self.out[:, None] @ hidden)[:, :, 0].unflatten(-1, (rows, columns))
+            rows, columns = _sides(features, shape)
+            part = maps[name][..., rows.first : rows.stop, columns.first : columns.stop]
+            units = F.conv2d(part.to(weight), weight[..., None, None])
+            by_shape[shape] = by_shape[shape].add_(units) if shape in by_shape else units
+        return by_shape
 
     def centre_bias(self, size: tuple[int, int]) -> Tensor:
-        """The weighted log density of the centre bias.
+        """Compute the weighted log density of the centre bias.
 
         Args:
             size: `(height, width)` of the picture in pixels.
@@ -296,7 +305,7 @@ class FixationDensity(Pretrained):
         scanpath: Tensor,
         corner: tuple[int, int, int] = (0, 0, 1),
     ) -> dict[str, Tensor]:
-        """The terms after scanpaths `(B, n, 2)`: with their gains, and with the oculomotor biases.
+        """Compute the terms after scanpaths `(B, n, 2)`: with their gains, and with the oculomotor biases.
 
         Args:
             terms: map and centre bias `(B, rows, columns)` or `(1, rows, columns)`.
@@ -360,24 +369,28 @@ class FixationDensity(Pretrained):
         return path
 
     def extra_repr(self) -> str:
-        """Its layers and readouts."""
+        """Write its layers and readouts."""
         return f"layers={self.layers}, readouts={self.mix.shape[0]}, units={self.mix.shape[1]}"
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Tensors that are saved; the weights of the convolutions in half precision."""
+        """List the tensors that are saved; the weights of the convolutions are in half precision."""
         tensors = super()._tensors()
         return tensors | {name: tensors[name].to(_HALF) for name in ("read", "mix")}
 
     def _record(self) -> dict[str, Any]:
+        """List what a file holds beside tensors."""
         return {"layers": [[name, channels] for name, channels in self.layers.items()]}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """Make the model of a file."""
         readouts, units = tensors["mix"].shape[:2]
         model = cls(dict(record["layers"]), readouts=readouts, units=units, metadata=record["metadata"])
         expected = str(tuple(model.read.shape))
         check(tensors["read"].shape == model.read.shape, "read", expected, tuple(tensors["read"].shape))
-        model.centre, model.duration = tensors["centre"], tensors["duration"]
+        # Their sizes are those of the file.
+        model.centre = tensors["centre"]
+        model.duration = tensors["duration"]
         model.to(tensors["shift"].dtype)
         model.load_state_dict({name: value.to(tensors["shift"].dtype) for name, value in tensors.items()})
         return model
@@ -387,7 +400,7 @@ _read = cache(FixationDensity.from_pretrained)  # shipped files do not change
 
 
 def shared_density(detector: Detector) -> FixationDensity:
-    """The model of `FixationDensity.for_detector`, one for all who do not change it."""
+    """Give the model of `FixationDensity.for_detector`, one for all who do not change it."""
     folder = FixationDensity.shipped
     path = folder / f"{detector.name}.safetensors"
     if not path.is_file():
@@ -402,32 +415,81 @@ def shared_density(detector: Detector) -> FixationDensity:
 
 
 def cells_of(size: tuple[int, int]) -> tuple[int, int]:
-    """Rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
+    """Count rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
     longer = max(size)
     return max(1, round(_CELLS * size[0] / longer)), max(1, round(_CELLS * size[1] / longer))
 
 
-def _placed(
-    features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]
-) -> list[tuple[tuple[float, float], int, int]]:
-    """Edges of the picture on a map, and first and last of the pixels between them and one beyond; rows, columns."""
+class _Side(NamedTuple):
+    """Where the picture is along one side of a map of `length` pixels.
+
+    Attributes:
+        start: its first edge, in pixels of the map.
+        end: its last edge.
+        first: first pixel that its interpolation needs.
+        stop: pixel after the last one.
+        length: number of pixels of the map.
+    """
+
+    start: float
+    end: float
+    first: int
+    stop: int
+    length: int
+
+
+def _sides(features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]) -> tuple[_Side, _Side]:
+    """Find the picture along the rows and the columns of maps of a shape `(h, w)`."""
     if not isinstance(features, FeatureMaps):
-        return [((0, length), 0, length) for length in shape]
+        return _Side(0, shape[0], 0, shape[0], shape[0]), _Side(0, shape[1], 0, shape[1], shape[1])
     placement: Placement = features.placement
-    placed = []
-    for side, length in ((1, shape[0]), (0, shape[1])):
-        pixels = features.canvas[side] / length
-        start = placement.offset[side] / pixels
-        end = start + placement.size[side] * placement.scale[side] / pixels
-        placed.append(((start, end), max(floor(start - 0.5), 0), min(ceil(end + 0.5), length)))
-    return placed
+    sides = []
+    for axis, length in ((1, shape[0]), (0, shape[1])):
+        pixels = features.canvas[axis] / length
+        start = placement.offset[axis] / pixels
+        end = start + placement.size[axis] * placement.scale[axis] / pixels
+        sides.append(_Side(start, end, max(floor(start - 0.5), 0), min(ceil(end + 0.5), length), length))
+    return sides[0], sides[1]
+
+
+def _on_picture(
+    values: Tensor, features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int], cells: tuple[int, int]
+) -> Tensor:
+    """Interpolate values of maps of a shape at the cells of the picture.
+
+    Args:
+        values: `(B, U, h, w)`, where the picture is.
+        features: as for `FixationDensity.forward`.
+        shape: `(h, w)` of the whole maps.
+        cells: rows and columns of cells.
+
+    Returns:
+        `(B, U, rows, columns)`.
+    """
+    vertical, horizontal = _sides(features, shape)
+    if _interpolates(vertical, cells[0]):
+        values = _line(vertical, cells[0], values) @ values
+    if _interpolates(horizontal, cells[1]):
+        values = values @ _line(horizontal, cells[1], values).mT
+    return values
+
+
+def _interpolates(side: _Side, cells: int) -> bool:
+    """Tell whether the cells are others than the pixels of the map."""
+    return (side.start, side.end) != (0, side.length) or side.length != cells
+
+
+def _line(side: _Side, cells: int, like: Tensor) -> Tensor:
+    """Make the matrix of `_interpolation` for the pixels that it needs."""
+    matrix = _interpolation(cells, side.start, side.end, side.length, like.dtype, like.device)
+    return matrix[:, side.first : side.stop]
 
 
 @constant
 def _interpolation(
     cells: int, start: float, end: float, length: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Bilinear interpolation at the centres of cells between two edges of a line of pixels, `(cells, length)`."""
+    """Make the matrix `(cells, length)` of bilinear interpolation at centres of cells between two edges of a line."""
     centres = torch.arange(cells, device=device, dtype=dtype) + 0.5
     place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
     pixels = torch.arange(length, device=device, dtype=dtype)
@@ -435,8 +497,19 @@ def _interpolation(
 
 
 def blurred(maps: Tensor, sigma: Tensor) -> Tensor:
-    """Maps `(..., rows, columns)` blurred by a Gaussian of σ cells, whose weights sum to 1 at the border, too."""
-    places = (torch.arange(cells, device=sigma.device, dtype=sigma.dtype) for cells in maps.shape[-2:])
-    squares = ((place[:, None] - place).square() for place in places)
-    down, across = ((each / (-2 * sigma.square())).softmax(-1) for each in squares)
-    return down @ maps @ across.mT
+    """Blur maps by a Gaussian whose weights sum to 1 at the border, too.
+
+    Args:
+        maps: `(..., rows, columns)`.
+        sigma: σ in cells, `()`.
+
+    Returns:
+        `(..., rows, columns)`.
+    """
+    return _blurring(maps.shape[-2], sigma) @ maps @ _blurring(maps.shape[-1], sigma).mT
+
+
+def _blurring(cells: int, sigma: Tensor) -> Tensor:
+    """Make the matrix `(cells, cells)` that blurs a line of cells; differentiable in σ."""
+    place = torch.arange(cells, device=sigma.device, dtype=sigma.dtype)
+    return ((place[:, None] - place).square() / (-2 * sigma.square())).softmax(-1)

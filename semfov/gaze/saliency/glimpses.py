@@ -38,11 +38,11 @@ def features_so_far(views: FeatureMaps, fixations: Tensor, scanpath: Tensor) -> 
     """
     check_shape(fixations, "fixations", len(next(iter(views.maps.values()))), 2)
     check_shape(scanpath, "scanpath", None, None, 2)
-    known = ~scanpath[..., 0].isnan()
-    check(bool(known.any(-1).all()), "scanpath", "at least one fixation in each", "none")
+    fixated = ~scanpath[..., 0].isnan()
+    check(bool(fixated.any(-1).all()), "scanpath", "at least one fixation in each", "none")
     place = views.placement
-    points = torch.where(known[..., None], scanpath, 0.0).to(fixations)
-    chosen = torch.cdist(points, fixations.expand(len(points), -1, -1)).argmin(-1)
+    points = torch.where(fixated[..., None], scanpath, 0.0).to(fixations)
+    nearest_view = torch.cdist(points, fixations.expand(len(points), -1, -1)).argmin(-1)
     joined = {}
     for name, maps in views.maps.items():
         height, width = maps.shape[-2:]
@@ -50,9 +50,9 @@ def features_so_far(views: FeatureMaps, fixations: Tensor, scanpath: Tensor) -> 
         x = ((torch.arange(width).to(fixations) + 0.5) * (views.canvas[0] / width) - place.offset[0]) / place.scale[0]
         y = ((torch.arange(height).to(fixations) + 0.5) * (views.canvas[1] / height) - place.offset[1]) / place.scale[1]
         pixels = torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], -1).flatten(0, 1) - 0.5
-        away = torch.cdist(pixels.expand(len(points), -1, -1), fixations[chosen])
-        closest = away.masked_fill(~known[:, None], torch.inf).argmin(-1)
-        view = chosen.gather(1, closest)
-        taken = maps.flatten(2).transpose(1, 2)[view, torch.arange(height * width, device=view.device)]
-        joined[name] = taken.transpose(1, 2).unflatten(2, (height, width))
+        distance = torch.cdist(pixels.expand(len(points), -1, -1), fixations[nearest_view])
+        closest = distance.masked_fill(~fixated[:, None], torch.inf).argmin(-1)
+        view = nearest_view.gather(1, closest)
+        features = maps.flatten(2).transpose(1, 2)[view, torch.arange(height * width, device=view.device)]
+        joined[name] = features.transpose(1, 2).unflatten(2, (height, width))
     return replace(views, maps=joined)

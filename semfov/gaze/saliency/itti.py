@@ -18,7 +18,9 @@ _ORIENTATIONS = (0.0, 45.0, 90.0, 135.0)
 
 # Itti, Koch and Niebur (1998) print no sizes of their Gabor filters; these are the SaliencyToolbox's (Walther and
 # Koch, 2006).
-_TAPS, _PERIOD, _SIGMA = 9, 7.0, 7 / 3
+_TAPS = 9
+_PERIOD = 7.0
+_SIGMA = 7 / 3
 
 # Lower maxima of a map do not count (Walther and Koch, 2006).
 _PEAK = 0.1
@@ -29,7 +31,7 @@ _FLAT = 32
 
 
 def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
-    """Dyadic Gaussian pyramid (`cv2.pyrDown`); channels `(B, C, H, W)`."""
+    """Compute the dyadic Gaussian pyramid (`cv2.pyrDown`) of channels `(B, C, H, W)`, finest level first."""
     pyramid = [channels]
     for _ in range(levels):
         pyramid.append(pyrdown(pyramid[-1], "opencv"))
@@ -38,13 +40,14 @@ def _dyadic_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
 
 @constant
 def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
-    r"""Even and odd Gabor filters, as weights of a convolution `(2n, 1, 9, 9)`: of mean 0 and absolute sum 1.
+    r"""Make even and odd Gabor filters, weights of a convolution `(2n, 1, 9, 9)`, of mean 0 and absolute sum 1.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
         u = x \cos\theta + y \sin\theta, \quad \phi \in \{0, \pi/2\}, \quad \sigma = 7/3
     """
     place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
-    y, x = place[:, None], place[None, :]
+    y = place[:, None]
+    x = place[None, :]
     envelope = torch.exp(-(x**2 + y**2) / (2 * _SIGMA**2))
     angles = torch.tensor(_ORIENTATIONS, dtype=torch.float64) * (pi / 180)
     wave = 2 * pi / _PERIOD * (x * angles.cos()[:, None, None] + y * angles.sin()[:, None, None])
@@ -54,7 +57,7 @@ def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _promote(maps: Tensor) -> Tensor:
-    """Map normalisation of Itti, Koch and Niebur (1998), `N(M) = M (1 - m)²`; maps `(..., h, w)`.
+    """Promote maps `(..., h, w)` with few peaks: `N(M) = M (1 - m)²` of Itti, Koch and Niebur (1998).
 
     m is the mean of the local maxima above 0.1 other than the largest; a map of rounding errors alone becomes 0.
     """
@@ -62,19 +65,20 @@ def _promote(maps: Tensor) -> Tensor:
     # Peaks are above their earlier neighbours and no less than their later ones, in row-major order.
     height, width = maps.shape[-2:]
     padded = F.pad(maps, (1, 1, 1, 1), value=-torch.inf)
-    left, right = padded[..., :width], padded[..., 2:]
-    rows = torch.maximum(torch.maximum(left, right), padded[..., 1:-1])
-    earlier = torch.maximum(rows[..., :height, :], left[..., 1:-1, :])
-    later = torch.maximum(rows[..., 2:, :], right[..., 1:-1, :])
+    west = padded[..., :width]
+    east = padded[..., 2:]
+    rows = torch.maximum(torch.maximum(west, east), padded[..., 1:-1])
+    earlier = torch.maximum(rows[..., :height, :], west[..., 1:-1, :])
+    later = torch.maximum(rows[..., 2:, :], east[..., 1:-1, :])
     peaks = (maps > earlier) & (maps >= later) & (maps > _PEAK)
     count = peaks.sum((-2, -1), keepdim=True)
     # The largest maximum is exactly 1, and is always among the peaks.
-    others = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
-    return maps * (1 - torch.where(count > 1, others, 0.0)) ** 2
+    mean = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
+    return maps * (1 - torch.where(count > 1, mean, 0.0)) ** 2
 
 
 def _conspicuity(image: Tensor) -> Tensor:
-    r"""Conspicuity maps of intensity, colour and orientation at scale 4 (Itti, Koch and Niebur, 1998).
+    r"""Compute conspicuity maps of intensity, colour and orientation at scale 4 (Itti, Koch and Niebur, 1998).
 
     .. math:: \bar I = \bigoplus_{c,s} N(I_{c,s}), \quad
         \bar C = \bigoplus_{c,s} N(RG_{c,s}) + N(BY_{c,s}), \quad
@@ -83,32 +87,44 @@ def _conspicuity(image: Tensor) -> Tensor:
     over centres c = 2, 3, 4 and surrounds s = c + 3, c + 4 of the Gaussian pyramid.
 
     Opponencies of the surround are subtracted as they are: with G - R in it (their equation 2, and 3 for B - Y) a
-    uniform colour would respond most. Image `(B, 3, H, W)` → `(B, 3, h, w)`.
+    uniform colour would respond most.
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        `(B, 3, h, w)`.
     """
     levels = max(_CENTRES) + max(_DELTAS)
     pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)
-    features = []
-    for level in pyramid[min(_CENTRES) :]:
-        intensity = F.pad(level[:, :1], (_TAPS // 2,) * 4, mode="replicate")
-        answers = F.conv2d(intensity, _gabor_kernels(level.dtype, level.device))
-        # The energy of an orientation is |even| + |odd|.
-        features.append(torch.cat([level, answers.abs().unflatten(1, (-1, 2)).sum(2)], 1))
+    finest = min(_CENTRES)
+    features = [_with_orientations(level) for level in pyramid[finest:]]
     total = torch.zeros((), dtype=image.dtype, device=image.device)
-    for centre in _CENTRES:
-        here = features[centre - min(_CENTRES)]
-        around = [features[centre - min(_CENTRES) + delta] for delta in _DELTAS]
-        size = here.shape[-2], here.shape[-1]
-        wide = [F.interpolate(each, size, mode="bilinear", align_corners=False) for each in around]
-        maps = _promote(torch.stack([(here - surround).abs() for surround in wide], 1)).sum(1)
+    for scale in _CENTRES:
+        centre = features[scale - finest]
+        size = (centre.shape[-2], centre.shape[-1])
+        contrasts = []
+        for delta in _DELTAS:
+            surround = features[scale - finest + delta]
+            enlarged = F.interpolate(surround, size, mode="bilinear", align_corners=False)
+            contrasts.append((centre - enlarged).abs())
+        maps = _promote(torch.stack(contrasts, 1)).sum(1)
         # Across-scale addition happens at the coarsest centre.
-        total = total + _dyadic_pyramid(maps, max(_CENTRES) - centre)[-1]
+        total = total + _dyadic_pyramid(maps, max(_CENTRES) - scale)[-1]
     intensity, colour, orientation = total.split([1, 2, len(_ORIENTATIONS)], 1)
     channels = [intensity, colour.sum(1, keepdim=True), _promote(orientation).sum(1, keepdim=True)]
     return torch.cat(channels, 1)
 
 
+def _with_orientations(level: Tensor) -> Tensor:
+    """Append to a level `(B, 3, h, w)` the energy of each orientation of its intensity, |even| + |odd|."""
+    intensity = F.pad(level[:, :1], (_TAPS // 2,) * 4, mode="replicate")
+    responses = F.conv2d(intensity, _gabor_kernels(level.dtype, level.device))
+    return torch.cat([level, responses.abs().unflatten(1, (-1, 2)).sum(2)], 1)
+
+
 def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
-    r"""Saliency by Itti, Koch and Niebur ("A model of saliency-based visual attention", PAMI 1998).
+    r"""Compute saliency by Itti, Koch and Niebur ("A model of saliency-based visual attention", PAMI 1998).
 
     .. math:: S = \tfrac{1}{3} (N(\bar I) + N(\bar C) + N(\bar O))
 

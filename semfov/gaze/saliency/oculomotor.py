@@ -49,7 +49,7 @@ class OculomotorBias(nn.Module):
         self.gain = nn.Parameter(torch.ones(2, _NUMBERS))
 
     def forward(self, path: Tensor, places: Tensor) -> Tensor:
-        """Log bias of every place as the next fixation, up to a constant.
+        """Compute the log bias of every place as the next fixation, up to a constant.
 
         Args:
             path: `(B, n, 2)`, fixations so far.
@@ -63,35 +63,56 @@ class OculomotorBias(nn.Module):
         check(path.shape[1] > 0, "path", "at least one fixation", tuple(path.shape))
         if path.shape[1] == 1:
             path = F.pad(path, (0, 0, 1, 0), value=torch.nan)
-        last, before = path[:, -1], path[:, -2]
-        ahead = places - last[:, None]
-        length = _norm(ahead)
-        across, down = (ahead / length[..., None].clamp(min=1e-9)).unbind(-1)
-        double = across.square() - down.square(), 2 * across * down
-        quadruple = double[0].square() - double[1].square(), 2 * double[0] * double[1]
+        saccades = self._saccade_bias(path[:, -1], path[:, -2], places)
+        return self._refixation_bias(path, places, saccades)
+
+    def _saccade_bias(self, last: Tensor, before: Tensor, places: Tensor) -> Tensor:
+        """Compute the bias by length, direction and turn of the saccade to every place.
+
+        Args:
+            last: the last fixation, `(B, 2)`.
+            before: the one before, `(B, 2)`, NaN for none.
+            places: `(N, 2)`.
+
+        Returns:
+            `(B, N)`.
+        """
+        saccade = places - last[:, None]
+        length = _norm(saccade)
+        cos, sin = (saccade / length[..., None].clamp(min=1e-9)).unbind(-1)
+        cos2 = cos.square() - sin.square()
+        sin2 = 2 * cos * sin
+        cos4 = cos2.square() - sin2.square()
+        sin4 = 2 * cos2 * sin2
         step = torch.where(before.isnan(), 0.0, last - before)
         unit = step / _norm(step)[:, None].clamp(min=1e-9)
-        along = across * unit[:, None, 0] + down * unit[:, None, 1]
-        known = (~before[:, :1].isnan()).to(along)
-        turns = known * along, known * (2 * along.square() - 1), known * (4 * along**3 - 3 * along)
-        angles = torch.stack([torch.ones_like(across), across, down, *double, *quadruple, *turns], -2)
+        turn = cos * unit[:, None, 0] + sin * unit[:, None, 1]  # cos τ
+        turns = (~before[:, :1].isnan()).to(turn)  # 0 without an earlier saccade
+        angles = [
+            *(torch.ones_like(cos), cos, sin, cos2, sin2, cos4, sin4),
+            *(turns * turn, turns * (2 * turn.square() - 1), turns * (4 * turn**3 - 3 * turn)),
+        ]
         tables = torch.cat([self.saccade, self.turn])
-        bias = (tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)).mul(angles).sum(-2)
+        by_length = tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)
+        return by_length.mul(torch.stack(angles, -2)).sum(-2)
+
+    def _refixation_bias(self, path: Tensor, places: Tensor, bias: Tensor) -> Tensor:
+        """Add to a bias `(B, N)` that of the distance of every place `(N, 2)` to the fixations before the last one."""
         earlier = path[:, :-1].flip(1)[:, :_MEMORY]
-        seen = (~earlier[..., 0].isnan()).to(bias)
+        fixated = (~earlier[..., 0].isnan()).to(bias)
         distance = torch.cdist(
-            torch.where(seen[..., None] > 0, earlier, 0.0),
+            torch.where(fixated[..., None] > 0, earlier, 0.0),
             places.expand(len(earlier), -1, -1),
             compute_mode="donot_use_mm_for_euclid_dist",
         )
         ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
         back = F.pad(self.back, (0, 1))[ages]
-        weights = back.diff(dim=1).flatten() * seen[..., None].expand(-1, -1, len(_NEAR) - 1).flatten(1)
+        weights = back.diff(dim=1).flatten() * fixated[..., None].expand(-1, -1, len(_NEAR) - 1).flatten(1)
         returns = weights[:, None] @ _passed(_NEAR, distance).flatten(1, 2)
-        return bias + returns[:, 0] + (back[:, 0] * seen).sum(1)[:, None]
+        return bias + returns[:, 0] + (back[:, 0] * fixated).sum(1)[:, None]
 
     def gains(self, number: Tensor) -> Tensor:
-        """Gains of the map and of the centre bias.
+        """Look up the gains of the map and of the centre bias.
 
         Args:
             number: `(B,)`, number of fixations so far, from 1.
@@ -103,13 +124,13 @@ class OculomotorBias(nn.Module):
 
 
 def _norm(vectors: Tensor) -> Tensor:
-    """Lengths of vectors `(..., 2)`, with a gradient of 0 at 0."""
+    """Compute the lengths of vectors `(..., 2)`, with a gradient of 0 at 0."""
     square = vectors.square().sum(-1)
     positive = square > 0
     return torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
 
 
 def _passed(knots: tuple[float, ...], distance: Tensor) -> Tensor:
-    """The share of each interval between K knots that distances `(..., N)` have passed, `(..., K - 1, N)`."""
+    """Compute the share of each interval between K knots that distances `(..., N)` have passed, `(..., K - 1, N)`."""
     knot = distance.new_tensor(knots)
     return ((distance[..., None, :] - knot[:-1, None]) / knot.diff()[:, None]).clamp(0, 1)

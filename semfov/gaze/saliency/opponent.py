@@ -18,14 +18,28 @@ def _check_image(image: Tensor) -> None:
 
 
 def opponent_colours(image: Tensor) -> Tensor:
-    """Intensity, red-green and blue-yellow `(B, 3, H, W)` of VOCUS2 (Frintrop, Werner and Martin García, 2015, 3.1)."""
+    """Compute the colours of VOCUS2 (Frintrop, Werner and Martin García, 2015, 3.1).
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        Intensity, red minus green and blue minus yellow, `(B, 3, H, W)`.
+    """
     _check_image(image)
     red, green, blue = image.unbind(1)
     return torch.stack([(red + green + blue) / 3, red - green, blue - (red + green) / 2], 1)
 
 
 def lab_colours(image: Tensor) -> Tensor:
-    """CIELAB `(L* / 100, a* / 255, b* / 255)` of sRGB: OpenCV's bytes by 255, but for their offset and rounding."""
+    """Convert sRGB to CIELAB as OpenCV's bytes divided by 255, but for their offset and rounding.
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        `(L* / 100, a* / 255, b* / 255)`, `(B, 3, H, W)`.
+    """
     # Imported when first needed: Kornia takes a quarter of a second.
     from kornia.color import rgb_to_lab
 
@@ -34,32 +48,50 @@ def lab_colours(image: Tensor) -> Tensor:
 
 
 def double_opponency(image: Tensor) -> Tensor:
-    r"""Intensity and the two colour opponencies of Itti, Koch and Niebur (1998), which do not depend on intensity.
+    r"""Compute intensity and two colour opponencies that do not depend on it (Itti, Koch and Niebur, 1998).
 
     With r, g and b divided by I where I exceeds a tenth of its maximum over the image, and 0 elsewhere,
 
     .. math:: R = [r - (g + b)/2]_+, \; G = [g - (r + b)/2]_+, \; B = [b - (r + g)/2]_+,
         \; Y = [(r + g)/2 - |r - g|/2 - b]_+
 
-    Image `(B, 3, H, W)` → `(B, 3, H, W)`.
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        I, R minus G, and B minus Y, `(B, 3, H, W)`.
     """
     _check_image(image)
     intensity = image.mean(1)
     least = intensity.amax((-2, -1), keepdim=True) / 10
     # So many rows at once that they stay in the processor's cache.
-    some = max(1, _PIXELS // max(1, len(image) * image.shape[-1])) if values_known(image) else image.shape[-2]
-    parts = []
-    for part, bright in zip(image.split(some, 2), intensity.split(some, 1), strict=True):
-        visible = bright > least
-        gain = visible / torch.where(visible, bright, 1.0)
-        red, green, blue = (part * gain[:, None]).unbind(1)
-        mean = (red + green) / 2
-        reds, greens = F.relu(red - (green + blue) / 2), F.relu(green - (red + blue) / 2)
-        blues, yellows = F.relu(blue - mean), F.relu(mean - (red - green).abs() / 2 - blue)
-        parts.append(torch.stack([bright, reds - greens, blues - yellows], 1))
-    return torch.cat(parts, 2)
+    rows = max(1, _PIXELS // max(1, len(image) * image.shape[-1])) if values_known(image) else image.shape[-2]
+    blocks = zip(image.split(rows, 2), intensity.split(rows, 1), strict=True)
+    return torch.cat([_opponencies(pixels, bright, least) for pixels, bright in blocks], 2)
+
+
+def _opponencies(image: Tensor, intensity: Tensor, least: Tensor) -> Tensor:
+    """Compute `double_opponency` of some rows of images `(B, 3, h, W)`.
+
+    Args:
+        image: the rows.
+        intensity: their intensity, `(B, h, W)`.
+        least: intensity up to which colours are not visible, `(B, 1, 1)`.
+
+    Returns:
+        `(B, 3, h, W)`.
+    """
+    visible = intensity > least
+    gain = visible / torch.where(visible, intensity, 1.0)
+    r, g, b = (image * gain[:, None]).unbind(1)
+    mean = (r + g) / 2
+    red = F.relu(r - (g + b) / 2)
+    green = F.relu(g - (r + b) / 2)
+    blue = F.relu(b - mean)
+    yellow = F.relu(mean - (r - g).abs() / 2 - b)
+    return torch.stack([intensity, red - green, blue - yellow], 1)
 
 
 def anchor(channels: Tensor) -> Tensor:
-    """Channels `(B, C, H, W)` less their first pixel: contrasts stay, and those of a uniform image are exactly 0."""
+    """Subtract from channels `(B, C, H, W)` their first pixel: contrasts stay, and a uniform image has exactly none."""
     return channels - channels[..., :1, :1]

@@ -28,12 +28,22 @@ class _Twin(NamedTuple):
 def _twin_pyramids(
     channels: Tensor, centre_sigma: float = 2.0, surround_sigma: float = 6.0, layers: int = 5, scales: int = 2
 ) -> list[list[_Twin]]:
-    r"""Centre and surround pyramids (Frintrop, Werner and Martin García, 2015, section 3.2); channels `(B, C, H, W)`.
+    r"""Compute centre and surround pyramids (Frintrop, Werner and Martin García, 2015, section 3.2).
 
     Each layer has half the size of the one before, and S scales, each by further blur of the one before (Lowe, 2004):
 
     .. math:: \sigma_c(s) = 2^{s/S} \sigma_c, \quad
         \mathrm{surround} = G(2^{s/S} \sqrt{\sigma_s^2 - \sigma_c^2}) * \mathrm{centre}
+
+    Args:
+        channels: `(B, C, H, W)`.
+        centre_sigma: blur of the centre at the first scale.
+        surround_sigma: blur of the surround at the first scale.
+        layers: number of layers, fewer of small images.
+        scales: S, number of scales of a layer.
+
+    Returns:
+        The scales of each layer, largest first.
     """
     wider = (surround_sigma**2 - centre_sigma**2) ** 0.5
     # From one scale to the next the variance grows by this factor.
@@ -102,20 +112,36 @@ def vocus2_saliency(
     with torch.autocast(image.device.type, enabled=False):
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
         pyramids = _twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
-        contrasts = ((twin.centre - twin.surround for twin in twins) for twins in pyramids)
-        size = image.shape[-2], image.shape[-1]
-        if fusion == "mean":
-            # One of on-off and off-on is 0, so their mean is half the difference. That over channels is taken as well.
-            maps = [torch.cat([each.abs_().mean(1, keepdim=True) / 2 for each in layer], 1) for layer in contrasts]
-            # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
-            enlarged = (enlarge(layer.mean(1), size) for layer in maps)
-            saliency = sum(enlarged, next(enlarged)) / len(maps)
-        else:
-            maps = [torch.cat([F.relu(part) for each in layer for part in (each, -each)], 1) for layer in contrasts]
-            saliency = torch.stack([enlarge(layer, size).amax(1) for layer in maps]).amax(0)
+        size = (image.shape[-2], image.shape[-1])
+        saliency = _mean_contrast(pyramids, size) if fusion == "mean" else _largest_contrast(pyramids, size)
     # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.
     flat = 0.0 if color_space == "opponent" else _FLAT * torch.finfo(saliency.dtype).eps
     return rescale(saliency, flat) if normalise else saliency
+
+
+def _mean_contrast(pyramids: list[list[_Twin]], size: tuple[int, int]) -> Tensor:
+    """Take the mean of on-off and off-on contrasts over channels, scales and layers, `(B, *size)`."""
+    total: Tensor | None = None
+    for twins in pyramids:
+        # One of on-off and off-on is 0, so their mean is half the difference.
+        contrasts = [(twin.centre - twin.surround).abs_().mean(1, keepdim=True) / 2 for twin in twins]
+        # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
+        layer = enlarge(torch.cat(contrasts, 1).mean(1), size)
+        total = layer if total is None else total + layer
+    assert total is not None
+    return total / len(pyramids)
+
+
+def _largest_contrast(pyramids: list[list[_Twin]], size: tuple[int, int]) -> Tensor:
+    """Take the largest of on-off and off-on contrasts over channels, scales and layers, `(B, *size)`."""
+    layers = []
+    for twins in pyramids:
+        contrasts = []
+        for twin in twins:
+            difference = twin.centre - twin.surround
+            contrasts += [F.relu(difference), F.relu(-difference)]
+        layers.append(enlarge(torch.cat(contrasts, 1), size).amax(1))
+    return torch.stack(layers).amax(0)
 
 
 class VOCUS2(nn.Module):
@@ -150,8 +176,14 @@ class VOCUS2(nn.Module):
     ) -> None:
         super().__init__()
         _check_settings(centre_sigma, surround_sigma, layers, scales, fusion, color_space)
-        self.settings: dict[str, Any] = {"centre_sigma": centre_sigma, "surround_sigma": surround_sigma}
-        self.settings |= {"layers": layers, "scales": scales, "fusion": fusion, "color_space": color_space}
+        self.settings: dict[str, Any] = {
+            "centre_sigma": centre_sigma,
+            "surround_sigma": surround_sigma,
+            "layers": layers,
+            "scales": scales,
+            "fusion": fusion,
+            "color_space": color_space,
+        }
         self.normalise = normalise
 
     def forward(self, image: ImageLike) -> Tensor:
@@ -166,13 +198,14 @@ class VOCUS2(nn.Module):
         return vocus2_saliency(as_batch(image), **self.settings, normalise=self.normalise)
 
     def extra_repr(self) -> str:
-        """All settings by name."""
+        """Write all settings by name."""
         return ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
 
 
 def _check_settings(
     centre_sigma: float, surround_sigma: float, layers: int, scales: int, fusion: str, color_space: str
 ) -> None:
+    """Raise `InputError` unless the settings of `vocus2_saliency` are in their range."""
     check(centre_sigma > 0, "centre_sigma", "a positive number of pixels", centre_sigma)
     check(surround_sigma > centre_sigma, "surround_sigma", f"more than centre_sigma = {centre_sigma}", surround_sigma)
     check(layers >= 1, "layers", "1 or more", layers)
