@@ -107,14 +107,14 @@ def _reconstruct(bands: Bands, fovea: Fovea, into: Tensor | None = None) -> Tens
         The views `R_0`, `(B, G, C, H, W)`; those of half precision in float32 on a CPU.
     """
     if not bands.details:
-        return bands.base[:, None].repeat(1, fovea.fixation.shape[1], 1, 1, 1)
+        return bands.base[:, None].repeat(1, fovea.count[1], 1, 1, 1)
     bands = bands.widened()
     windows = fovea.windows(bands.sizes, bands.convention, bands.base.dtype)
     return _collapse(bands, windows, into)
 
 
 def _collapse(bands: Bands, windows: tuple[Window, ...], into: Tensor | None = None) -> Tensor:
-    """Add the bands times their windows, from the coarsest to the finest, as `_reconstruct` says."""
+    """Compute `views = w_k L_k + expand(views)` from the coarsest band to the finest, into `into` if it is given."""
     views = bands.base[:, None]  # all fixations share the coarsest level
     for k in reversed(range(len(windows))):
         expanded = _expand(views, bands.sizes[k], bands.convention)
@@ -176,20 +176,27 @@ def _foveate_in_blocks(images: Tensor | Bands, fovea: Fovea, levels: int, conven
     channels = like.shape[1]
     batch, number = fovea.count
     block = max(1, _BLOCK // max(1, channels * height * width))  # views that are made together
-    large = isinstance(images, Tensor) and number == 1 and min(height, width) >= _LARGE
     if batch * number <= block:
-        if isinstance(images, Tensor) and large:
-            return _foveate_large(images, fovea, levels, convention).to(like.dtype)
-        return _reconstruct(_bands(images, levels, convention), fovea).to(like.dtype)
+        return _foveate_block(images, fovea, levels, convention).to(like.dtype)
     views = empty(like, batch, number, channels, height, width)
     for rows in _slices(batch, max(1, block // number)):
-        if isinstance(images, Tensor) and large:
-            _foveate_large(images[rows], fovea[rows, :], levels, convention, views[rows])
-            continue
-        bands = _bands(images[rows], levels, convention)
-        for columns in _slices(number, block):
-            _reconstruct(bands, fovea[rows, columns], views[rows, columns])
+        if number <= block:
+            _foveate_block(images[rows], fovea[rows, :], levels, convention, views[rows])
+        else:
+            # All fixations of an image share its pyramid.
+            bands = _bands(images[rows], levels, convention)
+            for columns in _slices(number, block):
+                _reconstruct(bands, fovea[rows, columns], views[rows, columns])
     return views
+
+
+def _foveate_block(
+    images: Tensor | Bands, fovea: Fovea, levels: int, convention: Convention, into: Tensor | None = None
+) -> Tensor:
+    """Foveate images on a CPU at once, by the faster one of two ways; arguments and result as of `_foveate_large`."""
+    if isinstance(images, Tensor) and fovea.count[1] == 1 and min(images.shape[-2:]) >= _LARGE:
+        return _foveate_large(images, fovea, levels, convention, into)
+    return _reconstruct(_bands(images, levels, convention), fovea, into)
 
 
 def _foveate_large(
