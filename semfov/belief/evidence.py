@@ -91,8 +91,10 @@ class Evidence(PretrainedForEye):
         Returns:
             `(B, X·Y)`, log odds.
         """
+        # Sums over a neighbourhood are of probabilities: log odds far below 0 would drown a likely cell.
         odds = nearest.sigmoid()
         eccentricity, row = _places(columns, nearest.shape[-1] // columns, nearest.dtype, nearest.device)
+        # Each input has about unit size, with which the network is trained from its usual random start.
         inputs = [
             nearest / 2 + 1,
             gathered.best / 2 + 1,
@@ -134,6 +136,7 @@ def nearness(distance: Tensor) -> Tensor:
 
 def farther(keep: float) -> float:
     """Compute the increase of the distance, in longer sides of the image, that multiplies `nearness` by `keep`."""
+    # Evidence that has faded to nothing is very far away, not infinitely: a distance of infinity is no look at all.
     return -math.log(max(keep, sys.float_info.min)) * _REACH
 
 

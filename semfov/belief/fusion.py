@@ -236,6 +236,7 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
     update = RULES[rule]
     if not values_known(beta, scaled, footprint):
         return _fuse_everywhere(beta, scaled, footprint, update)
+    # The gradient of a block that is written into a larger tensor would pass through all of that tensor.
     recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (beta, scaled, footprint))
     episodes = max(1, _BLOCK // max(1, beta[:1].numel()))
     if recorded or beta.device.type != "cpu" or len(beta) <= episodes:

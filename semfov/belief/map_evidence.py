@@ -132,6 +132,7 @@ class MapEvidence(Evidence):
             `(B, X·Y)`.
         """
         not_class = torch.nn.functional.logsigmoid(-log_odds)
+        # In logarithms: the product of 80 probabilities near 1 keeps its digits.
         none = (not_class if stands_for is None else not_class * stands_for[..., None]).sum(1)
         anything = -torch.expm1(none)
         first, second = log_odds.topk(2, 1).values.unbind(1)
@@ -146,6 +147,7 @@ class MapEvidence(Evidence):
             4 * distance,
             looks[:, None].log() / 2,
         ]
+        # The first two terms are the log odds of Π (1 - P).
         return none - anything.clamp(min=1e-6).log() + apply_network(self.void, inputs, first.shape)
 
     def gain(self, probabilities: Tensor, closest: Tensor, looks: Tensor, distance: Tensor) -> Tensor:

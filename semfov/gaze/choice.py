@@ -216,6 +216,7 @@ def soft_fixation(
     check_shape(visited, "visited", *logits.shape)
     check_shape(noise, "noise", *logits.shape)
     check_shape(centres, "centres", logits.shape[-1], 2)
+    # At 0 and 1 the noise would be infinite, and choose a cell whatever its value.
     limits = torch.finfo(noise.dtype)
     gumbel = -(-noise.clamp(min=limits.tiny, max=1 - limits.eps).log()).log()
     weights = ((logits + gumbel.to(logits)).masked_fill(visited, -torch.inf) / temperature).softmax(-1)

@@ -43,6 +43,7 @@ class _AnyBelief(Belief):
 
     def by_class(self) -> list[tuple[Belief, int, float]]:
         """List the belief about each class, the class and its weight."""
+        # A single belief about all classes answers for each of them.
         beliefs = self.inner if len(self.inner) > 1 else self.inner * len(self.weights)
         return [(belief, index, weight) for belief, (index, weight) in zip(beliefs, self.weights.items(), strict=True)]
 

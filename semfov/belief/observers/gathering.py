@@ -132,6 +132,7 @@ class Gatherer(Observer, Generic[_Model]):
             return belief
         fields: dict[str, Tensor] = vars(belief)
         unseen = self.model.unseen(belief.closest)
+        # Without a look, evidence is that of a look that shows nothing; sums and counts are 0.
         faded: dict[str, Any] = {name: unseen + keep * (fields[name] - unseen) for name in ("nearest", "best")}
         faded |= {name: keep * fields[name] for name in ("total", "weight", "score", "looks")}
         return replace(belief, **faded, closest=fields["closest"] + farther(keep), visited=visited)  # type: ignore[type-var]

@@ -179,6 +179,7 @@ class Semantic(Observer):
         distance = grid.distance(fixation).to(likelihood)
         if self.association == "each":
             return SemanticLook(scale_covering(likelihood, cells), cells, distance)
+        # One detection or a miss shows the object of a cell (`one_of`), each relative to background.
         ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
         covered = grid.footprint(detections.boxes) * detections.mask[..., None]
         return AssociatedLook(ratio, cells, distance, covered, grid.cell_of(fixation))
@@ -197,6 +198,7 @@ class Semantic(Observer):
             fused = self._fuse_one(before, associated, visited)
             changes["visited"] = visited
         if self.memory == "closest":
+            # `before` was the prior, so a cell takes all of the closer look, or nothing of it.
             fused = torch.where((semantic.distance < old.closest)[..., None], fused, old.beta)
         return replace(old, beta=fused, closest=torch.minimum(old.closest, semantic.distance), **changes)
 

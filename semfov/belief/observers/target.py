@@ -100,6 +100,7 @@ class Target(Gatherer[TargetEvidence]):
             image = self.model.presence(cells, gathered)[:, None]
             return torch.cat([cells, self.model.chance(gathered, columns), image], -1).sigmoid()
 
+        # One tensor for all of them, so that a batch is computed row by row in one pass.
         values = self.each(probabilities, *inputs, target_look.target)
         cells = all_looks["closest"].shape[-1]
         present, following = values[:, :-1].split(cells, -1)

@@ -281,6 +281,7 @@ class FixationDensity(Pretrained):
             shape = (int(maps[name].shape[-2]), int(maps[name].shape[-1]))
             rows, columns = _sides(features, shape)
             part = maps[name][..., rows.first : rows.stop, columns.first : columns.stop]
+            # Before the interpolation, which is then of a few units and not of hundreds of channels.
             units = F.conv2d(part.to(weight), weight[..., None, None])
             by_shape[shape] = by_shape[shape].add_(units) if shape in by_shape else units
         return by_shape

@@ -93,6 +93,7 @@ class OculomotorBias(nn.Module):
             *(turns * turn, turns * (2 * turn.square() - 1), turns * (4 * turn**3 - 3 * turn)),
         ]
         tables = torch.cat([self.saccade, self.turn])
+        # A table that is interpolated linearly is its first value and the shares of its steps that were passed.
         by_length = tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)
         return by_length.mul(torch.stack(angles, -2)).sum(-2)
 

@@ -45,6 +45,7 @@ def _twin_pyramids(
     Returns:
         The scales of each layer, largest first.
     """
+    # Variances of successive blurs add up, so the surround is a further blur of the centre.
     wider = (surround_sigma**2 - centre_sigma**2) ** 0.5
     # From one scale to the next the variance grows by this factor.
     growth = 2 ** (2 / scales)
