@@ -54,15 +54,15 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
     @wraps(function)
     def call(*settings: *_Settings) -> _Constant:
         if torch.compiler.is_dynamo_compiling():
-            return remember_in_graph(*_fixed(settings))  # type: ignore[no-any-return]
+            return remember_in_graph(*_fixed(settings))
         if torch.compiler.is_compiling():
             # The exporter runs Python itself, with tensors that have no values; the constant needs real ones.
             with _disable_current_modes():
-                return remember(*_fixed(settings))  # type: ignore[no-any-return]
+                return remember(*_fixed(settings))
         if type(torch.empty(0)) is not Tensor:
             # Another tracer: tensors that are made in it are of a kind of its own, which must not be kept.
             return function(*settings)
-        return remember(*settings)  # type: ignore[no-any-return]
+        return remember(*settings)
 
     return call
 
