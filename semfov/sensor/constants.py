@@ -1,12 +1,12 @@
 """Constants of sizes and settings: matrices and positions that are computed once and kept."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, wraps
 from typing import Any, TypeVar, TypeVarTuple
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import _disable_current_modes
 
 _Constant = TypeVar("_Constant")
 _Settings = TypeVarTuple("_Settings")
@@ -56,9 +56,10 @@ def constant(function: Callable[[*_Settings], _Constant]) -> Callable[[*_Setting
         if torch.compiler.is_dynamo_compiling():
             return remember_in_graph(*_fixed(settings))
         if torch.compiler.is_compiling():
-            # The exporter runs Python itself, with tensors that have no values; the constant needs real ones.
-            with _disable_current_modes():
-                return remember(*_fixed(settings))
+            # The exporter runs Python itself, with tensors that have no values. It does so in this thread alone, and
+            # in another one they have some.
+            with ThreadPoolExecutor(1) as thread:
+                return thread.submit(remember, *_fixed(settings)).result()
         if type(torch.empty(0)) is not Tensor:
             # Another tracer: tensors that are made in it are of a kind of its own, which must not be kept.
             return function(*settings)

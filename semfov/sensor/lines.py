@@ -129,8 +129,10 @@ def banded(
     first_pixels = start + shift * torch.arange(tiles)[:, None, None]
     inner = index[rows:stop].reshape(tiles, tile, -1) - first_pixels
     middle = _dense(inner, weight[rows:stop].reshape(inner.shape), shift + 2 * reach).to(device, dtype)
-    if values_known(middle) and bool((middle == middle[0]).all()):
-        # Usually all tiles are equal, and a single one stays in the fastest cache.
+    # Usually all tiles are equal, and a single one stays in the fastest cache. Tracers other than the compiler, which
+    # keeps the matrix as a constant, make tensors of another type, whose values are not known.
+    readable = type(middle) is Tensor and not middle.is_meta
+    if readable and bool((middle == middle[0]).all()):
         middle = middle[:1].expand(tiles, -1, -1)
     # Both ends have the same size, so that one product computes them; the longer one decides.
     edge = max(rows, length - stop)
