@@ -151,8 +151,9 @@ def measure(config: ContentConfig) -> str:
             else:
                 named[fault] += any(words in line for line in lines for words in planted.words)
             by_rules[fault] += bool(rules)
-    rows = [(fault, f"{named[fault] / config.sets:.2f}", f"{by_rules[fault] / config.sets:.2f}") for fault in named]
-    return table(["fault", "named by content", "anything suspicious by rules"], rows)
+    rows = [["fault", "named by content", "anything suspicious by rules"]]
+    rows += [[fault, f"{named[fault] / config.sets:.2f}", f"{by_rules[fault] / config.sets:.2f}"] for fault in named]
+    return "\n".join(table(rows))
 
 
 def _densities(config: ContentConfig, names: list[str]) -> tuple[dict[str, Tensor], dict[str, tuple[int, int]]]:

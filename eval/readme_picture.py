@@ -42,7 +42,8 @@ def _make_film(path: Path) -> None:
     view = Image.new("RGB", (_FILM_WIDTH, round(height * scale)))
     frames = []
     for number, (look, so_far) in enumerate(zip(record.looks, records, strict=True), 1):
-        window = tuple(round(edge) for edge in look.region)
+        left, top, right, bottom = (round(edge) for edge in look.region)
+        window = (left, top, right, bottom)
         _show_window(view, picture, window, agent.eye.detector.input_size, scale)
         frames.append(_film_frame(view, window, so_far.objects.boxes * scale, number, scale))
     times = [_SECONDS_A_LOOK] * len(frames)
@@ -55,7 +56,11 @@ def _make_film(path: Path) -> None:
 
 
 def _show_window(
-    view: Image.Image, picture: Image.Image, window: tuple[int, ...], input_size: tuple[int, int], scale: float
+    view: Image.Image,
+    picture: Image.Image,
+    window: tuple[int, int, int, int],
+    input_size: tuple[int, int],
+    scale: float,
 ) -> None:
     """Paste a window of the picture into a view of it, as sharp as the detector has seen it."""
     left, top, right, bottom = (round(edge * scale) for edge in window)
@@ -65,7 +70,9 @@ def _show_window(
     view.paste(seen.resize((right - left, bottom - top), Image.Resampling.BICUBIC), (left, top))
 
 
-def _film_frame(view: Image.Image, window: tuple[int, ...], boxes: Tensor, number: int, scale: float) -> Image.Image:
+def _film_frame(
+    view: Image.Image, window: tuple[int, int, int, int], boxes: Tensor, number: int, scale: float
+) -> Image.Image:
     """One frame of the film: the view, the window that is looked at, the people found so far, and their number."""
     frame = Image.new("RGB", (view.width, view.height + _CAPTION), "white")
     frame.paste(view)

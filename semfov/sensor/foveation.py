@@ -8,7 +8,7 @@ of a large image without its finest band (`_foveate_large`).
 
 from collections.abc import Iterator, Mapping
 from numbers import Real
-from typing import Any, get_args
+from typing import Any, TypeGuard, get_args
 
 import numpy as np
 import torch
@@ -242,7 +242,7 @@ def _bands(images: Tensor | Bands, levels: int, convention: Convention) -> Bands
     return images if isinstance(images, Bands) else laplacian_pyramid(images, levels, convention)
 
 
-def _is_single_picture(image: ImageLike | Bands) -> bool:
+def _is_single_picture(image: ImageLike | Bands) -> TypeGuard[ImageLike]:
     """Tell whether this is one picture of a common type, not a batch or its pyramid."""
     if isinstance(image, Bands):
         return False
