@@ -22,7 +22,7 @@ from semfov.sensor.pyramid import Convention
 
 
 @dataclass(frozen=True)
-class Window:
+class FovealWindow:
     """A Gaussian window of a band for G fixations of B images: weights of columns `(B, G, 1, w)`, rows `(B, G, 1, h)`.
 
     A Gaussian is separable: the weight of a pixel is that of its column times that of its row.
@@ -86,7 +86,7 @@ class Fovea:
 
     def windows(
         self, sizes: tuple[tuple[int, int], ...], convention: Convention, dtype: torch.dtype
-    ) -> tuple[Window, ...]:
+    ) -> tuple[FovealWindow, ...]:
         r"""Compute the windows :math:`w_k(x, y) = \exp(-((x - x_0)^2 + (y - y_0)^2) / 2 \sigma_k^2)` of all bands.
 
         Args:
@@ -106,7 +106,7 @@ class Fovea:
         weights = ((lattice.place - centre) / width).square().mul(-0.5).exp().to(dtype)[:, :, None]
         lengths = [length for height, width in sizes for length in (width, height)]
         lines = weights.split(lengths, -1)
-        return tuple(Window(columns, rows) for columns, rows in zip(lines[0::2], lines[1::2], strict=True))
+        return tuple(FovealWindow(columns, rows) for columns, rows in zip(lines[0::2], lines[1::2], strict=True))
 
 
 @dataclass(frozen=True, eq=False)

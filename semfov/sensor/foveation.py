@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor
-from semfov.sensor.fovea import Fovea, Window
+from semfov.sensor.fovea import Fovea, FovealWindow
 from semfov.sensor.lines import difference, empty
 from semfov.sensor.pyramid import Bands, Convention, expand, expanding, laplacian_pyramid, reduce, widened
 from semfov.threads import one_thread_if_small
@@ -113,7 +113,7 @@ def _reconstruct(bands: Bands, fovea: Fovea, into: Tensor | None = None) -> Tens
     return _collapse(bands, windows, into)
 
 
-def _collapse(bands: Bands, windows: tuple[Window, ...], into: Tensor | None = None) -> Tensor:
+def _collapse(bands: Bands, windows: tuple[FovealWindow, ...], into: Tensor | None = None) -> Tensor:
     """Compute `views = w_k L_k + expand(views)` from the coarsest band to the finest, into `into` if it is given."""
     views = bands.base[:, None]  # all fixations share the coarsest level
     for k in reversed(range(len(windows))):
