@@ -32,7 +32,7 @@ from semfov.head import Speeds
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
 from semfov.zoom.closer import USUAL_WINDOW, PhotographPlaces
-from semfov.zoom.eye import _WIDE_BORDER
+from semfov.zoom.eye import _PHOTOGRAPH_BORDER
 from tests.test_house_rules import MOST_LINES
 
 ROOT = Path(__file__).parents[1]
@@ -133,7 +133,7 @@ KNOWN = {
         f"confidence of {FAINT}": "code",
         f"candidates of {PhotographPlaces.least}": "code",
         f"window is {USUAL_WINDOW[0]} times as long": "code",
-        f"within {_WIDE_BORDER:g} canvas px": "code",
+        f"within {_PHOTOGRAPH_BORDER:g} canvas px": "code",
         "up to 831 px on the longer side for an input of 416 px": "twice the input, less one",
         "2,048 pixels for each byte of its files, or 16.8 million": "code",
         "1.6 MB": "of a belief over the cells that the sentence counts",

@@ -1,46 +1,29 @@
 """The part of an agent that looks by a fovea: its searches and explorations of photographs, and its streams."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from semfov.agents.episode import EpisodeLimits, on_cpu
-from semfov.agents.fovea_episode import FoveaEpisode, FoveaStream, GazePlan
-from semfov.belief import Grid, Verification
+from semfov.agents.fovea_episode import FoveaEpisode, FoveaStream, GazeParts, GazePlan
+from semfov.belief import Grid
 from semfov.belief.observers import LearnedMap
 from semfov.belief.observers.any_of import TargetLike
 from semfov.decision.stopping import AtDetection, AtGoal, LittleGain, StoppingCriterion
 from semfov.errors import InputError, check, check_finite, check_shape, check_whole
-from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
 from semfov.paths import GazePrediction, Scanpath
 from semfov.settings import ExploreSettings, FindSettings, LookSettings, SearchSettings, StreamSettings
-from semfov.strategy import Strategy
 
 _WORTH = 0.1  # default for the least gain of a look by a learned map, in cells that are classified correctly
 RATE = 2.5  # default rate at which the belief fades in a stream, per second
 _CONFIRM = 0.5  # default for the score of a detection that ends a search without thresholds
 
 
-@dataclass(frozen=True)
-class FoveaAgent:
-    """The parts of an agent that moves its gaze over a photograph.
-
-    Attributes:
-        eye: sensor and detector.
-        searching: observer and policy for a search.
-        exploring: observer and policy for an exploration.
-        verification: model of closer looks; None for none.
-        cells: number of columns and of rows of the belief.
-    """
-
-    eye: Eye
-    searching: Strategy
-    exploring: Strategy
-    verification: Verification | None
-    cells: tuple[int, int]
+class FoveaAgent(GazeParts):
+    """The part of an agent that moves its gaze over a photograph."""
 
     def search(self, image: Tensor, target: TargetLike, settings: SearchSettings) -> Scanpath:
         """Search a photograph for a target, and decide whether it is there (`ActivePerception.search`).

@@ -7,8 +7,7 @@ looks at a photograph, whose record is a `Scanpath`; `FoveaStream` has the look 
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import torch
 from numpy.typing import ArrayLike
@@ -26,6 +25,7 @@ from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, LiveLooks, Step, rollout
 from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import InputError, check, check_whole
+from semfov.eye import Eye
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
 from semfov.motion import Motion
@@ -37,10 +37,26 @@ from semfov.sensor.glimpse import window_around
 from semfov.settings import DecisionSettings, Start
 from semfov.strategy import Strategy
 
-if TYPE_CHECKING:
-    from semfov.agents.fovea import FoveaAgent
-
 _LONGEST = 640  # longer side of the frames that records keep, in pixels
+
+
+@dataclass(frozen=True)
+class GazeParts:
+    """The parts of an agent that moves its gaze over a photograph.
+
+    Attributes:
+        eye: sensor and detector.
+        searching: observer and policy for a search.
+        exploring: observer and policy for an exploration.
+        verification: model of closer looks; None for none.
+        cells: number of columns and of rows of the belief.
+    """
+
+    eye: Eye
+    searching: Strategy
+    exploring: Strategy
+    verification: Verification | None
+    cells: tuple[int, int]
 
 
 class GazePlan:
@@ -66,7 +82,7 @@ class GazePlan:
 
     def __init__(
         self,
-        agent: "FoveaAgent",
+        agent: GazeParts,
         target: int | None = None,
         *,
         strategy: Strategy | None = None,
