@@ -150,7 +150,10 @@ def more(folder: Path) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
     episode = looks, Semantic(3), Uniform(), torch.tensor([4]), Given(torch.tensor([[0, 7, 9]]))
     person = Fixations("a.jpg", "1", path.fixations.numpy(), (64, 48))
     image = small.rand(3, 48, 64)
+    viewed = [Fixations(f"{number}", "1", small.rand(9, 2).numpy() * 40, (64, 48)) for number in range(5)]
+    densities = {record.picture: small.rand(6, 8) for record in viewed}
     return {name: (arguments, options) for name, (arguments, options, _) in calls(path).items()} | {
+        "content_suspicions": ((viewed, densities, dict.fromkeys(densities, (64, 48))), {}),
         "animate": ((path, folder / "film.gif"), {"image": image, "views": [image] * 3}),
         "as_image": ((image,), {}),
         "compare_scanpath": ((path, [person, person]), {}),

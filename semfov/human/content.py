@@ -198,7 +198,7 @@ def _particular_densities(names: Sequence[str], densities: Mapping[str, Tensor])
         density = densities[name]
         check(density.ndim == 2, "densities", "a map (rows, columns) for each picture", tuple(density.shape))
         uniform = 1 / density.numel()
-        bits = (density.double() / uniform).log2().clamp(min=_FAINTEST)
+        bits = (density.detach().cpu().double() / uniform).log2().clamp(min=_FAINTEST)
         logs.append(interpolate(bits[None, None], size=(_SIDE, _SIDE), mode="bilinear")[0, 0])
     stacked = torch.stack(logs)
     others = (stacked.sum(0) - stacked) / (len(logs) - 1)
