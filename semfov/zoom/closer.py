@@ -126,13 +126,13 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         return self.prior.place(self._look.hit_chance, self._look.presence)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
-        """The most evident box, if it is as likely as what is found, or at the end probable enough."""
+        """Take the most evident box, if it is as likely as what is found, or at the end probable enough."""
         place = self._most_evident()
         least = thresholds.place if last else self.likely
         return None if place is None or place.probability < least else place
 
     def _most_evident(self) -> CandidatePlace | None:
-        """The box with the highest faded score that is of no examined place; None if there is none."""
+        """Find the box with the highest faded score that is of no examined place; None if there is none."""
         boxes, scores = self._boxes()
         if self._examined:
             scores = scores.masked_fill(self._are_examined(boxes), 0)
@@ -217,7 +217,7 @@ class PhotographPlaces(CandidateBoxes):
         return -1.0 if place is None else self._hit_chance_at(place)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
-        """The most evident place, if the chance of a hit there is worth a pass."""
+        """Take the most evident place, if the chance of a hit there is worth a pass."""
         place = self._most_evident()
         return None if place is None or self._hit_chance_at(place) < thresholds.give_up else place
 
