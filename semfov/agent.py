@@ -536,6 +536,7 @@ class ActivePerception(nn.Module):
         give_up: float | None = None,
         closer: int | None = None,
         prior: float | None = None,
+        least: float | None = None,
         color: Color = "rgb",
         white: White | None = None,
     ) -> LivePerception:
@@ -562,6 +563,7 @@ class ActivePerception(nn.Module):
             give_up=give_up,
             closer=closer,
             prior=prior,
+            least=least,
             color=color,
         )
         classes = class_numbers(target, self.classes[1:], "target")

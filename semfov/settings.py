@@ -8,7 +8,7 @@ the kind of look and the models of the agent.
     SearchSettings         x                x                 x            boxes
     FindSettings           x                                               worth, least, batch
     ExploreSettings        x                x                              worth, least, policy
-    StreamSettings                          x                 x            how, rate, color
+    StreamSettings                          x                 x            how, rate, least, color
 """
 
 import re
@@ -235,6 +235,8 @@ class StreamSettings(DecisionSettings, StartSettings):
         closer: largest number of closer looks in the time until half of the evidence has faded (None: 2 for a fovea, 3
             for windows of small frames, as many as there are frames for those of large ones); 0: none.
         prior: how often the target is there: the share of the frames that hold it (None: half of them).
+        least: probability from which on an object counts in windows (None: 0.5); with a lower one a tracker or a curve
+            of precision over recall gets fainter objects, too.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
     Raises:
@@ -246,6 +248,7 @@ class StreamSettings(DecisionSettings, StartSettings):
 
     how: How = "auto"
     rate: Rate | None = None
+    least: Probability | None = None
     color: Color = "rgb"
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import semfov
 from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
@@ -276,3 +277,13 @@ def test_a_moment_keeps_the_bytes_of_its_frame_also_where_the_next_one_takes_its
     moment = live.step(frame)
     frame *= 0
     assert torch.equal(moment.photograph, pixels)
+
+
+def test_fainter_objects_are_listed_from_the_probability_that_is_asked_for():
+    agent = ActivePerception.recommended()
+    frame = semfov.example("sheet")
+    usual = agent.live(["person"]).step(frame)
+    fainter = agent.live(["person"], least=0.05).step(frame)
+    shown = usual.candidates.scores
+    assert len(fainter.objects) == int((shown >= 0.05).sum()) > len(usual.objects) == int((shown >= 0.5).sum())
+    refused("least: expected None for a fovea, or how='windows', got 0.05", agent.live, how="fovea", least=0.05)

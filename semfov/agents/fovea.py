@@ -116,7 +116,11 @@ class FoveaAgent(GazeParts):
 
         Returns:
             The episode, to which frames are given.
+
+        Raises:
+            InputError: a setting is for windows alone.
         """
+        check(settings.least is None, "least", "None for a fovea, or how='windows'", settings.least)
         rate = RATE if settings.rate is None else settings.rate
         plan = GazePlan(self, target, start=settings.start, seed=settings.seed, decisions=settings, rate=rate)
         return FoveaStream(plan, settings.color)

@@ -236,5 +236,5 @@ class ZoomAgent(nn.Module):
         """
         settings = StreamSettings() if settings is None else settings
         rate = RATE if settings.rate is None else settings.rate
-        task = self.task(target, targets, decisions=settings)
+        task = self.task(target, targets, decisions=settings, least=settings.least)
         return WindowStream(task, self.eye, rate, color=settings.color, follows=follows)
