@@ -259,7 +259,14 @@ class Scanpath(_CellRecord):
         return self.stimulus.views(self.fixations)
 
     def fixation_after(self, number: int) -> int:
-        """Count to the last fixation up to a look, from 0: the index of the tensors of the fixations."""
+        """Count to the last fixation up to a look, from 0: the index of the tensors of the fixations.
+
+        Args:
+            number: number of the look; negative ones count from the end.
+
+        Returns:
+            The number of the fixation.
+        """
         return sum(not look.is_closer for look in self.looks[: number % len(self.looks) + 1]) - 1
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:

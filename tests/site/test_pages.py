@@ -137,7 +137,7 @@ def test_formulas_are_converted_in_tables_and_other_dollars_are_not():
 
 
 def test_names_commands_and_links_that_do_not_exist_are_refused(names, tmp_path):
-    for name in ["semfov.MissModel", "semfov.sensor.fovea", "semfov.Foveation.close"]:
+    for name in ["semfov.MissModel", "semfov.sensor.retina", "semfov.Foveation.close"]:
         with pytest.raises(LookupError, match="does not exist"):
             names.link(f"see `{name}`")
     with pytest.raises(ValueError, match="foo"):

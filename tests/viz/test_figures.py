@@ -121,8 +121,8 @@ def test_figures_use_the_photograph_that_the_scanpath_kept(scanpath, image):
 def test_the_legend_names_the_source_of_each_kind_of_box(scanpath, image):
     decision = Decision("found", 0.9, 11, torch.tensor([50.0, 40, 70, 55]))
     other = Detections(torch.tensor([[[0.0, 0, 9, 9]]]), torch.tensor([[[0.5, 0.1, 0.4]]]), torch.ones(1, 1).bool())
-    looks = (other, *scanpath.detections[1:])
-    sought = replace(scanpath, decision=decision, ending="decision", detections=looks)
+    looks = (replace(scanpath.looks[0], detections=other), *scanpath.looks[1:])
+    sought = replace(scanpath, decision=decision, ending="decision", looks=looks)
     (axes,) = draw(plot_scanpath(sought, image, boxes=torch.tensor([[60.0, 45, 79, 59]]))).axes
     entries = {
         text.get_text(): line
@@ -269,9 +269,8 @@ def test_titles_and_labels_are_inside_the_figure(scanpath, image):
     corner = Detections(
         torch.tensor([[[70.0, 50, 80, 60]]]), torch.tensor([[[0.1, 0.2, 0.7]]]), torch.ones(1, 1).bool()
     )
-    long = replace(
-        scanpath, detections=(corner, *scanpath.detections[1:]), classes=("background", "cup", "traffic " * 12)
-    )
+    looks = (replace(scanpath.looks[0], detections=corner), *scanpath.looks[1:])
+    long = replace(scanpath, looks=looks, classes=("background", "cup", "traffic " * 12))
     figure = plot_scanpath(replace(long, target=2), image)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
