@@ -11,9 +11,10 @@ try:
 except ImportError:
     raise DataError('semfov.envs needs Gymnasium: pip install "semfov[envs]"') from None
 
-from semfov.envs.environment import EpisodeEnv, GazeEnv, GazeExplore, GazeSearch, GazeVectorEnv, ZoomEnv
+from semfov.envs.environment import EpisodeEnv, GazeEnv, GazeExplore, GazeSearch, ZoomEnv
 from semfov.envs.registration import register
 from semfov.envs.scenery import open_scenery, open_zoom_scenery
+from semfov.envs.vector import GazeVectorEnv
 
 register()
 

@@ -1,7 +1,13 @@
-"""Gazes that move from cell to cell: searches and explorations with a fovea."""
+"""Gazes that move from cell to cell: searches and explorations with a fovea.
 
-from collections.abc import Callable, Sequence
-from typing import Any
+All looks that an episode can make are stored, so that a gaze shift reads a row of a table:
+
+     scene ──first entered──► stored looks ──weighed by the observer──► table of evidence ──row + cell──► belief
+                                           └──────────────────────────► table of detections ──row + cell──► infos
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,13 +18,15 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.detection.detections import Detections
-from semfov.envs.gazes import Gazes
-from semfov.envs.scenery import Scenery
+from semfov.envs.gazes import Gazes, GazeSettings, scene_number
+from semfov.envs.scenery import CellEpisode, Scenery
 from semfov.episode import EpisodeLook, Looks, StoredLooks
 from semfov.episode.loop import attend
 from semfov.episode.memory import Memory
 from semfov.episode.stopwatch import Stopwatch
-from semfov.errors import check, check_whole
+from semfov.errors import InputError, check
+from semfov.fit.protocols import Exploration, Trial
+from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import right_cells
 from semfov.paths import Scanpath
 from semfov.paths.stimulus import Stimulus, reduced_copy
@@ -29,115 +37,189 @@ from semfov.viz.look import plot_fixation
 _FIRST = torch.tensor([0])
 
 
+class _FirstRows(NamedTuple):
+    """Rows at which a scene begins: in the table of evidence, and in the table of detections."""
+
+    evidence: int
+    detections: int
+
+
 class _SceneLooks(Looks):
-    """Stored looks (`semfov.episode.StoredLooks`) in several scenes; each is opened when an episode first enters it."""
+    """Stored looks (`semfov.episode.StoredLooks`) in several scenes; each is opened when an episode first enters it.
+
+    Both tables hold the scenes one after another, as they were entered: the evidence with X·Y rows for each target of a
+    scene, the detections with X·Y rows for each scene.
+
+    Private attributes: `_scenes` has the looks of each scene that was entered, and `_first_rows` where they begin.
+    `_evidence` and `_detections` are the tables; None until a look needs them after another scene was entered.
+    `_evidence_row` and `_detections_row` `(B,)` have, for each episode, the rows of the look from cell 0.
+    """
 
     def __init__(self, open_scene: Callable[[int], StoredLooks], observer: Observer, episodes: int) -> None:
-        self._open, self._observer = open_scene, observer
+        self._open = open_scene
+        self._observer = observer
         self._scenes: dict[int, StoredLooks] = {}
-        self._starts: dict[int, tuple[int, int]] = {}
-        self._table: Look | None = None
-        self._every_look: Detections | None = None
-        # For each episode, the rows of the look from cell 0: in the table, and in the detections.
-        self._row, self._place = torch.zeros(2, episodes, dtype=torch.int64)
+        self._first_rows: dict[int, _FirstRows] = {}
+        self._evidence: Look | None = None
+        self._detections: Detections | None = None
+        self._evidence_row = torch.zeros(episodes, dtype=torch.int64)
+        self._detections_row = torch.zeros(episodes, dtype=torch.int64)
 
     def enter(self, episodes: Tensor, scenes: Sequence[int], targets: Tensor | None) -> None:
-        """Move episodes to other scenes; episodes `(n,)`, targets `(n,)`."""
+        """Move episodes to other scenes.
+
+        Args:
+            episodes: `(n,)`, numbers of the episodes.
+            scenes: n numbers of scenes.
+            targets: `(n,)`, classes 1..K that the episodes search for; None for explorations.
+        """
         for scene in scenes:
-            if scene in self._scenes:
-                continue
-            stored = self._open(scene)
-            if not self._scenes:
-                self.grid, self.like = stored.grid, stored.like
-            before = sum(each.rows(self._observer) for each in self._scenes.values())
-            self._starts[scene] = before, len(self._scenes) * len(self.grid)
-            self._scenes[scene], self._table, self._every_look = stored, None, None
-        rows = []
+            if scene not in self._scenes:
+                self._append(scene)
+        evidence_rows = []
         for number, scene in enumerate(scenes):
             target = None if targets is None else targets[number]
-            rows.append(self._starts[scene][0] + int(self._scenes[scene].first_row(self._observer, target)))
-        self._row[episodes] = torch.tensor(rows)
-        self._place[episodes] = torch.tensor([self._starts[scene][1] for scene in scenes])
+            target_row = int(self._scenes[scene].first_row(self._observer, target))
+            evidence_rows.append(self._first_rows[scene].evidence + target_row)
+        self._evidence_row[episodes] = torch.tensor(evidence_rows)
+        self._detections_row[episodes] = torch.tensor([self._first_rows[scene].detections for scene in scenes])
+
+    def _append(self, scene: int) -> None:
+        """Open the looks at a scene, behind those of all other scenes."""
+        looks = self._open(scene)
+        if not self._scenes:
+            self.grid = looks.grid
+            self.like = looks.like
+        evidence_rows = sum(entered.rows(self._observer) for entered in self._scenes.values())
+        self._first_rows[scene] = _FirstRows(evidence_rows, len(self._scenes) * len(self.grid))
+        self._scenes[scene] = looks
+        self._evidence = None
+        self._detections = None
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
-        """Read the looks at the cells from the table; the fixations are the centres of the cells."""
+        """Read the looks at the cells from the tables; the fixations are the centres of the cells."""
         watch = Stopwatch()
-        if self._table is None:
-            tables = [stored.weighed(self._observer) for stored in self._scenes.values()]
-            self._table = tables[0] if len(tables) == 1 else type(tables[0]).join(tables)
-        look = self._table[self._row[episodes] + cell]
+        evidence = self._evidence_table()[self._evidence_row[episodes] + cell]
         watch.lap("weigh")
-        place = self._place[episodes] + cell
-        return EpisodeLook(look, lambda: self._detections()[place], watch.seconds)
+        rows = self._detections_row[episodes] + cell
+        return EpisodeLook(evidence, lambda: self._detections_table()[rows], watch.seconds)
 
-    def _detections(self) -> Detections:
-        if self._every_look is None:
-            self._every_look = Detections.stack([stored.detections for stored in self._scenes.values()])
-        return self._every_look
+    def _evidence_table(self) -> Look:
+        """Weigh the looks of all scenes that were entered."""
+        if self._evidence is None:
+            tables = [looks.weighed(self._observer) for looks in self._scenes.values()]
+            self._evidence = tables[0] if len(tables) == 1 else type(tables[0]).join(tables)
+        return self._evidence
+
+    def _detections_table(self) -> Detections:
+        """Stack the detections of all scenes that were entered."""
+        if self._detections is None:
+            self._detections = Detections.stack([looks.detections for looks in self._scenes.values()])
+        return self._detections
 
 
-class CellGazes(Gazes):
-    """Episodes with a fovea that moves from cell to cell, each in a scene of its own, until a find or all cells."""
+class CellGazes(Gazes[CellEpisode]):
+    """Episodes with a fovea that moves from cell to cell, each in a scene of its own, until a find or all cells.
+
+    Args:
+        scenery: the scenes.
+        task: `search` or `exploration`.
+        settings: cost and reward of looks, and what observations contain.
+        count: B, the number of episodes.
+        together: whether learned beliefs of all episodes are computed at once.
+        pictures: whether the looks of the first episode are kept, so that they can be drawn.
+
+    Attributes:
+        observer: keeps the belief.
+        looks: the looks at the scenes of the episodes.
+        memory: the belief of all rows, and the cells that they have fixated.
+        cell: `(B,)`, the fixated cells.
+        size: `(B, 2)`, width and height of the scenes in pixels.
+
+    Private attributes: `_right` has the cells of each row's goal, `(B, X·Y)` boolean, in explorations the right classes
+    of all cells, `(B, X·Y, C)`. `_trace` has the looks of the first episode, None without pictures, and `_stimulus` its
+    scene, None until it is drawn.
+    """
 
     coordinates = 2
+    action_space: spaces.Discrete
     scenery: Scenery
     memory: Memory
 
-    def __init__(self, scenery: Scenery, task: str, count: int = 1, *, together: bool = False, **options: Any) -> None:
-        cells = scenery.shape[0] * scenery.shape[1]
-        maps = () if task == "search" else (len(scenery.classes),)
+    def __init__(
+        self,
+        scenery: Scenery,
+        task: Task,
+        settings: GazeSettings,
+        count: int = 1,
+        *,
+        together: bool = False,
+        pictures: bool = False,
+    ) -> None:
+        rows, columns = scenery.shape
+        cells = rows * columns
+        # A search has one plane of belief, of its target; an exploration has one of each class.
+        classes = () if task == "search" else (len(scenery.classes),)
+        belief_planes = 1 if task == "search" else len(scenery.classes)
         self.action_space = spaces.Discrete(cells)
-        self.belief_space = spaces.Box(0, 1, (sum(maps or (1,)) + 2, *scenery.shape), np.float32)
-        super().__init__(scenery, task, count, **options)
+        # Two more planes have the fixated cells and the cell of the gaze.
+        self.belief_space = spaces.Box(0, 1, (belief_planes + 2, rows, columns), np.float32)
+        super().__init__(scenery, task, settings, count)
+        self.pictures = pictures
         self.observer: Observer = scenery.together if together else scenery.observer
         self.looks = _SceneLooks(scenery.open, self.observer, count)
         self.cell = torch.zeros(count, dtype=torch.int64)
         self.size = torch.zeros(count, 2)
-        # The cells of the goal, or the right classes of all cells.
-        self._right = torch.zeros(count, cells, *maps, dtype=torch.bool)
-        self._trace: Trace | None = None  # of the first episode, where its pictures are wanted
+        self._right = torch.zeros(count, cells, *classes, dtype=torch.bool)
+        self._trace: Trace | None = None
         self._stimulus: Stimulus | None = None
 
-    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
-        unknown, scenery = options.keys() - {"episode", "scene"}, self.scenery
+    def choose(self, random: np.random.Generator, options: Mapping[str, object]) -> CellEpisode:
+        unknown = options.keys() - {"episode", "scene"}
         check(not unknown, "options", "episode or scene", ", ".join(sorted(unknown)))
         if "episode" in options:
-            scene = getattr(options["episode"], "scene", None)
-            fits = isinstance(scene, int) and 0 <= scene < len(scenery.pictures)
-            check(fits, "episode", f"one of {type(scenery).__name__}.episodes", repr(options["episode"]))
-            return options["episode"]
+            return self._checked_episode(options["episode"])
         if "scene" not in options:
-            return scenery.draw(random)
-        scene = options["scene"]
-        check_whole(scene, "scene", 0, len(scenery.pictures) - 1)
-        episodes = scenery.episodes(int(scene))
+            return self.scenery.draw(random)
+        scene = scene_number(options["scene"], self.scenery)
+        episodes = self.scenery.episodes(scene)
         check(len(episodes) > 0, "scene", "a scene with objects to look for", scene)
         return episodes[random.integers(len(episodes))]
 
-    def action(self, action: Any) -> Tensor:
+    def _checked_episode(self, episode: object) -> CellEpisode:
+        """Check that an option of a reset is an episode of the task in one of the scenes."""
+        kind = Trial if self.searching else Exploration
+        if isinstance(episode, kind) and 0 <= episode.scene < len(self.scenery.pictures):
+            return episode
+        raise InputError(f"episode: expected one of {type(self.scenery).__name__}.episodes, got {episode!r}")
+
+    def action(self, action: object) -> Tensor:
         expected = f"a whole number from 0 to {int(self.action_space.n) - 1}"
         check(self.action_space.contains(action), "action", expected, repr(action))
-        return torch.tensor([int(action)])
+        return torch.from_numpy(np.asarray(action, dtype=np.int64).reshape(1))
 
     @torch.inference_mode()
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """Planes of probabilities, of the fixated cells and of the cell of the gaze, `(n, C+2, Y, X)`."""
-        visited, belief = self.memory.visited[rows], self._all_or(rows)
-        here = torch.zeros_like(visited).scatter(1, self.cell[rows, None], True)
+        visited = self.memory.visited[rows]
+        belief = self._belief_of(rows)
+        gaze = torch.zeros_like(visited).scatter(1, self.cell[rows, None], True)
         if self.searching:  # if no fixated cell holds the target
             maps = belief.chance(self.targets[rows]).masked_fill(visited, 0.0)[:, None]
         else:
             maps = belief.class_probabilities().mT
-        more = torch.stack([visited, here], 1).float()
-        return torch.cat([maps.float().clamp(0, 1), more], 1).numpy().reshape(len(rows), -1, *self.scenery.shape)
+        cell_planes = torch.stack([visited, gaze], 1).float()
+        planes = torch.cat([maps.float().clamp(0, 1), cell_planes], 1)
+        return planes.numpy().reshape(len(rows), -1, *self.scenery.shape)
 
     def places(self, rows: Tensor) -> Tensor:
+        """Compute the centres of the fixated cells, `(n, 2)`, x and y as fractions of width and height."""
         lines, columns = self.scenery.shape
         cell = self.cell[rows]
         return torch.stack([(cell % columns + 0.5) / columns, (cell // columns + 0.5) / lines], -1)
 
     def points(self, rows: Tensor) -> Tensor:
-        """Fixated points `(n, 2)` in pixels of the scenes."""
+        """Compute the fixated points, `(n, 2)` in pixels of the scenes."""
         return self.places(rows) * self.size[rows] - 0.5
 
     def mask(self, rows: Tensor) -> NDArray[np.bool_]:
@@ -148,10 +230,12 @@ class CellGazes(Gazes):
 
     def draw(self) -> NDArray[np.uint8]:
         """Picture of the last look of the first episode: the scanpath, the foveated view, and the belief."""
-        scenery, episode, boxes = self.scenery, self.episodes[0], None
+        scenery = self.scenery
+        episode = self.episodes[0]
         if self._stimulus is None:
             self._stimulus = Stimulus.of(scenery.eye, scenery.image(episode.scene))
-        if self.searching:
+        boxes = None
+        if isinstance(episode, Trial):
             objects = scenery.annotation(episode.scene)
             boxes = objects.boxes[objects.labels == episode.target]
         path = self.scanpath()
@@ -165,67 +249,93 @@ class CellGazes(Gazes):
         with torch.inference_mode():
             return self._trace.scanpath()
 
-    def _new_trace(self) -> Trace:
-        """Make the trace of the first episode, before its first look."""
-        episode = self.episodes[0]
-        grid, classes = self.scenery.grid(episode.scene), self.scenery.classes
-        if not self.searching:
-            return Trace(grid, classes, None, None)
-        # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
-        return Trace(grid, classes, episode.cue, Semantic(len(classes)))
-
     @torch.inference_mode()
-    def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
+    def begin(self, rows: Tensor, episodes: Sequence[CellEpisode]) -> None:
         super().begin(rows, episodes)
         scenes = [episode.scene for episode in episodes]
         if self.searching:
-            self.targets[rows] = torch.tensor([episode.cue for episode in episodes])
-            goal = torch.zeros(len(rows), self._right.shape[1], dtype=torch.bool)
-            for number, episode in enumerate(episodes):
-                goal[number, list(episode.goal)] = True
-            self._right[rows] = goal
+            trials = [episode for episode in episodes if isinstance(episode, Trial)]
+            self.targets[rows] = torch.tensor([trial.cue for trial in trials])
+            self._right[rows] = _goals(trials, self._right.shape[1])
         else:
             self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])
         self.looks.enter(rows, scenes, self.targets[rows] if self.searching else None)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
         self.cell[rows] = torch.tensor([episode.start for episode in episodes])
-        self._trace = self._new_trace() if self.pictures else None
         self._stimulus = None
-        self._see(rows, rows, Memory.empty(self.looks, self.observer, len(rows)))
+        self._trace = self._new_trace() if self.pictures else None
+        self._see(rows, Memory.empty(self.looks, self.observer, len(rows)))
+        self._rate(rows)
+        self._extend_trace()
 
     @torch.inference_mode()
     def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
-        fresh = ~self.memory.visited[rows, actions]
         self.cell[rows] = actions
-        new = rows[fresh]
-        self._see(rows, new, self.memory if len(new) == len(self.episodes) else self.memory[new])
+        # A cell that was fixated before tells nothing new.
+        new = rows[~self.memory.visited[rows, actions]]
+        if len(new):
+            self._see(new, self.memory if self._are_all(new) else self.memory[new])
+        self._rate(rows)
+        self._extend_trace()
         return self.result[rows] == 1 if self.searching else self.memory.visited[rows].all(-1)
 
-    def _see(self, rows: Tensor, new: Tensor, memory: Memory) -> None:
-        """Look in the rows `new`, whose state is `memory`, rate all rows, and keep the last look of the first one."""
-        if len(new):
-            memory = attend(self.looks, self.observer, memory, new, self.cell[new], self.points(new))[1]
-            self.memory = memory if len(new) == len(self.episodes) else self.memory.put(new, memory)
+    def _see(self, rows: Tensor, memory: Memory) -> None:
+        """Make one look in each of the rows `(n,)`, whose state before it is `memory`."""
+        _, memory = attend(self.looks, self.observer, memory, rows, self.cell[rows], self.points(rows))
+        self.memory = memory if self._are_all(rows) else self.memory.put(rows, memory)
+
+    def _rate(self, rows: Tensor) -> None:
+        """Compare the gaze of the rows `(n,)` with their goals, or their maps with the right classes."""
         right = self._right[rows]
         if self.searching:
             self.result[rows] = right[torch.arange(len(rows)), self.cell[rows]].float()
         else:
-            hits = right_cells(self._all_or(rows).class_probabilities(), right).sum(-1)
+            hits = right_cells(self._belief_of(rows).class_probabilities(), right).sum(-1)
             self.result[rows] = hits / right.any(-1).sum(-1)
-        if self._trace is not None:
-            # Actions are chosen without values, and stored looks have no times.
-            values = torch.zeros(1, self.memory.visited.shape[1])
-            self._trace.fixate(
-                self.cell[:1].clone(), self.points(_FIRST), self.detections(_FIRST), self._all_or(_FIRST), values, {}
-            )
+
+    def _new_trace(self) -> Trace:
+        """Make the trace of the first episode, before its first look."""
+        episode = self.episodes[0]
+        grid = self.scenery.grid(episode.scene)
+        classes = self.scenery.classes
+        if not isinstance(episode, Trial):
+            return Trace(grid, classes, None, None)
+        # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
+        return Trace(grid, classes, episode.cue, Semantic(len(classes)))
+
+    def _extend_trace(self) -> None:
+        """Keep the last look of the first episode, where its pictures are wanted."""
+        if self._trace is None:
+            return
+        # Actions are chosen without values, and stored looks have no times.
+        values = torch.zeros(1, self.memory.visited.shape[1])
+        cell = self.cell[:1].clone()
+        self._trace.fixate(
+            cell, self.points(_FIRST), self.detections(_FIRST), self._belief_of(_FIRST), values, stages={}
+        )
 
     def _view(self, row: int) -> Tensor:
         view = self.scenery.view(self.episodes[row].scene)
         left, top = view.placement.offset
-        wide, high = (round(n * s) for n, s in zip(view.placement.size, view.placement.scale, strict=True))
-        point = self.points(torch.tensor([row]))
-        return self.scenery.eye.pictures(view, point)[..., top : top + high, left : left + wide]
+        # The part of the detector's canvas that the scene fills.
+        width, height = (
+            round(size * scale) for size, scale in zip(view.placement.size, view.placement.scale, strict=True)
+        )
+        canvas = self.scenery.eye.pictures(view, self.points(torch.tensor([row])))
+        return canvas[..., top : top + height, left : left + width]
 
-    def _all_or(self, rows: Tensor) -> Belief:
+    def _belief_of(self, rows: Tensor) -> Belief:
         """Take the belief of some rows, without a copy where these are all."""
-        return self.memory.belief if len(rows) == len(self.episodes) else self.memory.belief[rows]
+        return self.memory.belief if self._are_all(rows) else self.memory.belief[rows]
+
+    def _are_all(self, rows: Tensor) -> bool:
+        """Whether rows are all rows, so that their state needs no copy."""
+        return len(rows) == self.count
+
+
+def _goals(trials: Sequence[Trial], cells: int) -> Tensor:
+    """Mark the cells of the goal of each search, `(n, X·Y)` boolean."""
+    goals = torch.zeros(len(trials), cells, dtype=torch.bool)
+    for number, trial in enumerate(trials):
+        goals[number, list(trial.goal)] = True
+    return goals

@@ -1,8 +1,9 @@
 """Batches of episodes that environments step through: starts, gaze shifts, observations and rewards."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -14,84 +15,184 @@ from torch.nn.functional import interpolate
 from semfov.detection.detections import Detections
 from semfov.envs.scenery import Scenery, ZoomScenery
 from semfov.errors import check, check_number, check_whole
+from semfov.gaze.acquisition.base import Task
 
 Arrays = dict[str, Any]
+"""Arrays by name, or dictionaries of them, as Gymnasium takes observations and infos."""
 
-_PRICES = {"search": 0.05, "exploration": 0.01}  # cost of a look by default, for each task
+_PRICES: dict[Task, float] = {"search": 0.05, "exploration": 0.01}  # cost of a look by default
 
 
-class Gazes(ABC):
-    """A batch of B episodes; `result` `(B,)` is 1 once the target is found, or the fraction that is right or found."""
+@dataclass(frozen=True)
+class GazeSettings:
+    """What looks cost and bring, and what observations contain.
+
+    Args:
+        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        find: reward for finding the target, or for a complete result.
+        belief: whether observations contain the belief.
+        glimpse: side in pixels of the image that observations contain; None leaves it out.
+
+    Raises:
+        InputError: a price, a reward or a side is out of range.
+    """
+
+    price: float | None = None
+    find: float = 1.0
+    belief: bool = False
+    glimpse: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.price is not None:
+            check_number(self.price, "price", 0, 1e9)
+        check_number(self.find, "find", 0, 1e9)
+        if self.glimpse is not None:
+            check_whole(self.glimpse, "glimpse", 1, 4096)
+
+
+class _InScene(Protocol):
+    """An episode in one of the scenes."""
+
+    @property
+    def scene(self) -> int:
+        """Number of the scene."""
+
+
+_Episode = TypeVar("_Episode", bound=_InScene)
+
+
+class Outcome(NamedTuple):
+    """What a step of n episodes brings.
+
+    Attributes:
+        reward: `(n,)`.
+        terminated: `(n,)` boolean, whether the task is done.
+        truncated: `(n,)` boolean, whether the task is not done, and the looks are used up.
+    """
+
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+
+
+class Gazes(ABC, Generic[_Episode]):
+    """A batch of B episodes, each in a row of its own.
+
+    Invariant: `episodes` is empty before the first start, which starts all rows; from then on every row has an episode
+    with at least one look, and all other attributes are those after its last look.
+
+    Args:
+        scenery: the scenes.
+        task: `search` or `exploration`.
+        settings: cost and reward of looks, and what observations contain.
+        count: B.
+
+    Attributes:
+        episodes: the episodes of the rows.
+        targets: `(B,)`, class 1..K that each row searches for; 0 in explorations.
+        shift: `(B,)`, number of gaze shifts so far.
+        result: `(B,)`, 1 once the target is found, or the fraction of the map that is right, or of the objects that are
+            found.
+        price: cost of a look.
+        find: reward for an increase of `result` by 1.
+    """
 
     coordinates: ClassVar[int]
     """Number of coordinates of a gaze."""
 
-    action_space: Any
+    action_space: spaces.Space[Any]
     """Space of the actions of one episode."""
 
     belief_space: spaces.Box
     """Space of `planes` of one episode."""
 
-    def __init__(
-        self,
-        scenery: Scenery | ZoomScenery,
-        task: str,
-        count: int = 1,
-        *,
-        price: float | None = None,
-        find: float = 1.0,
-        belief: bool = False,
-        glimpse: int | None = None,
-        pictures: bool = False,
-    ) -> None:
-        price = _PRICES[task] if price is None else price
-        check_number(price, "price", 0, 1e9)
-        check_number(find, "find", 0, 1e9)
-        self.scenery, self.price, self.find, self.pictures = scenery, price, find, pictures
+    def __init__(self, scenery: Scenery | ZoomScenery, task: Task, settings: GazeSettings, count: int = 1) -> None:
+        self.scenery = scenery
+        self.task = task
         self.searching = task == "search"
-        self._side, self._begun = glimpse, False
-        self.episodes: list[Any] = [None] * count
-        self.targets, self.shift = torch.zeros(2, count, dtype=torch.int64)
+        self.price = _PRICES[task] if settings.price is None else settings.price
+        self.find = settings.find
+        self.count = count
+        self.episodes: list[_Episode] = []
+        self.targets = torch.zeros(count, dtype=torch.int64)
+        self.shift = torch.zeros(count, dtype=torch.int64)
         self.result = torch.zeros(count)
+        self._side = settings.glimpse
         entries: dict[str, spaces.Space[Any]] = {
             "gaze": spaces.Box(0, 1, (self.coordinates,), np.float32),
             "target": spaces.Discrete(len(scenery.classes)),
             "step": spaces.Discrete(scenery.shifts + 1),
         }
-        if belief:
+        if settings.belief:
             entries["belief"] = self.belief_space
-        if glimpse is not None:
-            check_whole(glimpse, "glimpse", 1, 4096)
-            entries["glimpse"] = spaces.Box(0, 255, (glimpse, glimpse, 3), np.uint8)
+        if settings.glimpse is not None:
+            entries["glimpse"] = spaces.Box(0, 255, (settings.glimpse, settings.glimpse, 3), np.uint8)
         self.observation_space = spaces.Dict(entries)
 
     @abstractmethod
-    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> Any:
+    def choose(self, random: np.random.Generator, options: Mapping[str, object]) -> _Episode:
         """Choose the episode that the options of a reset ask for, or one at random."""
 
     @abstractmethod
-    def action(self, action: Any) -> Tensor:
+    def action(self, action: object) -> Tensor:
         """Check the action of a single episode; returns a batch of one."""
 
-    def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Start episodes in the rows `(n,)`; a kind of gazes sets the targets, makes the first looks and rates them."""
-        every = self._begun or len(rows) == len(self.episodes)
-        check(every, "rows", f"all {len(self.episodes)} rows at the first start", rows.tolist())
+    def start(self, rows: Tensor, randoms: Sequence[np.random.Generator], options: Mapping[str, object]) -> None:
+        """Choose an episode for each of the rows, and start it.
+
+        Args:
+            rows: `(n,)`.
+            randoms: n generators, from which episodes are drawn.
+            options: options of the reset.
+
+        Raises:
+            InputError: an option is unknown, or no episode has it.
+        """
+        self.begin(rows, [self.choose(random, options) for random in randoms])
+
+    def begin(self, rows: Tensor, episodes: Sequence[_Episode]) -> None:
+        """Start given episodes; a kind of gazes sets the targets, makes the first looks and rates them.
+
+        Args:
+            rows: `(n,)`; at the first start all rows.
+            episodes: n episodes.
+
+        Raises:
+            InputError: the first start leaves out a row.
+        """
+        if not self.episodes:
+            check(len(rows) == self.count, "rows", f"all {self.count} rows at the first start", rows.tolist())
+            self.episodes = list(episodes)
         for row, episode in zip(rows.tolist(), episodes, strict=True):
             self.episodes[row] = episode
-        self.shift[rows], self._begun = 0, True
+        self.shift[rows] = 0
 
-    def move(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Move the gaze of the rows `(n,)`, and look; reward, terminated and truncated, each `(n,)`."""
+    def move(self, rows: Tensor, actions: Tensor) -> Outcome:
+        """Move the gaze of some rows, and look.
+
+        Args:
+            rows: `(n,)`.
+            actions: `(n, ...)`, as `action` gives them.
+
+        Returns:
+            The outcome of the step.
+        """
         self.shift[rows] += 1
-        before = self.result[rows]
-        over = self._look(rows, actions)
-        gain = self.result[rows] - before
-        truncated = ~over & (self.shift[rows] >= self.scenery.shifts)
-        return self.find * gain.double() - self.price, over, truncated
+        result_before = self.result[rows]
+        done = self._look(rows, actions)
+        gain = self.result[rows] - result_before
+        truncated = ~done & (self.shift[rows] >= self.scenery.shifts)
+        return Outcome(self.find * gain.double() - self.price, done, truncated)
 
     def observe(self, rows: Tensor) -> Arrays:
-        """Observations of the rows `(n,)`, each array `(n, ...)`."""
+        """Observe some rows.
+
+        Args:
+            rows: `(n,)`.
+
+        Returns:
+            The observations, each array `(n, ...)`.
+        """
         entries: Arrays = {
             "gaze": self.places(rows).float().numpy(),
             "target": self.targets[rows].numpy(),
@@ -100,15 +201,27 @@ class Gazes(ABC):
         if "belief" in self.observation_space.spaces:
             entries["belief"] = self.planes(rows)
         if self._side is not None:
-            with torch.inference_mode():
-                size = self._side, self._side
-                views = [interpolate(self._view(row), size, mode="bilinear", antialias=True) for row in rows.tolist()]
-                pixels = torch.cat(views).clamp(0, 1).mul(255).round().byte().permute(0, 2, 3, 1)
-            entries["glimpse"] = np.ascontiguousarray(pixels.numpy())
+            entries["glimpse"] = self._glimpses(rows, self._side)
         return entries
 
+    @torch.inference_mode()
+    def _glimpses(self, rows: Tensor, side: int) -> NDArray[np.uint8]:
+        """Show what the eye sees in the rows `(n,)`, `(n, side, side, 3)`."""
+        # Scenes have sizes of their own, so that each view is resized alone.
+        views = [interpolate(self._view(row), (side, side), mode="bilinear", antialias=True) for row in rows.tolist()]
+        pixels = torch.cat(views).clamp(0, 1).mul(255).round().byte().permute(0, 2, 3, 1)
+        return np.ascontiguousarray(pixels.numpy())
+
     def infos(self, rows: Tensor, *, detections: bool = True) -> Arrays:
-        """Infos of the rows `(n,)`, each array `(n, ...)`."""
+        """Tell what a learner may use beside the observations of some rows.
+
+        Args:
+            rows: `(n,)`.
+            detections: whether the detections of the present looks are among the infos.
+
+        Returns:
+            The infos, each array `(n, ...)`.
+        """
         passes = self.shift[rows] + 1
         entries: Arrays = {
             "passes": passes.numpy(),
@@ -118,15 +231,8 @@ class Gazes(ABC):
             "scene": np.array([self.episodes[row].scene for row in rows.tolist()]),
         }
         if detections:
-            # Padded to the largest number that the detector gives: Gymnasium requires infos of constant shape.
-            seen = self.detections(rows)
-            limit, count = max(self.scenery.eye.detector.selection.limit, seen.mask.shape[1]), seen.mask.shape[1]
-            entries["detections"] = {
-                name: np.zeros((len(rows), limit, *each.shape[2:]), bool if name == "mask" else np.float32)
-                for name, each in (("boxes", seen.boxes), ("scores", seen.scores), ("mask", seen.mask))
-            }
-            for name, array in entries["detections"].items():
-                array[:, :count] = getattr(seen, name).numpy()
+            # Gymnasium requires infos of constant shape: as many rows as the detector can give.
+            entries["detections"] = _padded(self.detections(rows), self.scenery.eye.detector.selection.limit)
         return entries
 
     @abstractmethod
@@ -156,3 +262,38 @@ class Gazes(ABC):
     @abstractmethod
     def _view(self, row: int) -> Tensor:
         """Show the image that the eye sees in a row, `(1, 3, h, w)`."""
+
+
+def check_options_of_reset(options: object) -> None:
+    """Raise `InputError` unless the options of a reset are a dictionary, or None."""
+    check(options is None or isinstance(options, Mapping), "options", "a dictionary", f"a {type(options).__name__}")
+
+
+def scene_number(value: object, scenery: Scenery | ZoomScenery) -> int:
+    """Check the number of a scene that an option of a reset asks for.
+
+    Args:
+        value: the option.
+        scenery: the scenes.
+
+    Returns:
+        The number.
+
+    Raises:
+        InputError: there is no such scene.
+    """
+    check_whole(value, "scene", 0, len(scenery.pictures) - 1)
+    return int(np.asarray(value))
+
+
+def _padded(detections: Detections, limit: int) -> dict[str, NDArray[np.generic]]:
+    """Convert n sets of detections to arrays `(n, limit, ...)`, which end in zeros; longer sets are kept whole."""
+    arrays = {"boxes": detections.boxes, "scores": detections.scores, "mask": detections.mask}
+    count = detections.mask.shape[1]
+    padded: dict[str, NDArray[np.generic]] = {}
+    for name, values in arrays.items():
+        sizes = (len(values), max(limit, count), *values.shape[2:])
+        array = np.zeros(sizes, bool if name == "mask" else np.float32)
+        array[:, :count] = values.numpy()
+        padded[name] = array
+    return padded

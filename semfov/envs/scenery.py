@@ -1,11 +1,12 @@
 """The parts that environments share: scenes, the eye that looks at them, and the belief about them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, lru_cache, partial
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -20,9 +21,10 @@ from semfov.data.pictures import Pictures
 from semfov.data.sources import PHOTOGRAPHS
 from semfov.detection.objects import LEAST
 from semfov.episode import StoredLooks
-from semfov.errors import DataError, InputError, check, check_whole
+from semfov.errors import DataError, InputError, check, check_options, check_whole
+from semfov.eye import Eye, View
 from semfov.fit.policy_looking import PolicyLooking
-from semfov.fit.protocols import Trial, episodes_of, explorations_of
+from semfov.fit.protocols import Exploration, Trial, episodes_of, explorations_of
 from semfov.fit.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
@@ -36,30 +38,58 @@ from semfov.runs.config import (
     SensorConfig,
 )
 from semfov.sensor.named import SensorName
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.objects import merge
+
+CellEpisode = Trial | Exploration
+"""An episode whose actions are cells."""
 
 _Source = Scenes | str | Path | None  # scenes of any kind, or a folder of photographs; None for the embedded scenes
 
 _Targets = Sequence[str | int] | None
 
+_Eye = TypeVar("_Eye", bound=Eye | WindowEye)
+
 _VIEWS = 16  # number of pictures that are kept open for glimpses
 
+_DRAWS = 1000  # number of pictures that are drawn in search of one with objects to look for
 
-class _Surroundings:
-    """What environments of all kinds share: scenes, and an eye that looks at them, `shifts` times after the first."""
 
-    def __init__(self, looking: Any, shifts: int, targets: _Targets, opened: partial[Any]) -> None:
-        self.pictures, self.eye, self.shifts, self.opened = looking.scenes, looking.eye, shifts, opened
-        classes, names = self.pictures.classes, self.eye.detector.classes
-        check(classes == names, "scenes", "the classes of the detector", f"{len(classes)} others")
-        self.classes, self.pixels = ("background", *names), math.prod(self.eye.detector.input_size)
-        self._chosen = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
+class _Surroundings(Generic[_Eye]):
+    """Scenes, and an eye that looks at them: what environments of all kinds share.
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    Args:
+        pictures: the scenes.
+        eye: looks at them; its detector has their classes.
+        shifts: largest number of looks of an episode after the first one.
+        targets: classes to search for, by name or index; None takes all that a scene allows.
+        reopen: opens the same scenes again, in another process.
+
+    Attributes:
+        classes: names of the classes, background first.
+        pixels: number of pixels that the detector gets in a look.
+
+    Private attribute: `_chosen` has the indices of `targets`, in ascending order.
+    """
+
+    def __init__(
+        self, pictures: Scenes, eye: _Eye, shifts: int, targets: _Targets, reopen: Callable[[], object]
+    ) -> None:
+        names = eye.detector.classes
+        check(pictures.classes == names, "scenes", "the classes of the detector", f"{len(pictures.classes)} others")
+        self.pictures = pictures
+        self.eye = eye
+        self.shifts = shifts
+        self.reopen = reopen
+        self.classes = ("background", *names)
+        self.pixels = math.prod(eye.detector.input_size)
+        self._chosen = None if targets is None else sorted({class_index(name, names, "targets") for name in targets})
+
+    def __reduce__(self) -> tuple[Callable[[], object], tuple[()]]:
         """Tell pickle that a copy opens the same scenes again."""
-        return self.opened, ()
+        return self.reopen, ()
 
     def image(self, scene: int) -> Tensor:
         """Pixels of a scene, `(3, H, W)`."""
@@ -67,39 +97,68 @@ class _Surroundings:
 
     def targets(self, scene: int) -> list[int]:
         """Classes that a scene may be searched for."""
-        return [each for each in self.pictures.targets(scene) if self._chosen is None or each in self._chosen]
+        targets = self.pictures.targets(scene)
+        if self._chosen is None:
+            return targets
+        return [target for target in targets if target in self._chosen]
 
 
-class Scenery(_Surroundings):
-    """Scenes, an eye and a belief that environments share; the looks at a scene that is entered are kept on disk."""
+class Scenery(_Surroundings[Eye]):
+    """Scenes, an eye and a belief that environments share; the looks at a scene that is entered are kept on disk.
 
-    def __init__(self, looking: PolicyLooking, targets: _Targets, opened: partial[Any]) -> None:
-        super().__init__(looking, looking.config.protocol.shifts, targets, opened)
+    Args:
+        looking: the looks at the scenes, and the policy.
+        targets: classes to search for, by name or index; None takes all that a scene allows.
+        reopen: opens the same scenes again, in another process.
+
+    Attributes:
+        policy: label of the policy, which determines the belief.
+        protocol: starts of the episodes, and the largest number of shifts.
+        shape: numbers of rows and columns of the cells.
+        observer: keeps the belief.
+        together: keeps beliefs of all episodes of a batch at once: faster, but its rounding depends on the batch.
+        scenes: numbers of the scenes with objects to look for.
+        episodes: lists all episodes of a scene.
+        grid: lays the cells over a scene.
+        answers: tells the right classes of the cells of a scene, `(X·Y, C)` boolean.
+        open: opens the stored looks at a scene.
+        view: opens a scene for the eye.
+
+    Raises:
+        DataError: no scene has objects to look for.
+    """
+
+    def __init__(self, looking: PolicyLooking, targets: _Targets, reopen: Callable[[], object]) -> None:
+        self.protocol = looking.config.protocol
+        super().__init__(looking.scenes, looking.eye, self.protocol.shifts, targets, reopen)
         self._looking = looking
         self.policy = next(iter(looking.policies))
-        belief, self.protocol = looking.config.belief, looking.config.protocol
-        self.shape, self.annotation = (belief.rows, belief.columns), self.pictures.annotation
+        self.shape = (looking.config.belief.rows, looking.config.belief.columns)
+        self.annotation = self.pictures.annotation
         self.observer: Observer = looking.strategies[self.policy].observer
-        searching = looking.task == "search"
-        labels = self.targets if searching else lambda scene: self.annotation(scene).labels.tolist()
-        self.scenes = [scene for scene in range(len(self.pictures)) if labels(scene)]
-        # Results are kept for as long as an environment uses this scenery.
-        self.episodes = cache(self._list)
-        self.grid = cache(looking.grid)
-        self.answers = cache(lambda scene: answers_of(self.annotation(scene), self.grid(scene), len(self.classes)))
-        self.open = cache(self._open)
-        # The observer that computes a batch at once: faster, but its rounding depends on the batch.
         self.together = self.observer
         if isinstance(self.observer, Target | LearnedMap):
             self.together = type(self.observer)(self.observer.model, together=True)  # type: ignore[arg-type]
-        self.view = lru_cache(_VIEWS)(lambda scene: self.eye.open(self.image(scene)[None]))
+        # Results are kept for as long as an environment uses this scenery.
+        self.episodes = cache(self._list)
+        self.grid = cache(looking.grid)
+        self.answers = cache(self._answers)
+        self.open = cache(self._open)
+        self.view = lru_cache(_VIEWS)(self._view)
+        self.scenes = [scene for scene in range(len(self.pictures)) if self._has_objects(scene)]
         if not any(self.episodes(scene) for scene in self.scenes):
             raise DataError(
                 "scenes: expected at least one with objects to look for, got none; change scenes or targets"
             )
 
-    def _list(self, scene: int) -> list[Any]:
-        """All episodes of a scene: its searches or explorations, with the starts that the protocol draws."""
+    def _has_objects(self, scene: int) -> bool:
+        """Whether a scene may be searched, or has anything to explore."""
+        if self._looking.task == "search":
+            return len(self.targets(scene)) > 0
+        return len(self.annotation(scene).labels) > 0
+
+    def _list(self, scene: int) -> list[CellEpisode]:
+        """List all episodes of a scene: its searches or explorations, with the starts that the protocol draws."""
         rows, columns = self.shape
         if self._looking.task == "search":
             return list(episodes_of(self.pictures, scene, columns, rows, self.protocol, self.targets(scene)))
@@ -107,30 +166,50 @@ class Scenery(_Surroundings):
             return []
         return list(explorations_of(self.pictures, scene, columns * rows, self.protocol))
 
-    def draw(self, random: np.random.Generator) -> Any:
-        """Draw an episode: all scenes are equally likely, and so are all episodes of a scene."""
-        while True:
-            episodes = self.episodes(self.scenes[random.integers(len(self.scenes))])
-            if episodes:
-                return episodes[random.integers(len(episodes))]
+    def _answers(self, scene: int) -> Tensor:
+        return answers_of(self.annotation(scene), self.grid(scene), len(self.classes))
 
     def _open(self, scene: int) -> StoredLooks:
         cues = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Trial)})
         targets = torch.tensor(cues) if cues else None
         return StoredLooks(self._looking.detections(scene), self.grid(scene), targets)
 
+    def _view(self, scene: int) -> View:
+        return self.eye.open(self.image(scene)[None])
+
+    def draw(self, random: np.random.Generator) -> CellEpisode:
+        """Draw an episode: all scenes are equally likely, and so are all episodes of a scene."""
+        # A scene with objects may have no episode, as where a target lies in every cell. One scene at least has some.
+        while True:
+            episodes = self.episodes(self.scenes[random.integers(len(self.scenes))])
+            if episodes:
+                return episodes[random.integers(len(episodes))]
+
 
 class _SceneLooking(PolicyLooking):
-    """Looks at the scenes of an environment, or at mosaics of them, with so many `tiles` in a row and a column."""
+    """Looks at the scenes of an environment, or at mosaics of them.
 
-    def __init__(self, config: RunConfig, task: Task, scenes: _Source, mosaics: int, tiles: tuple[int, int]) -> None:
-        self.task, self._chosen, self._mosaics, self._tiles = task, scenes, mosaics, tiles
+    Private attributes: `_source` is where the scenes are from. `_mosaics` is the number of mosaics, 0 for the scenes as
+    they are, and `_tiles` the numbers of scenes in a row and in a column of one.
+    """
+
+    def __init__(self, config: RunConfig, task: Task, source: _Source, mosaics: int, tiles: tuple[int, int]) -> None:
+        self.task = task
+        self._source = source
+        self._mosaics = mosaics
+        self._tiles = tiles
         super().__init__(config)
 
     def open_scenes(self) -> Scenes:
-        given, seed = self._chosen, self.config.data.scene_seed
-        scenes = super().open_scenes() if given is None or isinstance(given, str | Path) else given
-        return Mosaics(scenes, *self._tiles, count=self._mosaics, seed=seed) if self._mosaics else scenes
+        if self._source is None or isinstance(self._source, str | Path):
+            return self._composed(super().open_scenes())
+        return self._composed(self._source)
+
+    def _composed(self, scenes: Scenes) -> Scenes:
+        """Compose mosaics of scenes, where they are wanted."""
+        if not self._mosaics:
+            return scenes
+        return Mosaics(scenes, *self._tiles, count=self._mosaics, seed=self.config.data.scene_seed)
 
 
 def open_scenery(
@@ -190,36 +269,57 @@ def open_scenery(
         scenery = open_scenery("search", "photographs/", "instances.json", targets=["cat", "cup"])
         envs = [GazeSearch(scenery, belief=True) for _ in range(4)]
     """
-    arguments = {**locals()}
+    # The first statement, so that the arguments are the only variables.
+    reopen = partial(open_scenery, **locals())
     check(task in ("search", "exploration"), "task", "'search' or 'exploration'", repr(task))
     check_whole(mosaics, "mosaics", 0, 1_000_000)
-    kind = scenes is None or isinstance(scenes, str | Path) or hasattr(scenes, "__len__")
-    check(kind, "scenes", "a folder or `Scenes` (count= says how many)", scenes)
+    is_source = scenes is None or isinstance(scenes, str | Path) or hasattr(scenes, "__len__")
+    check(is_source, "scenes", "a folder or `Scenes` (count= says how many)", scenes)
     check_cells(grid)
     if config is None:
         folder = Path(scenes) if isinstance(scenes, str | Path) else None
-        notes = None if annotations is None else Path(annotations)
+        usual_shifts = 30 if task == "search" else 20
         config = RunConfig(
-            data=DataConfig(folder, notes, count, min_instances=0, scene_seed=seed),
-            detector=DetectorConfig(detector, None if weights is None else Path(weights)),
+            data=DataConfig(folder, _path(annotations), count, min_instances=0, scene_seed=seed),
+            detector=DetectorConfig(detector, _path(weights)),
             sensor=SensorConfig(sensor),
             belief=BeliefConfig(columns=grid[0], rows=grid[1]),
-            protocol=ProtocolConfig(starts, shifts or (30 if task == "search" else 20), seed=seed),
+            protocol=ProtocolConfig(starts, shifts or usual_shifts, seed=seed),
             policies=(policy,),
-            cache=None if cache is None else Path(cache),
+            cache=_path(cache),
             store=store,
         )
     check(isinstance(config, RunConfig), "config", "settings of an evaluation", type(config).__name__)
-    looking = _SceneLooking(replace(config, policies=config.policies[:1]), task, scenes, mosaics, tiles)
-    return Scenery(looking, targets, partial(open_scenery, **arguments))
+    # One belief is kept, that of the first policy.
+    config = replace(config, policies=config.policies[:1])
+    return Scenery(_SceneLooking(config, task, scenes, mosaics, tiles), targets, reopen)
 
 
-class ZoomScenery(_Surroundings):
-    """Large pictures and an eye that zooms, which environments can share; `open_zoom_scenery` makes one."""
+def _path(name: str | Path | None) -> Path | None:
+    """Return the path of a file or folder that may be left out."""
+    return None if name is None else Path(name)
 
-    def __init__(self, looking: WindowLooking, passes: int, targets: _Targets, opened: partial[Any]) -> None:
-        super().__init__(looking, passes - 1, targets, opened)
-        self.evidence, self.annotated = looking.evidence, not isinstance(self.pictures, Pictures)
+
+class ZoomScenery(_Surroundings[WindowEye]):
+    """Large pictures and an eye that zooms, which environments can share; `open_zoom_scenery` makes one.
+
+    Args:
+        looking: the looks at the pictures.
+        passes: largest number of looks of an episode, the first one included.
+        targets: classes to search for, by name or index; None takes all that a picture allows.
+        reopen: opens the same pictures again, in another process.
+
+    Attributes:
+        evidence: predicts from a look what closer looks will find.
+        annotated: whether the objects in the pictures are known.
+        looks_at: opens the looks at a picture.
+        episodes: lists the targets of all searches of a picture.
+    """
+
+    def __init__(self, looking: WindowLooking, passes: int, targets: _Targets, reopen: Callable[[], object]) -> None:
+        super().__init__(looking.scenes, looking.eye, passes - 1, targets, reopen)
+        self.evidence = looking.evidence
+        self.annotated = not isinstance(self.pictures, Pictures)
         # Looks are kept for as long as an environment uses this scenery.
         self.looks_at = cache(looking.looks_at)
         self.episodes = cache(self._list)
@@ -227,12 +327,14 @@ class ZoomScenery(_Surroundings):
     @cached_property
     def windows(self) -> int:
         """Largest number of windows of any of the pictures."""
-        pictures, eye = self.pictures, self.eye
+        pictures = self.pictures
         if isinstance(pictures, Pictures):
-            sizes = [open_large(pictures.root / str(name)).size for name in pictures.ids]
+            # The size is in the head of the file, so that no picture is decoded.
+            sizes = {open_large(pictures.root / str(name)).size for name in pictures.ids}
         else:
-            sizes = [pictures.annotation(index).size for index in range(len(pictures))]
-        return max(len(Lattice.over(size, eye.detector.input_size, finest=eye.finest)) for size in set(sizes))
+            sizes = {pictures.annotation(index).size for index in range(len(pictures))}
+        lattices = [Lattice.over(size, self.eye.detector.input_size, finest=self.eye.finest) for size in sizes]
+        return max(len(lattice) for lattice in lattices)
 
     def targets(self, scene: int) -> list[int]:
         if self.annotated:
@@ -242,19 +344,33 @@ class ZoomScenery(_Surroundings):
         return self._chosen
 
     def _list(self, scene: int) -> list[int]:
-        """Targets of all searches of a picture: those that the look at the whole picture does not show already."""
+        """List the targets of a picture's searches: those that the look at the whole picture does not show already."""
         source = self.looks_at(scene)
-        first = source.see([Window.overview(source.lattice)])[0]
-        return [target for target in self.targets(scene) if not self.found([first], scene, target)]
+        overview = source.see([Window.overview(source.lattice)])[0]
+        return [target for target in self.targets(scene) if not self.found([overview], scene, target)]
 
-    def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:
-        for _ in range(1000):
+    def draw(self, random: np.random.Generator, task: Task, scene: int | None = None) -> tuple[int, int]:
+        """Draw an episode.
+
+        Args:
+            random: draws the picture and the target.
+            task: `search` or `exploration`.
+            scene: number of the picture; None draws one with objects to look for.
+
+        Returns:
+            The number of the picture, and the target 1..K; 0 in an exploration.
+
+        Raises:
+            DataError: no picture that was drawn has objects to look for.
+        """
+        for _ in range(_DRAWS):
             picture = int(random.integers(len(self.pictures))) if scene is None else scene
-            if task != "search":
-                if not self.annotated or len(self.pictures.annotation(picture).boxes):
-                    return picture, 0
-            elif targets := self.episodes(picture):
-                return picture, targets[random.integers(len(targets))]
+            if task == "search":
+                targets = self.episodes(picture)
+                if targets:
+                    return picture, targets[random.integers(len(targets))]
+            elif not self.annotated or len(self.pictures.annotation(picture).boxes):
+                return picture, 0
         raise DataError(
             "scenes: expected pictures with objects to look for, found none; give other pictures or targets"
         )
@@ -263,30 +379,36 @@ class ZoomScenery(_Surroundings):
         """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
         if not self.annotated:
             return any(float(look.show[target - 1]) >= LEAST for look in looks)
-        every = self.pictures.annotation(scene)
-        there = every.labels == target
-        objects = Annotation(every.boxes[there], every.labels[there], every.crowd[there], every.size)
+        annotation = self.pictures.annotation(scene)
+        is_target = annotation.labels == target
+        objects = Annotation(
+            annotation.boxes[is_target], annotation.labels[is_target], annotation.crowd[is_target], annotation.size
+        )
         return bool(found_in(looks, objects, target).any())
 
     def share(self, looks: Sequence[WindowLook], scene: int) -> float:
+        """Compute the share of a picture's objects that looks have found; without annotations their number."""
         if not self.annotated:
             return float(len(merge(looks, None, score=LEAST)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
 
 
 class _PictureLooking(WindowLooking):
-    """Given large pictures, or those of a folder without annotations."""
+    """Looks at large pictures, which are given, or in a folder without annotations.
 
-    def __init__(self, config: WindowLookingConfig, scenes: _Source) -> None:
-        self._chosen = scenes
+    Private attribute: `_source` is where the pictures are from.
+    """
+
+    def __init__(self, config: WindowLookingConfig, source: _Source) -> None:
+        self._source = source
         super().__init__(config)
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
-        if self._chosen is not None and not isinstance(self._chosen, str | Path):
-            return self._chosen
-        if self._chosen is None or self.config.data.annotations is not None:
+        if self._source is not None and not isinstance(self._source, str | Path):
+            return self._source
+        if self._source is None or self.config.data.annotations is not None:
             return super().open_scenes(classes)
-        root = Path(self._chosen)
+        root = Path(self._source)
         if not root.is_dir():
             raise DataError(f"scenes: no such folder: {root}; check the path")
         names = [path.name for path in root.iterdir() if path.suffix.lower() in PHOTOGRAPHS]
@@ -340,20 +462,53 @@ def open_zoom_scenery(
         scenery = open_zoom_scenery("aerial/", targets=["person"], detector="yolox-nano")
         env = ZoomEnv("search", scenery, belief=True)
     """
-    arguments = {**locals()}
+    # The first statement, so that the arguments are the only variables.
+    reopen = partial(open_zoom_scenery, **locals())
     check_whole(passes, "passes", 2, 100_000)
     data = DataConfig(limit=count, min_instances=0, max_target_area=None, scene_seed=seed)
     if annotations is not None:
         folder = Path(scenes) if isinstance(scenes, str | Path) else None
+        # Objects that fill more than a fifth of a photograph are no targets of a search.
         data = replace(data, root=folder, annotations=Path(annotations), max_target_area=0.2)
+    if mosaics is None:
+        # Embedded scenes are too small to look at closely.
+        mosaics = 8 if scenes is None else 0
     config = WindowLookingConfig(
         data=data,
-        detector=DetectorConfig(detector, None if weights is None else Path(weights)),
-        mosaics=(8 if scenes is None else 0) if mosaics is None else mosaics,
+        detector=DetectorConfig(detector, _path(weights)),
+        mosaics=mosaics,
         columns=tiles[0],
         rows=tiles[1],
         seed=seed,
-        cache=None if cache is None else Path(cache),
+        cache=_path(cache),
         store=store,
     )
-    return ZoomScenery(_PictureLooking(config, scenes), passes, targets, partial(open_zoom_scenery, **arguments))
+    return ZoomScenery(_PictureLooking(config, scenes), passes, targets, reopen)
+
+
+_Scenery = TypeVar("_Scenery", Scenery, ZoomScenery)
+
+
+def scenery_or_open(
+    scenery: _Scenery | None, opener: Callable[..., _Scenery], options: Mapping[str, object], *task: Task
+) -> _Scenery:
+    """Take the scenery that several environments share, or open one.
+
+    Args:
+        scenery: a scenery that `opener` has opened; None opens one.
+        opener: `open_scenery` or `open_zoom_scenery`.
+        options: arguments of `opener` by name, none beside a scenery.
+        task: first argument of `opener`, if it has one.
+
+    Returns:
+        The scenery.
+
+    Raises:
+        InputError: both a scenery and options are given, or `opener` has no such option.
+    """
+    expected = f"no options of `{opener.__name__}` beside it"
+    check(scenery is None or not options, "scenery", expected, ", ".join(options))
+    is_scenery = scenery is None or hasattr(scenery, "classes")
+    check(is_scenery, "scenery", f"what `{opener.__name__}` makes", f"a {type(scenery).__name__}")
+    check_options(options, signature(opener).parameters.keys() - {"task"}, f"`{opener.__name__}`")
+    return opener(*task, **options) if scenery is None else scenery

@@ -1,7 +1,7 @@
 """Gazes that move from window to window of a large picture: a choice of where to look and how closely."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, SupportsInt
 
 import numpy as np
 import torch
@@ -13,9 +13,11 @@ from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interp
 from semfov.agents.episode import Goal
 from semfov.agents.window_episode import GivenWindows
 from semfov.detection.detections import Detections
-from semfov.envs.gazes import Gazes
+from semfov.envs.gazes import Gazes, GazeSettings, Outcome, scene_number
 from semfov.envs.scenery import ZoomScenery
-from semfov.errors import check, check_whole
+from semfov.errors import InputError, check
+from semfov.fit.zoom_store import StoredWindowLooks
+from semfov.gaze.acquisition.base import Task
 from semfov.viz.animation import render
 from semfov.viz.scanpath import plot_scanpath
 from semfov.zoom.lattice import Lattice
@@ -31,64 +33,108 @@ class _WindowEpisode(NamedTuple):
     target: int
 
 
-class WindowGaze(Gazes):
-    """An episode in a large picture, whose first look is the whole picture; one at a time, as it has its own belief."""
+class WindowGaze(Gazes[_WindowEpisode]):
+    """An episode in a large picture, whose first look is the whole picture; one at a time, as it has its own belief.
+
+    Args:
+        scenery: the pictures.
+        task: `search` or `exploration`.
+        settings: cost and reward of looks, and what observations contain.
+        grid: number of columns and rows of the belief's planes.
+
+    Attributes:
+        shape: numbers of rows and columns of the belief's planes.
+        source: the looks at the picture of the episode.
+        looking: the looks of the episode, and its belief.
+        window: the window of the last look.
+        done: all windows that were looked at.
+
+    Invariant: `source`, `looking` and `window` are there from the first start on, and `done` is empty before it.
+    """
 
     coordinates = 3
+    action_space: spaces.Box
     scenery: ZoomScenery
+    source: StoredWindowLooks
     looking: GivenWindows
+    window: Window
 
-    def __init__(self, scenery: ZoomScenery, task: str, *, grid: tuple[int, int] = (10, 10), **options: Any) -> None:
-        self.task, self.shape = task, (grid[1], grid[0])
+    def __init__(
+        self, scenery: ZoomScenery, task: Task, settings: GazeSettings, grid: tuple[int, int] = (10, 10)
+    ) -> None:
+        columns, rows = grid
+        self.shape = (rows, columns)
         # Place and magnification; a space of this type holds numbers of any other kind.
         self.action_space = spaces.Box(0, 1, (3,), np.float64)
-        self.belief_space = spaces.Box(0, 1, (2, *self.shape), np.float32)
-        super().__init__(scenery, task, **options)
+        self.belief_space = spaces.Box(0, 1, (2, rows, columns), np.float32)
+        super().__init__(scenery, task, settings)
         self.done: set[Window] = set()
 
-    def choose(self, random: np.random.Generator, options: dict[str, Any]) -> _WindowEpisode:
+    def choose(self, random: np.random.Generator, options: Mapping[str, object]) -> _WindowEpisode:
         unknown = [name for name in options if name not in ("scene", "target")]
         check(not unknown, "options", "scene or target", ", ".join(unknown))
-        scene, target = options.get("scene"), options.get("target")
-        if scene is None or target is None:
-            return _WindowEpisode(*self.scenery.draw(random, self.task, scene))
-        check_whole(scene, "scene", 0, len(self.scenery.pictures) - 1)
-        allowed = self.scenery.episodes(int(scene)) if self.task == "search" else [0]
-        check(int(target) in allowed, "target", f"one of {allowed}", int(target))
-        return _WindowEpisode(int(scene), int(target))
+        scene = options.get("scene")
+        target = options.get("target")
+        if scene is None:
+            check(target is None, "target", "a scene to search for it in (scene=)", target)
+            return _WindowEpisode(*self.scenery.draw(random, self.task))
+        number = scene_number(scene, self.scenery)
+        if target is None:
+            return _WindowEpisode(*self.scenery.draw(random, self.task, number))
+        allowed = self.scenery.episodes(number) if self.searching else [0]
+        if isinstance(target, SupportsInt) and int(target) in allowed:
+            return _WindowEpisode(number, int(target))
+        raise InputError(f"target: expected one of {allowed}, got {target}")
 
-    def action(self, action: Any) -> Tensor:
+    def action(self, action: object) -> Tensor:
         try:
             place = np.asarray(action, dtype=np.float64)
         except (ValueError, TypeError):  # it has no numbers
             place = np.empty(0)
-        fits = self.action_space.contains(action if isinstance(action, np.ndarray) else place)
-        check(fits, "action", "(x, y, magnification), each from 0 to 1", repr(action))
+        # The space warns of lists. An array is checked with its own type of numbers.
+        is_action = self.action_space.contains(action if isinstance(action, np.ndarray) else place)
+        check(is_action, "action", "(x, y, magnification), each from 0 to 1", repr(action))
         return torch.from_numpy(place)[None]
 
-    def move(self, rows: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def move(self, rows: Tensor, actions: Tensor) -> Outcome:
         """Look at another window; the looks are stored at the end of an episode."""
-        reward, terminated, truncated = super().move(rows, actions)
-        if terminated or truncated:
+        outcome = super().move(rows, actions)
+        if outcome.terminated or outcome.truncated:
             self.source.save()
-        return reward, terminated, truncated
+        return outcome
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """Lay out the probability that closer looks find an object, and how closely each place was looked at."""
-        lattice, belief = self.source.lattice, self.looking.session.belief
+        probability = 1 - torch.exp(-self._expected_objects())
+        closeness = adaptive_max_pool2d(self._closeness(), self.shape)
+        return torch.cat([probability, closeness]).clamp(0, 1).numpy()[None]
+
+    def _expected_objects(self) -> Tensor:
+        """Compute how many objects a closer look is expected to find in each place of the planes, `(1, Y, X)`."""
+        lattice = self.source.lattice
+        belief = self.looking.session.belief
         assert belief is not None
-        expected = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
-        most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
+        if lattice.levels > 1:
+            by_level = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
+            expected = torch.stack(by_level).amax(0)
+        else:
+            expected = torch.zeros(lattice.rows, lattice.columns)
         # Objects of each place: the mean of its cells times their number.
-        count = adaptive_avg_pool2d(most[None], self.shape) * most.numel() / (self.shape[0] * self.shape[1])
+        rows, columns = self.shape
+        return adaptive_avg_pool2d(expected[None], self.shape) * expected.numel() / (rows * columns)
+
+    def _closeness(self) -> Tensor:
+        """Compute how closely each lattice cell was looked at, `(1, rows, columns)`, 1 at the closest level."""
+        lattice = self.source.lattice
         closeness = torch.zeros(1, lattice.rows, lattice.columns)
         for window in self.done:
             x1, y1, x2, y2 = window.cells
-            closeness[0, y1:y2, x1:x2] = closeness[0, y1:y2, x1:x2].clamp(min=(window.level + 1) / lattice.levels)
-        near = adaptive_max_pool2d(closeness, self.shape)
-        return torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()[None]
+            cells = closeness[0, y1:y2, x1:x2]
+            cells.clamp_(min=(window.level + 1) / lattice.levels)
+        return closeness
 
     def places(self, rows: Tensor) -> Tensor:
+        """Compute the action that looks at the present window, `(1, 3)`."""
         return torch.from_numpy(_action_of(self.source.lattice, self.window))[None]
 
     def mask(self, rows: Tensor) -> NDArray[np.bool_]:
@@ -104,11 +150,12 @@ class WindowGaze(Gazes):
         return next(look for look in self.looking.looks if look.shown.window == self.window).detections
 
     def draw(self) -> NDArray[np.uint8]:
+        """Picture of the windows that were looked at, and of the objects that were found."""
         image = self.scenery.image(self.episodes[0].scene)[None]
-        share = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
-        size = [max(1, round(n * share)) for n in image.shape[-2:]]
-        small = interpolate(image, size, mode="bilinear", antialias=True)[0]
-        return render([plot_scanpath(self.looking.record(), small)])[0]
+        reduction = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
+        size = [max(1, round(side * reduction)) for side in image.shape[-2:]]
+        reduced = interpolate(image, size, mode="bilinear", antialias=True)[0]
+        return render([plot_scanpath(self.looking.record(), reduced)])[0]
 
     def begin(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
         super().begin(rows, episodes)
@@ -130,9 +177,12 @@ class WindowGaze(Gazes):
         if window not in self.done:
             self.looking.look(window)
             self.done.add(window)
-        scene, target = self.episodes[0]
+        episode = self.episodes[0]
         looks = [look.shown for look in self.looking.looks]
-        result = self.scenery.found(looks, scene, target) if target else self.scenery.share(looks, scene)
+        if self.searching:
+            result = float(self.scenery.found(looks, episode.scene, episode.target))
+        else:
+            result = self.scenery.share(looks, episode.scene)
         self.result = torch.tensor([result], dtype=torch.float64)
 
     def _view(self, row: int) -> Tensor:
@@ -142,20 +192,25 @@ class WindowGaze(Gazes):
 
 
 def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
-    """Find the window of the lattice that is nearest to an action."""
-    level = round(float(action[2]) * (lattice.levels - 1))
-    places, pitch, window = lattice.places(level), lattice.pitch, lattice.window(level)
-    column, row = (
-        min(
-            max(round((float(action[axis]) * lattice.size[axis] - window[axis] / 2) / pitch[axis]), 0), places[axis] - 1
-        )
-        for axis in (0, 1)
-    )
+    """Find the window of the lattice that is nearest to an action `(x, y, magnification)`."""
+    x, y, magnification = action.tolist()
+    level = round(magnification * (lattice.levels - 1))
+    column = _nearest_place(lattice, level, 0, x)
+    row = _nearest_place(lattice, level, 1, y)
     return Window.on(lattice, (level, column, row))
+
+
+def _nearest_place(lattice: Lattice, level: int, axis: int, middle: float) -> int:
+    """Find the place of the window whose middle is nearest to one on an axis, a fraction of the picture's side."""
+    low = middle * lattice.size[axis] - lattice.window(level)[axis] / 2
+    place = round(low / lattice.pitch[axis])
+    # At the borders windows lie inside the picture, so that their middles cannot reach it.
+    return min(max(place, 0), lattice.places(level)[axis] - 1)
 
 
 def _action_of(lattice: Lattice, window: Window) -> NDArray[np.float32]:
     """Find the action that looks at a window; → `(x, y, magnification)`."""
     x, y, _ = window.fixation
-    level = window.level / max(lattice.levels - 1, 1)
-    return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)
+    width, height = lattice.size
+    magnification = window.level / max(lattice.levels - 1, 1)
+    return np.clip([(x + 0.5) / width, (y + 0.5) / height, magnification], 0, 1).astype(np.float32)

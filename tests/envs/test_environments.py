@@ -246,7 +246,14 @@ def test_invalid_calls_are_refused(sceneries):
     refused("render_mode: expected 'rgb_array' or None", GazeSearch, scenery, render_mode="human")
     refused("price", GazeSearch, scenery, price=-1.0)
     envs = GazeVectorEnv("search", 2, scenery)
+    refused("step: expected episodes in progress, got none; call reset", envs.step, np.array([0, 1]))
     envs.reset()
+    episodes = scenery.episodes(scenery.scenes[0])[:1] * 2
+    options = {"episodes": episodes, "scene": 0}
+    refused("options: expected no other ones beside episodes, got scene", envs.reset, options=options)
+    exploration = sceneries["exploration"]
+    other_task = exploration.episodes(exploration.scenes[0])[0]
+    refused(r"episode: expected one of Scenery\.episodes", env.reset, options={"episode": other_task})
     refused("actions: expected 2 cells from 0 to 19", envs.step, np.array([0, 20]))
     refused("unknown action 'pixel'", gymnasium.make, _IDS["search"], action="pixel")
 

@@ -189,3 +189,15 @@ def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_
         refused(r"action: expected \(x, y, magnification\), each from 0 to 1", env.step, action)
     twin = pickle.loads(pickle.dumps(env))
     assert env.reset(seed=3)[0]["target"] == twin.reset(seed=3)[0]["target"]
+
+
+def test_options_of_a_reset_and_of_shared_pictures_are_checked(zoom_scenery):
+    """No option is dropped: a target needs its scene, and shared pictures are opened already."""
+    env = ZoomEnv("exploration", zoom_scenery)
+    refused("scene: expected a whole number from 0 to 0", env.reset, options={"scene": 1})
+    refused("target: expected a scene to search for it in", env.reset, options={"target": 0})
+    for target in (1, "person"):
+        refused(r"target: expected one of \[0\]", env.reset, options={"scene": 0, "target": target})
+    make = partial(gymnasium.make_vec, _IDS["exploration"], num_envs=2, action="window")
+    refused("scenery: expected no options of `open_zoom_scenery` beside it", make, scenery=zoom_scenery, count=1)
+    refused("pases: expected an option of `open_zoom_scenery`", make, pases=3)
