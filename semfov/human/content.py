@@ -19,6 +19,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -73,76 +74,84 @@ class _Reading:
     frame_scale: float = 1.0
 
 
-def _as_read(points: _Array, frame: _Array, picture: _Array) -> _Array:
+def _shares_as_read(points: _Array, frame: _Array, picture: _Array) -> _Array:
     """Place the largest picture that fits, with its proportions, in the middle of the frame."""
     scale = (frame / picture).min()
     corner = (frame - scale * picture) / 2
     return np.asarray((points + 0.5 - corner) / (scale * picture))
 
 
-def _y_upwards(points: _Array, frame: _Array, picture: _Array) -> _Array:
-    return _as_read(np.stack([points[:, 0], frame[1] - 1 - points[:, 1]], 1), frame, picture)
+def _shares_y_upwards(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Count y from the lower border of the frame."""
+    return _shares_as_read(np.stack([points[:, 0], frame[1] - 1 - points[:, 1]], 1), frame, picture)
 
 
-def _mirrored(points: _Array, frame: _Array, picture: _Array) -> _Array:
-    return _as_read(np.stack([frame[0] - 1 - points[:, 0], points[:, 1]], 1), frame, picture)
+def _shares_mirrored(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Count x from the right border of the frame."""
+    return _shares_as_read(np.stack([frame[0] - 1 - points[:, 0], points[:, 1]], 1), frame, picture)
 
 
-def _turned(points: _Array, frame: _Array, picture: _Array) -> _Array:
-    return _as_read(frame - 1 - points, frame, picture)
+def _shares_half_turned(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Count both coordinates from the lower right corner of the frame."""
+    return _shares_as_read(frame - 1 - points, frame, picture)
 
 
-def _swapped(points: _Array, frame: _Array, picture: _Array) -> _Array:
-    return _as_read(points[:, ::-1], frame, picture)
+def _shares_swapped(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Take the first coordinate for y."""
+    return _shares_as_read(points[:, ::-1], frame, picture)
 
 
-def _at_own_size(points: _Array, frame: _Array, picture: _Array) -> _Array:
+def _shares_at_own_size(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Place the picture in the middle of the frame, pixel for pixel."""
     return np.asarray((points + 0.5 - (frame - picture) / 2) / picture)
 
 
-def _stretched(points: _Array, frame: _Array, picture: _Array) -> _Array:
+def _shares_stretched(points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Stretch the picture over the whole frame."""
     return np.asarray((points + 0.5) / frame)
 
 
-def _at_size_in_the_middle(part: float) -> _Shares:
+def _shares_at_part(part: float) -> _Shares:
     """Make the map for pictures that filled a part of what they could, in the middle of the frame."""
 
     def shares(points: _Array, frame: _Array, picture: _Array) -> _Array:
-        return np.asarray((_as_read(points, frame, picture) - 0.5) / part + 0.5)
+        return np.asarray((_shares_as_read(points, frame, picture) - 0.5) / part + 0.5)
 
     return shares
 
 
-def _in_a_frame_of(scale: float) -> _Shares:
+def _shares_in_frame(scale: float) -> _Shares:
     """Make the map for points whose frame was larger or smaller than the file says."""
 
     def shares(points: _Array, frame: _Array, picture: _Array) -> _Array:
-        return _as_read(points / scale, frame, picture)
+        return _shares_as_read(points / scale, frame, picture)
 
     return shares
 
 
-_READ = _Reading(_as_read)
+_PRESENT_READING = _Reading(_shares_as_read)
 
 _PARTS = (0.4, 0.5, 0.6, 2 / 3, 0.75, 0.8, 0.85)
 _FRAME_SCALES = (0.4, 0.5, 0.625, 0.75, 0.8, 1.25, 4 / 3, 1.5, 1.6, 1.875, 2.0, 2.4, 2.7)
 
-_OTHERS = (
-    _Reading(_y_upwards, "y ran upwards", "read them with origin='bottom left'"),
-    _Reading(_mirrored, "x ran from right to left", "take the width of the frame less x"),
-    _Reading(_turned, "they were turned by half a circle", "take the size of the frame less x and y"),
-    _Reading(_swapped, "y came before x", "swap the two columns"),
-    _Reading(_at_own_size, "the pictures were shown at their own size", "use in_picture(size, scale=1)"),
-    _Reading(_stretched, "the pictures were stretched over the frame", "use in_picture(size, place=(0, 0, *frame))"),
+_OTHER_READINGS = (
+    _Reading(_shares_y_upwards, "y ran upwards", "read them with origin='bottom left'"),
+    _Reading(_shares_mirrored, "x ran from right to left", "take the width of the frame less x"),
+    _Reading(_shares_half_turned, "they were turned by half a circle", "take the size of the frame less x and y"),
+    _Reading(_shares_swapped, "y came before x", "swap the two columns"),
+    _Reading(_shares_at_own_size, "the pictures were shown at their own size", "use in_picture(size, scale=1)"),
+    _Reading(
+        _shares_stretched, "the pictures were stretched over the frame", "use in_picture(size, place=(0, 0, *frame))"
+    ),
     *(
         _Reading(
-            _at_size_in_the_middle(part),
+            _shares_at_part(part),
             f"the pictures filled about {100 * part:.0f} % of the frame, in the middle",
             "give the place of the picture, in_picture(size, place=…)",
         )
         for part in _PARTS
     ),
-    *(_Reading(_in_a_frame_of(scale), "their frame had another size", frame_scale=scale) for scale in _FRAME_SCALES),
+    *(_Reading(_shares_in_frame(scale), "their frame had another size", frame_scale=scale) for scale in _FRAME_SCALES),
 )
 
 
@@ -175,11 +184,12 @@ def content_suspicions(
     if len(names) < FEWEST_PICTURES or sum(map(len, records)) < _FEWEST_FIXATIONS:
         return []
     evidence = _Evidence(records, {name: sizes[name] for name in names}, _particular_densities(names, densities))
-    moved = _shift_of(evidence, records, "all fixations", _LEAST_SHIFT)
-    read = _better_reading(evidence)
-    if moved or read:
+    shift = _shift_of(evidence, records, "all fixations", _LEAST_SHIFT)
+    reading = _better_reading(evidence)
+    findings = [finding for finding in (shift, reading) if finding is not None]
+    if findings:
         # A shift and another size of the frame look alike where few fixations lie at the borders.
-        return [max((found for found in (moved, read) if found), key=lambda found: found.fit).line]
+        return [max(findings, key=lambda finding: finding.fit).line]
     return _wrong_names(evidence) or _shifts_of_some(evidence)
 
 
@@ -201,9 +211,23 @@ def _particular_densities(names: Sequence[str], densities: Mapping[str, Tensor])
         bits = (density.detach().cpu().double() / uniform).log2().clamp(min=_FAINTEST)
         logs.append(interpolate(bits[None, None], size=(_SIDE, _SIDE), mode="bilinear")[0, 0])
     stacked = torch.stack(logs)
-    others = (stacked.sum(0) - stacked) / (len(logs) - 1)
-    particular = stacked - others
+    mean_of_other_pictures = (stacked.sum(0) - stacked) / (len(logs) - 1)
+    particular = stacked - mean_of_other_pictures
     return {name: particular[number].numpy() for number, name in enumerate(names)}
+
+
+class _BestShift(NamedTuple):
+    """The shift with which records fit best.
+
+    Attributes:
+        shift: `(x, y)` in shares of the sides, `(2,)`.
+        fits_before: the fits `(n,)` in bits of the pictures of these records without it.
+        fits_after: the same with it.
+    """
+
+    shift: _Array
+    fits_before: _Array
+    fits_after: _Array
 
 
 class _Evidence:
@@ -212,6 +236,9 @@ class _Evidence:
     Attributes:
         records: the records of these pictures.
         names: the pictures.
+
+    Private attributes: `_sizes` has `(width, height)` of each picture in pixels, and `_particular` its particular
+    density, `(_SIDE, _SIDE)`.
     """
 
     def __init__(
@@ -226,36 +253,31 @@ class _Evidence:
         """Compute the fit of each picture in bits, `(N,)`."""
         return np.array([self.fit(name, name, reading) for name in self.names])
 
-    def fit(self, name: str, other: str, reading: _Reading) -> float:
-        """Compute the fit of the fixations that are named for one picture in another one."""
+    def fit(self, name: str, picture: str, reading: _Reading) -> float:
+        """Compute the fit of the fixations that are named for one picture in the same or in another one."""
         places = np.concatenate([self.places(record, reading) for record in self.records if record.picture == name])
-        return float(_looked_up(self._particular[other], places).mean())
+        return float(_densities_at(self._particular[picture], places).mean())
 
     def places(self, record: Fixations, reading: _Reading) -> _Array:
         """Places of the fixations of a record in shares of the sides of its picture, `(n, 2)`."""
         frame = np.array(record.size, np.float64)
         return reading.shares(record.points, frame, np.array(self._sizes[record.picture], np.float64))
 
-    def best_shift(self, records: Sequence[Fixations]) -> tuple[_Array, _Array, _Array]:
-        """Find the shift with which some records fit best.
-
-        Returns:
-            The shift `(2,)` in shares of the sides, and the fits `(n,)` of the pictures of these records without it and
-            with it.
-        """
+    def best_shift(self, records: Sequence[Fixations]) -> _BestShift:
+        """Find the shift with which some records fit best, all of them moved alike."""
         by_picture: dict[str, list[_Array]] = defaultdict(list)
         for record in records:
-            by_picture[record.picture].append(self.places(record, _READ))
-        places = {name: np.concatenate(listed) for name, listed in by_picture.items()}
+            by_picture[record.picture].append(self.places(record, _PRESENT_READING))
+        places = {name: np.concatenate(of_records) for name, of_records in by_picture.items()}
         total = sum(_fit_by_shift(self._particular[name], places[name]) for name in places)
         row, column = np.unravel_index(int(np.argmax(total)), np.shape(total))
         shift = (np.array([column, row]) - _REACH) / _SIDE
-        before = [_looked_up(self._particular[name], places[name]).mean() for name in places]
-        after = [_looked_up(self._particular[name], places[name] + shift).mean() for name in places]
-        return shift, np.array(before), np.array(after)
+        before = [_densities_at(self._particular[name], places[name]).mean() for name in places]
+        after = [_densities_at(self._particular[name], places[name] + shift).mean() for name in places]
+        return _BestShift(shift, np.array(before), np.array(after))
 
 
-def _looked_up(particular: _Array, places: _Array) -> _Array:
+def _densities_at(particular: _Array, places: _Array) -> _Array:
     """Take d at places `(n, 2)` in shares of the sides; 0 beyond the picture."""
     cells = np.floor(places * _SIDE).astype(np.int64)
     inside = np.all((cells >= 0) & (cells < _SIDE), axis=1)
@@ -283,14 +305,15 @@ def _is_clear(gains: _Array, least: float) -> bool:
 
 def _better_reading(evidence: _Evidence) -> _Finding | None:
     """Find the reading that fits better than the present one, if one does."""
-    present = evidence.fits(_READ)
-    fits = {reading: evidence.fits(reading) for reading in _OTHERS}
-    best = max(fits, key=lambda reading: fits[reading].mean())
-    if not (_is_clear(fits[best] - present, _LEAST_GAIN) and _is_clear(fits[best], _LEAST_GAIN)):
+    present = evidence.fits(_PRESENT_READING)
+    fits_by_reading = {reading: evidence.fits(reading) for reading in _OTHER_READINGS}
+    best = max(fits_by_reading, key=lambda reading: fits_by_reading[reading].mean())
+    best_fits = fits_by_reading[best]
+    if not (_is_clear(best_fits - present, _LEAST_GAIN) and _is_clear(best_fits, _LEAST_GAIN)):
         return None
     width, height = evidence.records[0].size
     frame = f"give a frame of about {width * best.frame_scale:.0f} × {height * best.frame_scale:.0f}"
-    fit = float(fits[best].mean())
+    fit = float(best_fits.mean())
     line = (
         f"fixations look as if {best.fault}: they fit their pictures by {fit:.2f} bits then, and by "
         f"{present.mean():.2f} as they are read ({best.remedy or frame})"
@@ -301,35 +324,49 @@ def _better_reading(evidence: _Evidence) -> _Finding | None:
 def _wrong_names(evidence: _Evidence) -> list[str]:
     """Find fixations that are named for other pictures than those in which they were made."""
     names = evidence.names
-    own = evidence.fits(_READ)
-    if _is_clear(own, 0.0):
-        return _exchanged(evidence, own)
+    own_fits = evidence.fits(_PRESENT_READING)
+    if _is_clear(own_fits, 0.0):
+        return _exchanged(evidence, own_fits)
+    # Lists of names and of files that are shifted against each other are the usual fault.
     for steps in (1, -1, 2, -2):
-        moved = names[steps:] + names[:steps]
-        gains = np.array([evidence.fit(name, other, _READ) for name, other in zip(names, moved, strict=True)]) - own
-        if _is_clear(gains, _LEAST_GAIN):
+        neighbours = names[steps:] + names[:steps]
+        fits_of_neighbours = [
+            evidence.fit(name, neighbour, _PRESENT_READING) for name, neighbour in zip(names, neighbours, strict=True)
+        ]
+        if _is_clear(np.array(fits_of_neighbours) - own_fits, _LEAST_GAIN):
             side = "after" if steps > 0 else "before"
             return [
                 f"fixations fit the pictures that come {abs(steps)} {side} theirs in alphabetical order: check names"
             ]
     return [
-        f"fixations do not fit the pictures that they are named for ({own.mean():.2f} bits above those of the other "
-        "pictures): are these their pictures, and is the frame right?"
+        f"fixations do not fit the pictures that they are named for ({own_fits.mean():.2f} bits above those of the "
+        "other pictures): are these their pictures, and is the frame right?"
     ]
 
 
-def _exchanged(evidence: _Evidence, own: _Array) -> list[str]:
-    """Find pairs of pictures whose fixations fit each other's picture."""
+def _exchanged(evidence: _Evidence, own_fits: _Array) -> list[str]:
+    """Find pairs of pictures whose fixations fit each other's picture.
+
+    Args:
+        evidence: the fixations of N pictures, and the pictures' densities.
+        own_fits: `(N,)`, the fit of the fixations of each picture in it.
+
+    Returns:
+        A line for each pair.
+    """
     names = evidence.names
-    across = np.array([[evidence.fit(name, other, _READ) for other in names] for name in names])
-    gains = across - own[:, None]
-    found = []
+    # Row i has the fits of the fixations of picture i in all pictures.
+    fits_in_pictures = np.array(
+        [[evidence.fit(name, picture, _PRESENT_READING) for picture in names] for name in names]
+    )
+    gains = fits_in_pictures - own_fits[:, None]
+    lines = []
     for first, second in combinations(range(len(names)), 2):
         both_gain = min(gains[first, second], gains[second, first]) > _EXCHANGED
-        neither_fits = max(own[first], own[second]) < _LEAST_FIT
+        neither_fits = max(own_fits[first], own_fits[second]) < _LEAST_FIT
         if both_gain and neither_fits:
-            found.append(f"the fixations of {names[first]} and {names[second]} fit each other's picture")
-    return found
+            lines.append(f"the fixations of {names[first]} and {names[second]} fit each other's picture")
+    return lines
 
 
 def _shifts_of_some(evidence: _Evidence) -> list[str]:
@@ -337,37 +374,43 @@ def _shifts_of_some(evidence: _Evidence) -> list[str]:
     by_person: dict[str, list[Fixations]] = defaultdict(list)
     for record in evidence.records:
         by_person[record.subject].append(record)
-    found = []
+    findings = []
     if len(by_person) > 1:
-        found = [
+        findings = [
             _shift_of(evidence, records, f"the fixations of person {person}", _LEAST_SHIFT_OF_SOME)
             for person, records in by_person.items()
         ]
-    if not any(found):
+    if not any(findings):
+        # A tracker drifts while a person looks at one picture after the other.
         later = [record for records in by_person.values() for record in records[len(records) // 2 :]]
-        whose = "fixations in the second half of each person's pictures"
-        found = [_shift_of(evidence, later, whose, _LEAST_SHIFT_OF_SOME)]
-    return [finding.line for finding in found if finding]
+        label = "fixations in the second half of each person's pictures"
+        findings = [_shift_of(evidence, later, label, _LEAST_SHIFT_OF_SOME)]
+    return [finding.line for finding in findings if finding is not None]
 
 
-def _shift_of(evidence: _Evidence, records: Sequence[Fixations], whose: str, least: float) -> _Finding | None:
+def _shift_of(evidence: _Evidence, records: Sequence[Fixations], label: str, least_shift: float) -> _Finding | None:
     """Find the shift of some records in pixels of their frame, if they fit better without one.
 
     Args:
         evidence: the densities of the pictures.
         records: the records.
-        whose: what the fixations are called.
-        least: share of a side from which on a shift is told.
+        label: what the fixations are called.
+        least_shift: share of a side from which on a shift is told.
+
+    Returns:
+        The finding; None without a shift that is clear.
     """
     if len({record.picture for record in records}) < FEWEST_PICTURES:
         return None
-    shift, before, after = evidence.best_shift(records)
-    gains = after - before
-    if np.abs(shift).max() < least or not (_is_clear(gains, _LEAST_GAIN / 2) and _is_clear(after, _LEAST_GAIN)):
+    best = evidence.best_shift(records)
+    gains = best.fits_after - best.fits_before
+    is_clear = _is_clear(gains, _LEAST_GAIN / 2) and _is_clear(best.fits_after, _LEAST_GAIN)
+    if np.abs(best.shift).max() < least_shift or not is_clear:
         return None
-    x, y = (-shift * np.array(records[0].size)).round().astype(int).tolist()
+    # What is added to make the fixations fit is what was taken from them.
+    x, y = (-best.shift * np.array(records[0].size)).round().astype(int).tolist()
     line = (
-        f"{whose} lie about ({x}, {y}) px beside what they were made at, and fit by {gains.mean():.2f} bits more "
+        f"{label} lie about ({x}, {y}) px beside what they were made at, and fit by {gains.mean():.2f} bits more "
         "without this shift (a drift of the calibration, or another origin)"
     )
-    return _Finding(line, float(after.mean()))
+    return _Finding(line, float(best.fits_after.mean()))
