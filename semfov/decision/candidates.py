@@ -252,7 +252,7 @@ class CandidateCells(CandidatePlaces[Step]):
             cells = cells.masked_fill(place.cells, 0)
         if not (last or bool(place_known(cells, self._step.visited[0], thresholds.place))):
             return None
-        boxes = torch.cat([seen.detections.boxes[0] for _, seen in self._looks])
+        boxes = torch.cat([look.detections.boxes[0] for _, look in self._looks])
         if not len(boxes):
             return None
         evidence = self._evidence(boxes)
@@ -274,13 +274,13 @@ class CandidateCells(CandidatePlaces[Step]):
         """
         keep = self.forgetting.keep
         faded = [
-            seen.detections.mask[0] * (seen.detections.scores[0, :, self.target] * keep ** (self._now - time))
-            for time, seen in self._looks
+            look.detections.mask[0] * (look.detections.scores[0, :, self.target] * keep ** (self._now - time))
+            for time, look in self._looks
         ]
         scores = torch.cat(faded)
         if self._examined:
             scores = scores * ~self._are_examined(boxes)
-        return scores[:, None] * torch.cat([seen.footprint()[0] for _, seen in self._looks])
+        return scores[:, None] * torch.cat([look.footprint()[0] for _, look in self._looks])
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the search."""

@@ -221,9 +221,9 @@ def check_thresholds(confirm: float | None, give_up: float | None, closer: int |
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
     """Whether a detection over each cell `(B,)` gives `target` at least this score, `(B,)`."""
-    sure = detections.mask & (detections.class_scores[..., target - 1] >= score)
-    there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
-    return (there & sure).any(-1)
+    has_score = detections.mask & (detections.class_scores[..., target - 1] >= score)
+    is_over_cell = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
+    return (is_over_cell & has_score).any(-1)
 
 
 def detects(step: Step, *, grid: Grid, weights: Mapping[int, float], score: float) -> Tensor:

@@ -97,7 +97,10 @@ class LiveLooks(Looks):
     def __init__(
         self, eye: Eye, view: View, grid: Grid, target: int | None = None, *, device: torch.device | None = None
     ) -> None:
-        self.eye, self.view, self.grid, self.target = eye, view, grid, target
+        self.eye = eye
+        self.view = view
+        self.grid = grid
+        self.target = target
         self.like = view.canvas.new_empty(0, device=device)
         self.passed = FRAME
 
@@ -120,6 +123,9 @@ class StoredLooks(Looks):
         grid: the cells.
         targets: `(B,)`, class 1..K that each episode searches for; None for exploration.
 
+    Private attributes: `_weighed` has the looks from all cells as each observer has weighed them, also for other
+    episodes (`of`). `_classes` has the classes of all these episodes, in ascending order.
+
     >>> from semfov.belief.observers import Semantic
     >>> scores = torch.tensor([[[0.9, 0.1]], [[0.2, 0.8]]])  # of one detection from each of two cells
     >>> seen = Detections(torch.tensor([[[6.0, 0, 9, 9]]]).repeat(2, 1, 1), scores, torch.ones(2, 1).bool())
@@ -130,7 +136,9 @@ class StoredLooks(Looks):
     """
 
     def __init__(self, detections: Detections, grid: Grid, targets: Tensor | None = None) -> None:
-        self.detections, self.grid, self.targets = detections, grid, targets
+        self.detections = detections
+        self.grid = grid
+        self.targets = targets
         self.like = detections.scores
         self._weighed: dict[Observer, Look] = {}
         self._classes = [] if targets is None else targets.unique().tolist()

@@ -72,10 +72,10 @@ class Memory:
     @classmethod
     def empty(cls, looks: Looks, observer: Observer, episodes: int) -> "Memory":
         """State before the first look."""
-        cells, device = len(looks.grid), looks.like.device
-        visited = torch.zeros(episodes, cells, dtype=torch.bool, device=device)
-        age = torch.full(visited.shape, torch.inf, device=device)
-        return cls(observer.start(episodes, looks.grid, looks.like), visited, age)
+        belief = observer.start(episodes, looks.grid, looks.like)
+        visited = torch.zeros(episodes, len(looks.grid), dtype=torch.bool, device=looks.like.device)
+        age = torch.full(visited.shape, torch.inf, device=looks.like.device)
+        return cls(belief, visited, age)
 
     def __getitem__(self, index: Tensor) -> "Memory":
         """State of the selected episodes."""
@@ -83,5 +83,7 @@ class Memory:
 
     def put(self, index: Tensor, other: "Memory") -> "Memory":
         """Replace the state of some episodes `(n,)`; both must have had a look."""
-        visited, age = self.visited.index_copy(0, index, other.visited), self.age.index_copy(0, index, other.age)
-        return Memory(self.belief.put(index, other.belief), visited, age)
+        belief = self.belief.put(index, other.belief)
+        visited = self.visited.index_copy(0, index, other.visited)
+        age = self.age.index_copy(0, index, other.age)
+        return Memory(belief, visited, age)

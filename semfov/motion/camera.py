@@ -1,7 +1,7 @@
 """The motion of a camera from frame to frame, estimated from the frames by sparse optical flow.
 
-    key frame ───────── `_moved` ─────────► last frame ── the step ──► present frame
-    `_key`    ─────────────────── estimated, from `_moved` on ───────►
+    key frame ────── `_key_to_last` ──────► last frame ── the step ──► present frame
+    `_key`    ──────────────── estimated, from `_key_to_last` on ────►
 
 The step is the motion from the key frame to the present frame, with the motion to the last frame taken off. Where the
 present frame fits neither the key frame nor the last one, it becomes the key frame. The last frame before is then kept
@@ -166,7 +166,7 @@ class CameraMotion:
         self._cv2: Any = cv2
         self.patience = patience
         self._key: _GreyFrame | None = None  # None before the first frame
-        self._moved = _STILL  # `(3, 3)`, from the key frame to the last frame, in reduced pixels
+        self._key_to_last = _STILL  # `(3, 3)`, motion from the key frame to the last frame, in reduced pixels
         self._last: _GreyFrame | None = None
         self._lost: _GreyFrame | None = None  # the last frame before a disturbance, while it may still be found
         self._waited = 0  # frames since that one
@@ -205,29 +205,29 @@ class CameraMotion:
 
     def _since_last(self, key: _GreyFrame, last: _GreyFrame, present: _GreyFrame) -> Motion | None:
         """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
-        moved = self._between(key, present, self._moved)
-        if moved is None and last is not key:
+        key_to_present = self._between(key, present, self._key_to_last)
+        if key_to_present is None and last is not key:
             key = last
-            self._moved = _STILL
-            moved = self._between(last, present, _STILL)
-        if moved is None:
+            self._key_to_last = _STILL
+            key_to_present = self._between(last, present, _STILL)
+        if key_to_present is None:
             self._begin_at(present)
             # Nothing can be followed where there is no texture, and nothing moves where two frames are the same.
             return Motion.still() if _largest_change(last.grey, present.grey) < _SAME else None
-        since = moved @ np.linalg.inv(self._moved)
-        if _largest_shift(since, present.grey.shape) * max(present.ratio) < _STILL_SHIFT:
+        last_to_present = key_to_present @ np.linalg.inv(self._key_to_last)
+        if _largest_shift(last_to_present, present.grey.shape) * max(present.ratio) < _STILL_SHIFT:
             return Motion.still()
-        if _share_in_view(moved, present.grey.shape) < _LEAST_IN_VIEW:
+        if _share_in_view(key_to_present, present.grey.shape) < _LEAST_IN_VIEW:
             self._begin_at(present)
         else:
             self._key = key
-            self._moved = moved
-        return _at_full_size(since, present.ratio)
+            self._key_to_last = key_to_present
+        return _at_full_size(last_to_present, present.ratio)
 
     def _begin_at(self, frame: _GreyFrame) -> None:
         """Make a frame the key frame, from which nothing has moved."""
         self._key = frame
-        self._moved = _STILL
+        self._key_to_last = _STILL
 
     def _between(
         self, first: _GreyFrame, present: _GreyFrame, guess: NDArray[np.float64]
@@ -308,8 +308,8 @@ def _correlation(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float |
 
 def _at_full_size(similarity: NDArray[np.float64], ratio: tuple[float, float]) -> Motion:
     """Convert the motion of a reduced copy to that of the frame; pixel 0 of the copy is the mean of its first ones."""
-    across, down = ratio
-    enlarge = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
+    x_ratio, y_ratio = ratio
+    enlarge = np.array([[x_ratio, 0, (x_ratio - 1) / 2], [0, y_ratio, (y_ratio - 1) / 2], [0, 0, 1]])
     return Motion(enlarge @ similarity @ np.linalg.inv(enlarge))
 
 
@@ -342,6 +342,6 @@ def _share_in_view(similarity: NDArray[np.float64], shape: tuple[int, ...]) -> f
     """Estimate the share of a frame that is still in view after a motion, by the upright box around it."""
     height, width = shape
     x, y, _ = similarity @ _corners_of(shape)
-    across = max(min(x.max(), width) - max(x.min(), 0), 0) / width
-    down = max(min(y.max(), height) - max(y.min(), 0), 0) / height
-    return float(across * down)
+    width_share = max(min(x.max(), width) - max(x.min(), 0), 0) / width
+    height_share = max(min(y.max(), height) - max(y.min(), 0), 0) / height
+    return float(width_share * height_share)

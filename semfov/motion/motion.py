@@ -143,9 +143,9 @@ class Motion:
         Returns:
             `(..., 4)` in pixels of the second frame.
         """
-        low = boxes[..., :2]
-        high = boxes[..., 2:]
-        centre = (low + high) / 2
-        half = (high - low) / 2 * self.scale_at(centre)[..., None]
-        moved = self.points(centre)
-        return torch.cat([moved - half, moved + half], -1)
+        top_left = boxes[..., :2]
+        bottom_right = boxes[..., 2:]
+        centre = (top_left + bottom_right) / 2
+        half_size = (bottom_right - top_left) / 2 * self.scale_at(centre)[..., None]
+        moved_centre = self.points(centre)
+        return torch.cat([moved_centre - half_size, moved_centre + half_size], -1)
