@@ -497,13 +497,16 @@ class WindowStream(StreamEpisode[WindowMoment]):
 class _Camera:
     """How the camera moves between frames: by the poses that are given, or estimated from the frames.
 
+    The first frame decides: with a pose `_poses` is made, and without one `_estimate`, where the camera is followed.
+
     Attributes:
-        is_followed: whether its motion is known at all.
+        is_followed: whether its motion is known at all, from the first frame on.
     """
 
     def __init__(self, *, follows: bool) -> None:
-        self._estimate = _camera_motion() if follows else None
-        self._poses: KnownPoses | None = None  # once poses are given
+        self._follows = follows
+        self._estimate: CameraMotion | None = None
+        self._poses: KnownPoses | None = None
         self._is_first = True  # whether no frame was seen
 
     @property
@@ -514,6 +517,9 @@ class _Camera:
         """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
         has_poses = self._poses is not None
         check(self._is_first or (pose is not None) == has_poses, "pose", "a pose of each frame, or of none", pose)
+        # Without OpenCV a warning is given, which does not concern a camera whose poses are known.
+        if self._is_first and pose is None and self._follows:
+            self._estimate = _camera_motion()
         self._is_first = False
         if pose is not None:
             self._poses = self._poses or KnownPoses()

@@ -14,7 +14,7 @@ class Subcommand(NamedTuple):
 
     Attributes:
         summary: what it does, in the list of commands.
-        positional: the setting that has no option before it.
+        positional: the setting that has no option before it; None for none.
         positional_help: what it is.
         options: dataclass of its options, as `room.module:Name`.
         function: what runs it, as `room.module:name`; it takes the options, and returns the exit code.
@@ -24,7 +24,7 @@ class Subcommand(NamedTuple):
     """
 
     summary: str
-    positional: str
+    positional: str | None
     positional_help: str
     options: str
     function: str
@@ -58,6 +58,28 @@ _PICTURES = "photographs, large pictures, or folders of them (none: one that com
 _DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
 
 SUBCOMMANDS = {
+    "demo": Subcommand(
+        summary="write a page of what semfov does, in seconds and without a picture or a network",
+        positional=None,
+        positional_help="",
+        options="cli.options:DemoOptions",
+        function="cli.demo:make_demo",
+        help="""\
+semfov demo: what semfov does, as a page
+
+  semfov demo
+  semfov demo --out first.html
+
+usage: semfov demo [--out FILE.html]
+
+  --out FILE           the page to write (default: semfov-demo.html), one file that loads nothing from elsewhere
+  --quiet              errors alone
+
+The page shows a search for a boat, all people on a sheet of five photographs with each window that was looked at, where
+people look, and a stream. They are computed when you run it, by the detector and in the photographs that come with
+semfov: nothing is downloaded. Under each stands the command for a picture of your own.
+""",
+    ),
     "search": Subcommand(
         summary="search pictures for a class, and decide whether it is there",
         positional="pictures",
@@ -329,6 +351,7 @@ _SUMMARIES["completion"] = "let bash, zsh or fish complete commands and options"
 OVERVIEW = f"""\
 semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
 
+  semfov demo                                       a page of all this, in seconds, without a picture
   semfov search kitchen.jpg --target cup            is there a cup, and where?
   semfov find harbour.tif --target person           all people in a large picture, and how many
   semfov explore street.jpg --report street.html    what is where, as a page with every look

@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     options = _options_of(name)
     command = SUBCOMMANDS[name]
-    positional = (command.positional, command.positional_help)
+    positional = None if command.positional is None else (command.positional, command.positional_help)
     program = f"semfov {name}"
     if "--help-all" in rest or "--help_all" in rest:
         make_parser(options, command.help.partition("\nusage:")[0], positional, program).print_help()
@@ -170,9 +170,11 @@ def _of_others(command: str, words: Sequence[str]) -> str | None:
 def _refusal(command: str, option: str) -> str | None:
     """Say what is wrong with one option of a subcommand; None where the parser says it, or nothing is wrong."""
     names = {name: set(_option_names(name)) for name in (*_LOOKING, command)}
-    positional = SUBCOMMANDS[command].positional
-    singular = positional.removesuffix("s")
     is_unknown = bool(option) and option not in names[command]
+    positional = SUBCOMMANDS[command].positional
+    if positional is None:
+        return None
+    singular = positional.removesuffix("s")
     meanings = {option, option.removesuffix("s"), *OPTIONS.get(option, "").split()}
     # The parts of the detector are options of `semfov fit`: detector.name and others.
     is_whole_detector = (command, option) == ("fit", "detector")

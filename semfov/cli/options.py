@@ -234,6 +234,19 @@ class AppOptions(AgentOptions):
 
 
 @dataclass(frozen=True)
+class DemoOptions(Settings):
+    """A page of what semfov does, on the photographs that come with it.
+
+    Args:
+        out: HTML page to write.
+        quiet: print errors and warnings alone.
+    """
+
+    out: Path = Path("semfov-demo.html")
+    quiet: bool = False
+
+
+@dataclass(frozen=True)
 class CheckOptions(Settings):
     """Check files of fixations.
 

@@ -19,9 +19,9 @@ _FOLDER = Path(__file__).parent
 _STEPS = 33  # of a colour map
 
 
-def page_path(path: Path) -> Path:
-    """Return the path of a page if its suffix is that of a page; otherwise raise `InputError`."""
-    check(path.suffix.lower() in (".html", ".htm"), "report", "a file that ends in .html or .htm", path)
+def page_path(path: Path, argument: str = "report") -> Path:
+    """Return the path of a page if its suffix is that of a page; otherwise raise `InputError` for the argument."""
+    check(path.suffix.lower() in (".html", ".htm"), argument, "a file that ends in .html or .htm", path)
     return path
 
 

@@ -139,6 +139,25 @@ def _write_gif(frames: Sequence[_Frame], file: BinaryIO, seconds: float, hold: f
     first.save(file, format="GIF", save_all=True, append_images=following, duration=times, loop=0, comment=MADE_HERE)
 
 
+def write_webp(
+    frames: Sequence[PillowImage], file: BinaryIO, seconds: Sequence[float], quality: int, *, effort: int = 4
+) -> None:
+    """Write frames as an animated WebP that repeats.
+
+    Args:
+        frames: the frames, of one size.
+        file: what is written to.
+        seconds: duration of each frame.
+        quality: up to 100; at low ones lines of earlier frames are left faintly where little has changed.
+        effort: how long to try for a smaller file, 0 to 6.
+    """
+    first, *following = frames
+    times = [round(1000 * duration) for duration in seconds]
+    first.save(
+        file, "WEBP", save_all=True, append_images=following, duration=times, loop=0, quality=quality, method=effort
+    )
+
+
 def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[PillowImage]:
     """Convert frames `(H, W, 3)` to Pillow images with a common palette, without which static parts would flicker."""
     from PIL import Image

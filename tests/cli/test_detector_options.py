@@ -20,7 +20,7 @@ from semfov.detection.load import loader_options
 from tests.small import write_network
 
 SIDE = 64
-WITH_DETECTOR = [name for name in SUBCOMMANDS if name != "check"]
+WITH_DETECTOR = [name for name in SUBCOMMANDS if name not in ("check", "demo")]
 HERE = Path(semfov.__file__).parent
 
 

@@ -1,5 +1,6 @@
 """Looks that move along with the camera: what they showed is where the scene is now."""
 
+import sys
 from dataclasses import replace
 
 import cv2
@@ -154,6 +155,16 @@ def test_known_poses_take_the_place_of_the_estimate():
     assert not moment.lost
     assert len(moment.objects) == 1
     assert float(box_iou(moment.objects.boxes, torch.tensor([[x, y, x + 40.0, y + 40.0]]))) > 0.7
+
+
+def test_without_opencv_only_a_camera_whose_poses_are_unknown_is_warned_of(monkeypatch):
+    """Warnings are errors here: with poses there is none."""
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    agent = ZoomAgent(WindowEye(Patches())).eval()
+    frame = np.full((768, 1024, 3), 90, np.uint8)
+    agent.stream(None, (RED,), StreamSettings(rate=0.25)).step(frame, pose=np.eye(3))
+    with pytest.warns(UserWarning, match="taken to stand still, unless poses are given"):
+        agent.stream(None, (RED,), StreamSettings(rate=0.25)).step(frame)
 
 
 def test_poses_are_given_for_all_frames_or_none():
