@@ -58,28 +58,6 @@ _PICTURES = "photographs, large pictures, or folders of them (none: one that com
 _DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
 
 SUBCOMMANDS = {
-    "demo": Subcommand(
-        summary="write a page of what semfov does, in seconds and without a picture or a network",
-        positional=None,
-        positional_help="",
-        options="cli.options:DemoOptions",
-        function="cli.demo:make_demo",
-        help="""\
-semfov demo: what semfov does, as a page
-
-  semfov demo
-  semfov demo --out first.html
-
-usage: semfov demo [--out FILE.html]
-
-  --out FILE           the page to write (default: semfov-demo.html), one file that loads nothing from elsewhere
-  --quiet              errors alone
-
-The page shows a search for a boat, all people on a sheet of five photographs with each window that was looked at, where
-people look, and a stream. They are computed when you run it, by the detector and in the photographs that come with
-semfov: nothing is downloaded. Under each stands the command for a picture of your own.
-""",
-    ),
     "search": Subcommand(
         summary="search pictures for a class, and decide whether it is there",
         positional="pictures",
@@ -228,6 +206,28 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   --out FOLDER         likewise, as a video in this folder
 
 Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
+""",
+    ),
+    "demo": Subcommand(
+        summary="write a page of what semfov does, in seconds and without a picture or a network",
+        positional=None,
+        positional_help="",
+        options="cli.options:DemoOptions",
+        function="cli.demo:make_demo",
+        help="""\
+semfov demo: what semfov does, as a page
+
+  semfov demo
+  semfov demo --out first.html
+
+usage: semfov demo [--out FILE.html]
+
+  --out FILE           the page to write (default: semfov-demo.html), one file that loads nothing from elsewhere
+  --quiet              errors alone
+
+The page shows a search for a boat, all people on a sheet of five photographs with each window that was looked at, where
+people look, and a stream. They are computed when you run it, by the detector and in the photographs that come with
+semfov: nothing is downloaded. Under each stands the command for a picture of your own.
 """,
     ),
     "app": Subcommand(
