@@ -351,7 +351,7 @@ _SUMMARIES["completion"] = "let bash, zsh or fish complete commands and options"
 OVERVIEW = f"""\
 semfov: active perception with any detector, in photographs, large pictures, scenes, video and cameras
 
-  semfov demo                                       a page of all this, in seconds, without a picture
+  semfov demo                                       a page of four tasks, in seconds, without a picture
   semfov search kitchen.jpg --target cup            is there a cup, and where?
   semfov find harbour.tif --target person           all people in a large picture, and how many
   semfov explore street.jpg --report street.html    what is where, as a page with every look
