@@ -184,6 +184,7 @@ KNOWN = {
         f"score of {LEAST}, and an": "code",
     },
     "docs/guides/live.md": {
+        f"at least {LIKELY} are listed": "code",
         f"{MOST_CLOSER} by default": "code",
         "for 15 s": "code, tested with a stream that breaks off",
         f"{log(2) / WindowKind.usual_rate:.1f} s by default": "code",
