@@ -6,8 +6,11 @@ looks at a photograph, whose record is a `Scanpath`; `FoveaStream` has the look 
 """
 
 import sys
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from weakref import ref
 
 import torch
 from numpy.typing import ArrayLike
@@ -38,6 +41,7 @@ from semfov.settings import DecisionSettings, Start
 from semfov.strategy import Strategy
 
 _LONGEST = 640  # longer side of the frames that records keep, in pixels
+_UNREDUCED = 2  # largest number of moments that hold their whole frames
 
 
 @dataclass(frozen=True)
@@ -342,6 +346,7 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         self.color = color
         self._gaze: FoveaGaze | None = None  # from the first frame on
         self._moment: FoveaMoment | None = None
+        self._latest: deque[ref[FoveaMoment]] = deque()  # the moments whose photographs may not be made yet
         self._pixels = torch.zeros(0)  # of the present frame, as they came
         self._since_fixation = 0.0  # seconds
         self._closer_look: tuple[int, Detections, dict[str, float]] | None = None  # cell, what it shows, and its time
@@ -392,7 +397,7 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         assert self._closer_look is not None
         cell, detections, seconds = self._closer_look
         self._passes += 1
-        self._moment = self._made(gaze, cell, detections, seconds, closer=(close_up,))
+        self._keep(self._made(gaze, cell, detections, seconds, closer=(close_up,)))
 
     def _keep_closer_look(
         self, cell: int, region: list[float], detections: Detections, seconds: dict[str, float], value: float
@@ -411,7 +416,17 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         step = self._gaze.fixate()
         assert step is not None
         self._passes += 1
-        self._moment = self._made(self._gaze, int(step.cell), step.detections, {**watch.seconds, **step.seconds})
+        self._keep(self._made(self._gaze, int(step.cell), step.detections, {**watch.seconds, **step.seconds}))
+
+    def _keep(self, moment: FoveaMoment) -> None:
+        """Make a moment the present one; kept for longer, it holds the reduced frame alone."""
+        self._moment = moment
+        self._latest.append(ref(moment))
+        # While a frame is looked at, a loop over frames still has the moment of the one before, and drops it then.
+        if len(self._latest) > _UNREDUCED:
+            older = self._latest.popleft()()
+            if older is not None:
+                _ = older.photograph
 
     def _made(
         self,
@@ -443,7 +458,7 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
             next_cell=int(step.next_cell) if next_cell is None else next_cell,
             closer=tuple(replace(close_up, fixation=0, number=0) for close_up in closer),
             found=decision is not None and decision.outcome == "found",
-            photograph=_reduced(self._pixels, gaze.image),
+            photograph=partial(_reduced, self._pixels, gaze.image),  # type: ignore[arg-type]
             detector=self.plan.agent.eye.detector.name,
         )
 

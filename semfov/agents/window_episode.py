@@ -18,12 +18,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, no_frame_yet
+from semfov.agents.window_objects import MergedLooks
 from semfov.belief.prior import Prior
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp, Decision
-from semfov.detection import LEAST, Detections, Objects
+from semfov.detection import LEAST, Detections
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check
 from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
@@ -33,7 +34,6 @@ from semfov.paths.windows import LookAtWindow, look_at_window
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells
-from semfov.zoom.carrying import inside_frame
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import USUAL_WINDOW, closer_window, look_closely
 from semfov.zoom.decision import DecisionsByScore, WindowDecisions, decisions_of
@@ -41,8 +41,7 @@ from semfov.zoom.episode import KeptLook, WindowStep, find_everything, look_by_l
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
-from semfov.zoom.objects import merge, probable_objects
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLooks
 from semfov.zoom.slices import ranked, usual_slices
 
 PASSES = 24  # default for the largest number of passes of the detector
@@ -226,15 +225,15 @@ class WindowSession:
         """
         task = self.task
         places = {look.number: place for place, look in enumerate(self.kept_looks)}
-        objects, unseen = self._objects([look.shown for look in looks])
+        merged = self._merged(looks)
         return {
             "lattice": self.source.lattice,
             "classes": task.goal.classes,
             "target": task.goal.target,
             "targets": task.goal.targets,
             "looks": tuple(looks),
-            "candidates": objects,
-            "unseen": unseen,
+            "candidates": merged.objects,
+            "unseen": merged.unseen,
             "spread": SPREAD if self._certainty is None else self._certainty.spread,
             "least": self._least,
             "detector": task.detector,
@@ -247,28 +246,19 @@ class WindowSession:
         usual = LEAST if self._certainty is None else LIKELY
         return usual if self.task.least is None else self.task.least
 
-    def _objects(self, looks: Sequence[WindowLook]) -> tuple[Objects, tuple[float, float] | None]:
-        """Merge the objects of looks; also the mean and the variance of how many more there are, if that is known."""
-        goal, lattice = self.task.goal, self.source.lattice
-        fades = not self._stands_still
-        current = _without_replaced(looks, lattice) if fades else looks
-        sought = goal.targets or goal.target
-        unseen = None
-        if self._certainty is None:
-            objects = merge(current, sought)
-        else:
-            objects, unseen = probable_objects(
-                current,
-                lattice,
-                sought,
-                self._certainty,
-                remaining=self._remaining(),
-                promised=self._promised(),
-                latest=fades,
-            )
-        if self.follows:
-            objects = objects[inside_frame(objects.boxes, lattice.size)]
-        return objects, unseen
+    def _merged(self, looks: Sequence[LookAtWindow]) -> MergedLooks:
+        """Make what merges the objects of looks when they are asked for; what changes is computed now."""
+        goal = self.task.goal
+        return MergedLooks(
+            looks=tuple(look.shown for look in looks),
+            lattice=self.source.lattice,
+            sought=goal.sought,
+            certainty=self._certainty,
+            remaining=self._remaining(),
+            promised=self._promised(),
+            fades=not self._stands_still,
+            in_frame=self.follows,
+        )
 
     def _remaining(self) -> tuple[float, float]:
         """Ask the belief what further looks find; nothing in a search, and for several classes."""
@@ -543,28 +533,3 @@ def _renumbered(closer: Sequence[CloseUp], places: Mapping[int, int]) -> tuple[C
     """Give the closer looks that count the places of their looks in the record as numbers."""
     counting = [look for look in closer if look.number is not None and look.number in places]
     return tuple(replace(look, number=places[look.number]) for look in counting if look.number is not None)
-
-
-def _without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[WindowLook]:
-    """Drop detections whose surroundings a later look showed at the same or a higher magnification.
-
-    Args:
-        looks: the looks at a stream, in their order.
-        lattice: lattice of the frames.
-
-    Returns:
-        The looks with the detections that remain.
-    """
-    current = []
-    for number, look in enumerate(looks):
-        remain = look.detections.mask[0]
-        low, high = look.detections.boxes[0].split(2, -1)
-        margin = (high - low) / 2
-        low = (low - margin).clamp(min=0)
-        high = (high + margin).minimum(low.new_tensor(lattice.size))
-        for later in looks[number + 1 :]:
-            if later.window.fixation[2] >= look.window.fixation[2]:
-                first, last = low.new_tensor(later.window.region(lattice)).split(2)
-                remain = remain & ~((low >= first) & (high <= last)).all(-1)
-        current.append(replace(look, detections=look.detections.take(remain), cut=look.cut[remain]))
-    return current

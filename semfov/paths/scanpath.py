@@ -19,6 +19,7 @@ from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.fovea import FoveaLook, FoveaLooks, moment_look
 from semfov.paths.kinds import FOVEA
+from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import LookView
 from semfov.paths.stimulus import Stimulus
 from semfov.paths.words import MomentWords, Words
@@ -65,24 +66,6 @@ _FORMAT = Format(
     },
 )
 """Format of the files of scanpaths."""
-
-
-class _MadeWhenRead:
-    """A field that can be given as a function, which then makes it when it is read for the first time."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, record: Any, owner: type | None = None) -> Any:
-        if record is None:
-            raise AttributeError(self._name)  # no default
-        values = vars(record)
-        if callable(values[self._name]):
-            values[self._name] = values[self._name]()
-        return values[self._name]
-
-    def __set__(self, record: Any, value: Any) -> None:
-        vars(record)[self._name] = value
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -212,7 +195,7 @@ class Scanpath(_CellRecord):
     '“cup” found after 1 gaze shift'
     """
 
-    probabilities: Tensor = _MadeWhenRead()  # type: ignore[assignment]
+    probabilities: Tensor = MadeWhenRead()  # type: ignore[assignment]
     values: Tensor
     posterior: Tensor | None = None
     presence: Tensor | None = None
@@ -417,6 +400,7 @@ class FoveaMoment(_CellRecord, Moment):
     visited: Tensor
     next_cell: int
     belief: Belief | None = field(default=None, compare=False)
+    photograph: Tensor | None = MadeWhenRead(None)  # type: ignore[assignment]
 
     _words = FoveaMomentWords
     _format = _FOVEA

@@ -16,6 +16,7 @@ from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.kinds import WINDOWS
+from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import Box, RecordedLook
 from semfov.paths.words import MomentWords, Words
 from semfov.zoom.certainty import SEVERAL, SPREAD, number_of, number_of_faint, reacts
@@ -233,6 +234,13 @@ def looks_at_windows(
     return tuple(look_at_window(one, lattice, number, time, value) for number, (one, time, value) in columns)
 
 
+def _has_found(record: "ZoomPath") -> bool:
+    """Tell whether the decision, or without one the objects say that a target was found."""
+    if record.decision is not None:
+        return record.decision.outcome == "found"
+    return bool(record.sought) and len(record.objects) > 0
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ZoomPath(Record):
     """The record of a search or an exploration of a large picture.
@@ -263,19 +271,15 @@ class ZoomPath(Record):
 
     lattice: Lattice
     looks: tuple[LookAtWindow, ...]
-    candidates: Objects = field()
+    candidates: Objects = MadeWhenRead()  # type: ignore[assignment]
+    unseen: tuple[float, float] | None = MadeWhenRead(None)  # type: ignore[assignment]
     spread: float = SPREAD
-    found: bool = field(init=False)
+    # Without a decision it rests on the objects, and is made as late as they are.
+    found: bool = field(init=False, default=cached_property(_has_found))  # type: ignore[assignment]
 
     kind = WINDOWS
     _words = WindowWords
     _format = Format("zoom path", _TENSORS, _VALUES)
-
-    def __post_init__(self) -> None:
-        """Derive what the decision, or the objects tell."""
-        some = bool(self.sought) and len(self.objects) > 0
-        found = some if self.decision is None else self.decision.outcome == "found"
-        object.__setattr__(self, "found", found)
 
     @property
     def window_looks(self) -> tuple[WindowLook, ...]:

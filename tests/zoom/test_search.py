@@ -10,7 +10,7 @@ from torchvision.transforms.functional import to_pil_image
 
 from semfov import ActivePerception, Detections, InputError, WindowEye, ZoomAgent
 from semfov.agents.picture import OpenedPicture
-from semfov.agents.window_episode import _without_replaced
+from semfov.agents.window_objects import without_replaced
 from semfov.data.large import open_large
 from semfov.settings import StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice, merge
@@ -330,7 +330,7 @@ def test_a_later_look_as_close_replaces_what_earlier_ones_showed():
         boxes = torch.cat([low, low + 40], -1)[None]
         detections = Detections(boxes, torch.full((1, 6, 3), 0.5), torch.ones(1, 6, dtype=torch.bool))
         looks.append(WindowLook(Window.on(lattice, action), detections, torch.arange(6) % 2 == 0, torch.zeros(2), None))
-    kept = _without_replaced(looks, lattice)
+    kept = without_replaced(looks, lattice)
     for number, (window_look, left) in enumerate(zip(looks, kept, strict=True)):
         expected = []
         for place, (x1, y1, x2, y2) in enumerate(window_look.detections.boxes[0].tolist()):

@@ -1,0 +1,121 @@
+"""The objects of the record of looks at windows, merged when they are first asked for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from semfov.detection import Objects
+from semfov.zoom.carrying import inside_frame
+from semfov.zoom.certainty import Certainty
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import WindowLook
+from semfov.zoom.objects import merge, probable_objects
+
+
+@dataclass(frozen=True)
+class MergedLooks:
+    """The objects of looks, merged once, when they are first asked for: most records of a stream are never asked.
+
+    It holds nothing that a later look or frame changes, and merges in the modes of PyTorch in which it was made.
+
+    Attributes:
+        looks: the looks, where they lie in their frame.
+        lattice: lattice of the picture or the frame.
+        sought: the classes that are looked for; none stands for all.
+        certainty: probability that an object is there; None without evidence.
+        remaining: objects that further looks are expected to find (`ZoomBelief.remaining`).
+        promised: objects that the looks so far promised.
+        fades: whether later looks replace what earlier ones showed, as in a stream that forgets.
+        in_frame: whether objects beyond the frame are left out, as where looks were carried along with a camera.
+    """
+
+    looks: tuple[WindowLook, ...]
+    lattice: Lattice
+    sought: tuple[int, ...]
+    certainty: Certainty | None
+    remaining: tuple[float, float]
+    promised: float
+    fades: bool
+    in_frame: bool
+    _has_gradients: bool = field(default_factory=torch.is_grad_enabled, init=False)
+    _is_inference: bool = field(default_factory=torch.is_inference_mode_enabled, init=False)
+
+    def objects(self) -> Objects:
+        """Merge the objects, the most confident first."""
+        return self._merged[0]
+
+    def unseen(self) -> tuple[float, float] | None:
+        """Estimate mean and variance of how many more there are; None where that is not known."""
+        return self._merged[1]
+
+    @cached_property
+    def _merged(self) -> tuple[Objects, tuple[float, float] | None]:
+        """The objects, and how many more there are."""
+        with torch.inference_mode(self._is_inference), torch.set_grad_enabled(self._has_gradients):
+            looks = without_replaced(self.looks, self.lattice) if self.fades else self.looks
+            objects, unseen = self._merge(looks)
+            if self.in_frame:
+                objects = objects[inside_frame(objects.boxes, self.lattice.size)]
+            return objects, unseen
+
+    def _merge(self, looks: Sequence[WindowLook]) -> tuple[Objects, tuple[float, float] | None]:
+        """Merge by the scores, or by the certainty where one was fitted."""
+        if self.certainty is None:
+            return merge(looks, self.sought), None
+        return probable_objects(
+            looks,
+            self.lattice,
+            self.sought,
+            self.certainty,
+            remaining=self.remaining,
+            promised=self.promised,
+            latest=self.fades,
+        )
+
+
+def without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[WindowLook]:
+    """Drop detections whose surroundings a later look showed at the same or a higher magnification.
+
+    Args:
+        looks: the looks at a stream, in their order.
+        lattice: lattice of the frames.
+
+    Returns:
+        The looks with the detections that remain.
+    """
+    if not looks:
+        return []
+    # All boxes are in one table, so that each look is compared with those of all before it at once.
+    counts = [look.detections.boxes.shape[1] for look in looks]
+    ends = np.cumsum(counts)
+    low, high = _surroundings(torch.cat([look.detections.boxes[0] for look in looks]), lattice.size)
+    remain = torch.cat([look.detections.mask[0] for look in looks]).numpy()
+    magnifications = np.array([look.window.fixation[2] for look in looks])
+    magnification_of_box = np.repeat(magnifications, counts)
+    for number in range(1, len(looks)):
+        earlier = slice(ends[number - 1])
+        x1, y1, x2, y2 = np.array(looks[number].window.region(lattice), dtype=low.dtype)
+        inside = (low[0, earlier] >= x1) & (low[1, earlier] >= y1) & (high[0, earlier] <= x2) & (high[1, earlier] <= y2)
+        remain[earlier] &= ~(inside & (magnifications[number] >= magnification_of_box[earlier]))
+    parts = torch.from_numpy(remain).split(counts)
+    return [_taken(look, part) for look, part in zip(looks, parts, strict=True)]
+
+
+def _surroundings(boxes: Tensor, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Enlarge boxes `(M, 4)` by half a side on each side, within a frame of a size; low and high corners `(2, M)`."""
+    low, high = boxes.split(2, -1)
+    margin = (high - low) / 2
+    low = (low - margin).clamp(min=0)
+    high = (high + margin).minimum(low.new_tensor(size))
+    return low.T.contiguous().numpy(), high.T.contiguous().numpy()
+
+
+def _taken(look: WindowLook, remain: Tensor) -> WindowLook:
+    """Take the detections of a look that remain, `(L,)` boolean."""
+    if bool(remain.all()):
+        return look
+    return replace(look, detections=look.detections.take(remain), cut=look.cut[remain])
