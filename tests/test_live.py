@@ -287,3 +287,37 @@ def test_fainter_objects_are_listed_from_the_probability_that_is_asked_for():
     shown = usual.candidates.scores
     assert len(fainter.objects) == int((shown >= 0.05).sum()) > len(usual.objects) == int((shown >= 0.5).sum())
     refused("least: expected None for a fovea, or how='windows', got 0.05", agent.live, how="fovea", least=0.05)
+
+
+def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once():
+    """Each frame, which is reduced for the moment, is written over the one before."""
+
+    def moments():
+        live = agent_with(observers()["target"]).live("green", seed=5, how="fovea", rate=0.3)
+        buffer = np.empty((960, 1280, 3), np.uint8)
+        for number in range(6):
+            small = (scene(20 * number) * 255).byte().permute(1, 2, 0).numpy()
+            buffer[:] = small.repeat(8, 0).repeat(8, 1)
+            yield live.step(buffer, 0.2)
+
+    def told(moment):
+        objects = [getattr(moment.objects, name).tolist() for name in ("boxes", "scores", "labels", "passes")]
+        belief = moment.probability.tolist(), moment.visited.tolist(), moment.next_cell
+        return moment.describe(), moment.found, objects, belief, moment.photograph.tolist()
+
+    at_once = [told(moment) for moment in moments()]
+    kept = list(moments())
+    # No more than the last moments keep their whole frames in memory.
+    assert [isinstance(vars(moment)["photograph"], torch.Tensor) for moment in kept] == [True] * 4 + [False] * 2
+    assert [told(moment) for moment in kept] == at_once
+    assert kept[0].photograph.shape == (3, 480, 640)
+
+
+def test_a_moment_that_nobody_keeps_makes_no_photograph(monkeypatch):
+    reduced = []
+    monkeypatch.setattr("semfov.agents.fovea_episode._reduced", lambda *frame: reduced.append(frame))
+    live = agent_with(observers()["target"]).live("green", seed=5, how="fovea", rate=0.3)
+    for number in range(6):
+        moment = live.step(scene(20 * number), 0.2)
+    assert moment.number == 5
+    assert not reduced

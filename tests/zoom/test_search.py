@@ -1,9 +1,11 @@
 """Searches by windows in pictures, and in frames that follow each other."""
 
 import math
+import pickle
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torchvision.transforms.functional import to_pil_image
@@ -11,6 +13,7 @@ from torchvision.transforms.functional import to_pil_image
 from semfov import ActivePerception, Detections, InputError, WindowEye, ZoomAgent
 from semfov.agents.picture import OpenedPicture
 from semfov.agents.window_objects import without_replaced
+from semfov.data.images import to_bytes
 from semfov.data.large import open_large
 from semfov.settings import StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice, merge
@@ -381,3 +384,45 @@ def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(raw, picture):
     ):
         running.step(picture[:, :700])
     refused(r"frame: expected a picture, got None \(OpenCV gives None after the last frame", running.step, None)
+
+
+def told(record):
+    """All that a record tells, but the time that its looks took."""
+    values = record.to_dict()
+    for row in values["looks"]:
+        del row["seconds"]
+    unseen = record.unseen
+    objects = [getattr(record.candidates, name).tolist() for name in ("boxes", "scores", "labels", "passes")]
+    return record.found, record.describe(), values, unseen, objects, record.photograph.tolist()
+
+
+@pytest.mark.parametrize("learned", [True, False])
+@pytest.mark.parametrize("target", [None, 1, [1, 3]])
+def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once(agent, picture, learned, target, one_thread):
+    """A camera moves, looks fade, and each frame is written over the one before."""
+    agent = agent if learned else ZoomAgent(agent.eye).eval()
+    targets = tuple(target) if isinstance(target, list) else ()
+
+    def moments():
+        live = agent.stream(None if targets else target, targets, StreamSettings(rate=0.5))
+        buffer = np.empty((600, 800, 3), np.uint8)
+        pixels = to_bytes(picture)
+        for number in range(8):
+            buffer[:] = pixels[number : number + 600, 9 * number : 9 * number + 800]
+            yield live.step(buffer, 0.2, pose=[[1, 0, -9 * number], [0, 1, -number]])
+
+    at_once = [told(moment) for moment in moments()]
+    kept = list(moments())
+    copies = pickle.loads(pickle.dumps(kept))
+    assert [told(moment) for moment in kept] == at_once
+    assert [told(moment) for moment in copies] == at_once
+    assert any(objects[0] for *_, objects, _ in at_once)
+
+
+def test_a_record_of_a_look_that_is_read_later_is_the_one_that_is_read_at_once(agent, picture, one_thread):
+    for look in (partial(agent.search, picture, "red"), partial(agent.explore, picture, worth=0.0)):
+        at_once = []
+        kept = []
+        look(passes=4, on_look=lambda record, told_so_far=at_once: told_so_far.append(told(record)))
+        look(passes=4, on_look=kept.append)
+        assert [told(record) for record in kept] == at_once
