@@ -209,7 +209,8 @@ class ByCloserLooks(StoppingCriterion):
         self._concluded = self.verifier.conclude(room)
 
     def found_class(self, belief: Belief, target: int) -> int:
-        is_found = self.decision is not None and self.decision.outcome == "found"
+        decision = self.decision
+        is_found = decision is not None and decision.outcome == "found"
         return self.verifier.best.target if is_found else class_meant(belief, target)
 
     def wait(self, passed: float = FRAME) -> None:

@@ -186,27 +186,28 @@ class DecisionsByScore(WindowDecisions):
     def __init__(self, target: int, confirm: float | None = None) -> None:
         self._target = target
         self._confirm = _LEAST_SCORE if confirm is None else confirm
-        self._step: WindowStep[Any] | None = None
+        self._decision: Decision | None = None
         self.criterion = f"a detection scores {self._confirm:g}"
 
     def see(self, step: WindowStep[Any], number: int, room: float) -> None:
-        self._step = step
-        self.outcome = FOUND if self._best()[0] >= self._confirm else GO_ON
+        score, box = self._best(step.looks)
+        if score >= self._confirm:
+            self.outcome = FOUND
+            self._decision = Decision("found", score, None, box)
+        else:
+            self.outcome = GO_ON
+            self._decision = Decision("undecided", score)
 
     @property
     def decision(self) -> Decision | None:
         """`found` with the best detection, or `undecided` with its score."""
-        if self._step is None:
-            return None
-        score, box = self._best()
-        return Decision("found", score, None, box) if score >= self._confirm else Decision("undecided", score)
+        return self._decision
 
-    def _best(self) -> tuple[float, Tensor | None]:
-        """Score and box `(4,)` of the best detection of the target in the looks that count."""
-        assert self._step is not None
+    def _best(self, looks: Sequence[WindowLook]) -> tuple[float, Tensor | None]:
+        """Find score and box `(4,)` of the best detection of the target in the looks that count."""
         highest = 0.0
         box = None
-        for look in self._step.looks:
+        for look in looks:
             scores = look.detections.class_scores[0, :, self._target - 1]
             if len(scores) and float(scores.max()) > highest:
                 highest = float(scores.max())
