@@ -9,7 +9,7 @@ from functools import partial
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import torch
@@ -195,20 +195,33 @@ def open_pillow(path: str | PathLike[str]) -> Iterator["Image"]:
     Raises:
         DataError: it is no regular file, or a TIFF that Pillow would read wrongly or at a price.
     """
-    from PIL import Image
-
     name = f"image {Path(path)}"
     check_regular(path, name)
-    Image.init()
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
-    with (
-        Path(path).open("rb") as file,
-        Image.open(file, formats=[kind for kind in _FORMATS if kind in Image.OPEN]) as image,
-    ):
+    with Path(path).open("rb") as file, _open_in_formats(file) as image:
         if image.format == "TIFF":
             _seek_full_page(image)
             _check_tiff(TiffTags.of_image(image), image.size, name)
         yield image
+
+
+def _open_in_formats(file: BinaryIO) -> "Image":
+    """Open a file in one of `_FORMATS`, first in those that Pillow always knows: importing all others takes longer."""
+    from PIL import Image, UnidentifiedImageError
+
+    Image.preinit()
+    try:
+        return Image.open(file, formats=_formats_known())
+    except UnidentifiedImageError:
+        Image.init()
+        return Image.open(file, formats=_formats_known())
+
+
+def _formats_known() -> list[str]:
+    """List those of `_FORMATS` that Pillow can open so far."""
+    from PIL import Image
+
+    return [kind for kind in _FORMATS if kind in Image.OPEN]
 
 
 def _seek_full_page(image: "Image") -> None:
