@@ -1,9 +1,9 @@
 """Episodes of looks at windows: of a picture, of the frames of a stream, or at windows that are given.
 
 `WindowTask` says what is looked for, and with what. `WindowSession` looks at the windows of one source: it chooses
-them, makes closer looks, decides, and merges objects. Three short drivers stand on it: `WindowEpisode` looks at a
-picture, whose record is a `ZoomPath`; `WindowStream` has the looks that count at the present frame, a `WindowMoment`;
-and `GivenWindows` looks where it is asked to.
+them, makes closer looks, and decides; the objects are merged when a record is read (`semfov.agents.window_objects`).
+Three short drivers stand on it: `WindowEpisode` looks at a picture, whose record is a `ZoomPath`; `WindowStream` has
+the looks that count at the present frame, a `WindowMoment`; and `GivenWindows` looks where it is asked to.
 """
 
 import warnings

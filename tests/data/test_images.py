@@ -1,5 +1,7 @@
 import io
 import struct
+import subprocess
+import sys
 import zlib
 
 import numpy as np
@@ -150,6 +152,20 @@ def test_the_first_frame_of_an_animation_is_read(tmp_path, kind):
     lossless = {"lossless": True} if kind == "webp" else {}
     frames[0].save(tmp_path / f"a.{kind}", save_all=True, append_images=frames[1:], duration=50, **lossless)
     assert (bits(read_image(tmp_path / f"a.{kind}")) == (255, 0, 0)).all()
+
+
+def test_a_process_that_reads_a_photograph_imports_few_formats_and_reads_the_others(tmp_path):
+    """In processes of their own, since formats stay imported."""
+    for kind in ("jpg", "png", "bmp", "webp", "tif", "jp2", "avif"):
+        file = tmp_path / f"photograph.{kind}"
+        Image.fromarray(PICTURE).save(file)
+        code = (
+            "import sys; from semfov import read_image; "
+            f"print(tuple(read_image({str(file)!r}).shape), 'PIL.PdfImagePlugin' in sys.modules)"
+        )
+        told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        assert told.split(") ")[0] == "(3, 16, 24"
+        assert told.endswith("False\n") == (kind in ("jpg", "png", "bmp"))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 700), (20000, 3)])
