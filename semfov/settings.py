@@ -133,7 +133,8 @@ class DecisionSettings(CheckedSettings):
         closer: largest number of closer looks, in which a window around a place that seems to hold the target is
             enlarged to the detector's input, each a pass (None: 3 in a photograph, all that there are passes for in a
             large picture, 2 for a fovea); 0 makes none.
-        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (None: half of them).
+        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (None: as often as in
+            the searches of the fit, nearly always for people and hardly ever for a toaster).
 
     Raises:
         InputError: a value is out of range.
@@ -234,7 +235,8 @@ class StreamSettings(DecisionSettings, StartSettings):
             a belief that fades can reach it, or with rate 0 that of a search).
         closer: largest number of closer looks in the time until half of the evidence has faded (None: 2 for a fovea, 3
             for windows of small frames, as many as there are frames for those of large ones); 0: none.
-        prior: how often the target is there: the share of the frames that hold it (None: half of them).
+        prior: how often the target is there: the share of the frames that hold it (None: as often as in the searches of
+            the fit).
         least: probability from which on an object counts in windows (None: 0.5); with a lower one a tracker or a curve
             of precision over recall gets fainter objects, too.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.

@@ -156,13 +156,16 @@ def settings_values(draw: Draw, _: Path) -> Case:
     kind, name, base, allowed, optional = draw.choose(
         ((kind, *field) for kind in kinds for field in fields_of(kind)), "setting"
     )
-    edges = [e for bound in (allowed.low, allowed.high, allowed.above) if math.isfinite(bound)
-             for e in (bound - 1, bound, bound + 1, bound + 0.5)]  # fmt: skip
+    limits = (allowed.low, allowed.high, allowed.above, allowed.below)
+    bounds = [bound for bound in limits if bound is not None and math.isfinite(bound)]
+    edges = [bound + step for bound in bounds for step in (-1, 0, 1, 0.5)]
     value = draw.choose([*NUMBERS, *edges, *([None] if optional else [])], "value")
     values = {"policy": "random", name: value} if kind is settings.PolicyConfig else {name: value}
     number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     fits = number and (base is float or isinstance(value, int))
-    fits = fits and max(allowed.low, -math.inf) <= value <= allowed.high and value > allowed.above
+    fits = fits and allowed.low <= value <= allowed.high
+    fits = fits and (allowed.above is None or value > allowed.above)
+    fits = fits and (allowed.below is None or value < allowed.below)
     # Words and mappings are checked only on the command line.
     unchecked = isinstance(value, dict) or (isinstance(value, str | None) and optional)
 

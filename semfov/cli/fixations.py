@@ -118,7 +118,9 @@ def _report(path: Path, options: CheckOptions, arguments: dict[str, Any], sizes:
     if sizes is not None and "picture" in arguments:  # a single one is compared with what was looked at in it
         records = [record for record in records if record.picture in sizes] or records
     suspicious = suspicions(records, sizes)
-    if sizes is not None and not options.rules_alone:
+    # Where points look like those of another frame or unit, that is said by the rules alone, in one way.
+    is_read_wrongly = any(line.startswith("points look like") for line in suspicious)
+    if sizes is not None and not options.rules_alone and not is_read_wrongly:
         suspicious += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
     data_set = DATA_SETS.get(reader)
     has_usual_frames = data_set in ("OSIE", "COCO-Search18") and "size" not in arguments

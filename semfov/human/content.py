@@ -49,7 +49,7 @@ _LEAST_GAIN = 0.25  # bits by which another reading must fit better
 _EXCHANGED = 2.0  # bits by which both of two pictures must fit better if their names were exchanged
 _LEAST_FIT = 0.5  # bits below which fixations do not fit their picture
 _REACH = 20  # cells by which a shift is tried in each direction
-_LEAST_SHIFT = 0.03  # share of a side below which a shift of all fixations is what models are off anyway
+_LEAST_SHIFT = 0.05  # share of a side below which a shift of all fixations is what models are off anyway
 _LEAST_SHIFT_OF_SOME = 0.06  # the same of one person's or of later fixations, for what trackers are usually off
 
 
