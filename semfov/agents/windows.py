@@ -109,7 +109,8 @@ class ZoomAgent(nn.Module):
                 the threshold of the evidence.
             closer: largest number of closer looks, 0 to 100; None takes 3 in a photograph, and in a larger picture as
                 many as there are passes for. 0 decides without them, as does evidence without fitted verification.
-            prior: how often the class is there, as a share of the pictures that are searched; None: as often as in the fit.
+            prior: how often the class is there, as a share of the pictures that are searched; None: as often as in the
+                fit.
 
         Returns:
             The looks, the objects of the class, and the decision.
