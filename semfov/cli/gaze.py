@@ -98,7 +98,8 @@ class _GazeJob:
         source = self.sources[number]
         image = OpenedPicture.of(source.picture()).image(torch.zeros(1))[0]
         file = None if source.file is None else str(source.file)
-        prediction = GazePrediction.of(self.detector, image, model=self.model, source=file)
+        given = None if self.options.model is None else self.model
+        prediction = GazePrediction.of(self.detector, image, model=given, source=file)
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
         outcome: _Outcome = {
             "text": self._text(source.name, prediction, paths),
@@ -124,9 +125,8 @@ class _GazeJob:
             f"  added by each term, in bits: {terms}",
             f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
         ]
-        width, height = prediction.size
-        if self.options.model is None and width <= height:
-            lines.append("  the model was fitted to pictures that are wider than high, and may be wrong here")
+        if prediction.caution is not None:
+            lines.append(f"  {prediction.caution}")
         return "\n".join(lines)
 
     def _density_path(self, out: Path, number: int, prediction: GazePrediction) -> Path:

@@ -3,7 +3,7 @@
 import logging
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from os import PathLike
@@ -211,17 +211,17 @@ def _open_in_formats(file: BinaryIO) -> "Image":
 
     Image.preinit()
     try:
-        return Image.open(file, formats=_formats_known())
+        return Image.open(file, formats=_known_to_pillow(_FORMATS))
     except UnidentifiedImageError:
         Image.init()
-        return Image.open(file, formats=_formats_known())
+        return Image.open(file, formats=_known_to_pillow(_FORMATS))
 
 
-def _formats_known() -> list[str]:
-    """List those of `_FORMATS` that Pillow can open so far."""
+def _known_to_pillow(formats: Sequence[str]) -> list[str]:
+    """List those of some formats that Pillow can open so far."""
     from PIL import Image
 
-    return [kind for kind in _FORMATS if kind in Image.OPEN]
+    return [kind for kind in formats if kind in Image.OPEN]
 
 
 def _seek_full_page(image: "Image") -> None:

@@ -53,6 +53,7 @@ class GazePrediction(OtherWords):
         photograph: `(3, h, w)`, bytes, the reduced picture.
         source: file of the picture; None if it does not come from a file.
         seen: number of fixations at which the fovea has seen the picture; None for the sharp picture.
+        is_shipped: whether the model is the one that is shipped for the detector.
 
     Example::
 
@@ -68,6 +69,7 @@ class GazePrediction(OtherWords):
     photograph: Tensor
     source: str | None = None
     seen: int | None = None
+    is_shipped: bool = False
 
     _other_words = GAZE_PREDICTION
 
@@ -115,7 +117,15 @@ class GazePrediction(OtherWords):
             terms = (fitted if suits else deepcopy(fitted).to(image)).terms(features, size[::-1])
         on_processor = {name: term.cpu() for name, term in terms.items()}
         number = None if fixations is None else len(fixations)
-        return cls(fitted, on_processor, size, reduced_copy(image), source, number)
+        return cls(fitted, on_processor, size, reduced_copy(image), source, number, is_shipped=model is None)
+
+    @property
+    def caution(self) -> str | None:
+        """Why the prediction may be wrong for this picture; None where nothing is known against it."""
+        width, height = self.size
+        if self.is_shipped and width <= height:
+            return "the model was fitted to pictures that are wider than high, and may be wrong here"
+        return None
 
     @cached_property
     def density(self) -> Tensor:

@@ -117,8 +117,9 @@ def _facts(prediction: GazePrediction) -> str:
         f"<tr><td>{place}</td><td>{peak['x']:.0f}, {peak['y']:.0f}</td><td>{100 * peak['share']:.1f} %</td></tr>"
         for place, peak in enumerate(prediction.peaks(), 1)
     )
+    caution = "" if prediction.caution is None else f"<p>{escape(prediction.caution.capitalize())}.</p>"
     return (
-        f'<dl class="facts"><div><dt>Entropy of the density</dt><dd>{prediction.entropy:.2f} bits</dd></div>'
+        f'{caution}<dl class="facts"><div><dt>Entropy of the density</dt><dd>{prediction.entropy:.2f} bits</dd></div>'
         f"<div><dt>Added by each term, bits</dt><dd>{escape(bits)}</dd></div></dl>"
         '<div class="wide" tabindex="0" role="region" aria-label="Places">'
         '<table><caption>Where most fixations are expected</caption><thead><tr><th scope="col">Place</th>'
