@@ -1,14 +1,20 @@
 """What subcommand check knows of fixations from the pictures in which they were made."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
+from semfov.agents.picture import OpenedPicture
+from semfov.cli.options import DetectorOptions
 from semfov.data.fixations import Fixations
+from semfov.detection.load import load_detector
 from semfov.errors import SemfovError
 from semfov.human.content import CONTENT_PICTURES, FEWEST_PICTURES, content_suspicions
+from semfov.paths.gaze import GazePrediction
 from semfov.runs.progress import task_bar
 
 
@@ -26,22 +32,21 @@ def suspicions_by_content(
     Returns:
         The lines.
     """
-    from semfov.agent import ActivePerception
-
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for record in records:
-        counts[record.picture] = counts.get(record.picture, 0) + len(record)
+        counts[record.picture] += len(record)
     # Pictures with most fixations tell most.
     names = sorted(counts, key=lambda name: (-counts[name], name))[:CONTENT_PICTURES]
     if len(names) < FEWEST_PICTURES:
         return []
-    agent = ActivePerception.recommended()
+    detector = load_detector(DetectorOptions.detector)
     densities: dict[str, Tensor] = {}
     known: dict[str, tuple[int, int]] = {}
     with task_bar(len(names), "where people look", "picture", hidden=quiet) as bar:
         for name in names:
             with suppress(KeyError, SemfovError):  # a picture that is missing or damaged is named by its size
-                densities[name] = agent.gaze(path_of(name)).cells
+                image = OpenedPicture.of(path_of(name)).image(torch.zeros(1))[0]
+                densities[name] = GazePrediction.of(detector, image).cells
                 known[name] = sizes[name]
             bar.update()
     return content_suspicions(records, densities, known)

@@ -14,6 +14,7 @@ from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations, suspicions
 from semfov.data.fixations.exports import PictureError
 from semfov.data.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
+from semfov.data.fixations.suspicions import other_frame_of
 from semfov.data.fixations.table import FrameError
 from semfov.data.large import picture_size
 from semfov.data.sources import PHOTOGRAPHS, picture_files
@@ -119,8 +120,8 @@ def _report(path: Path, options: CheckOptions, arguments: dict[str, Any], sizes:
         records = [record for record in records if record.picture in sizes] or records
     suspicious = suspicions(records, sizes)
     # Where points look like those of another frame or unit, that is said by the rules alone, in one way.
-    is_read_wrongly = any(line.startswith("points look like") for line in suspicious)
-    if sizes is not None and not options.rules_alone and not is_read_wrongly:
+    by_content = sizes is not None and not options.rules_alone and records and other_frame_of(records) is None
+    if sizes is not None and by_content:
         suspicious += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
     data_set = DATA_SETS.get(reader)
     has_usual_frames = data_set in ("OSIE", "COCO-Search18") and "size" not in arguments

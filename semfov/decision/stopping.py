@@ -14,6 +14,7 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.data.inputs import FRAME
 from semfov.decision.candidates import CandidatePlace
 from semfov.decision.rule import FOUND, GO_ON, CloseUp, Decision, conclude, decide, detects, gains_less
+from semfov.decision.state import DecisionState
 from semfov.decision.verifier import Verifier
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
@@ -21,39 +22,20 @@ from semfov.episode import Forgetting, Step
 _MOST_RECENT = 1000  # largest number of looks whose detections are kept in a stream
 
 
-class StoppingCriterion:
+class StoppingCriterion(DecisionState):
     """Base of the stopping criteria, which never ends an episode, and decides nothing.
 
     Attributes:
         ending: reason for an end that it makes.
-        criterion: what the decision `found` needs, in words; None where nothing is decided.
-        outcome: outcome of the last look, a number of `OUTCOMES`; `GO_ON` before the first one.
     """
 
     ending: Literal["box", "worth", "detection", "decision"] = "worth"
-    criterion: str | None = None
-    outcome: int = GO_ON
 
     def see(self, step: Step) -> None:
         """Take in a fixation."""
 
-    @property
-    def decision(self) -> Decision | None:
-        """The decision of a search as it stands; None where nothing is decided, and before the first look."""
-        return None
-
     def conclude(self, room: float = math.inf) -> None:
         """End the search; closer looks that are due are made while passes remain."""
-
-    @property
-    def candidate(self) -> CandidatePlace | None:
-        """The place that is to be looked at closely now; None if there is none."""
-        return None
-
-    @property
-    def looks(self) -> list[CloseUp]:
-        """The closer looks so far."""
-        return []
 
     def look(self) -> CloseUp:
         """Look closely at the candidate, and choose the next one."""

@@ -251,30 +251,36 @@ class _Evidence:
 
     def fits(self, reading: _Reading) -> _Array:
         """Compute the fit of each picture in bits, `(N,)`."""
-        return np.array([self.fit(name, name, reading) for name in self.names])
+        places = self._places(self.records, reading)
+        return np.array([self._fit(places[name], name) for name in self.names])
 
-    def fit(self, name: str, picture: str, reading: _Reading) -> float:
-        """Compute the fit of the fixations that are named for one picture in the same or in another one."""
-        places = np.concatenate([self.places(record, reading) for record in self.records if record.picture == name])
-        return float(_densities_at(self._particular[picture], places).mean())
-
-    def places(self, record: Fixations, reading: _Reading) -> _Array:
-        """Places of the fixations of a record in shares of the sides of its picture, `(n, 2)`."""
-        frame = np.array(record.size, np.float64)
-        return reading.shares(record.points, frame, np.array(self._sizes[record.picture], np.float64))
+    def fits_in_pictures(self) -> _Array:
+        """Compute the fit of the fixations of picture i, as they are read, in picture j, `(N, N)`."""
+        places = self._places(self.records, _PRESENT_READING)
+        return np.array([[self._fit(places[name], picture) for picture in self.names] for name in self.names])
 
     def best_shift(self, records: Sequence[Fixations]) -> _BestShift:
         """Find the shift with which some records fit best, all of them moved alike."""
-        by_picture: dict[str, list[_Array]] = defaultdict(list)
-        for record in records:
-            by_picture[record.picture].append(self.places(record, _PRESENT_READING))
-        places = {name: np.concatenate(of_records) for name, of_records in by_picture.items()}
+        places = self._places(records, _PRESENT_READING)
         total = sum(_fit_by_shift(self._particular[name], places[name]) for name in places)
         row, column = np.unravel_index(int(np.argmax(total)), np.shape(total))
         shift = (np.array([column, row]) - _REACH) / _SIDE
-        before = [_densities_at(self._particular[name], places[name]).mean() for name in places]
-        after = [_densities_at(self._particular[name], places[name] + shift).mean() for name in places]
+        before = [self._fit(places[name], name) for name in places]
+        after = [self._fit(places[name] + shift, name) for name in places]
         return _BestShift(shift, np.array(before), np.array(after))
+
+    def _places(self, records: Sequence[Fixations], reading: _Reading) -> dict[str, _Array]:
+        """Places of the fixations of records in shares of the sides, `(n, 2)`, by their pictures."""
+        by_picture: dict[str, list[_Array]] = defaultdict(list)
+        for record in records:
+            frame = np.array(record.size, np.float64)
+            picture = np.array(self._sizes[record.picture], np.float64)
+            by_picture[record.picture].append(reading.shares(record.points, frame, picture))
+        return {name: np.concatenate(of_records) for name, of_records in by_picture.items()}
+
+    def _fit(self, places: _Array, picture: str) -> float:
+        """Compute the fit of places `(n, 2)` in a picture, in bits."""
+        return float(_densities_at(self._particular[picture], places).mean())
 
 
 def _densities_at(particular: _Array, places: _Array) -> _Array:
@@ -323,17 +329,15 @@ def _better_reading(evidence: _Evidence) -> _Finding | None:
 
 def _wrong_names(evidence: _Evidence) -> list[str]:
     """Find fixations that are named for other pictures than those in which they were made."""
-    names = evidence.names
-    own_fits = evidence.fits(_PRESENT_READING)
+    fits = evidence.fits_in_pictures()
+    own_fits = fits.diagonal()
     if _is_clear(own_fits, 0.0):
-        return _exchanged(evidence, own_fits)
+        return _exchanged(evidence.names, fits)
+    pictures = np.arange(len(evidence.names))
     # Lists of names and of files that are shifted against each other are the usual fault.
     for steps in (1, -1, 2, -2):
-        neighbours = names[steps:] + names[:steps]
-        fits_of_neighbours = [
-            evidence.fit(name, neighbour, _PRESENT_READING) for name, neighbour in zip(names, neighbours, strict=True)
-        ]
-        if _is_clear(np.array(fits_of_neighbours) - own_fits, _LEAST_GAIN):
+        neighbours = (pictures + steps) % len(pictures)
+        if _is_clear(fits[pictures, neighbours] - own_fits, _LEAST_GAIN):
             side = "after" if steps > 0 else "before"
             return [
                 f"fixations fit the pictures that come {abs(steps)} {side} theirs in alphabetical order: check names"
@@ -344,22 +348,18 @@ def _wrong_names(evidence: _Evidence) -> list[str]:
     ]
 
 
-def _exchanged(evidence: _Evidence, own_fits: _Array) -> list[str]:
+def _exchanged(names: Sequence[str], fits: _Array) -> list[str]:
     """Find pairs of pictures whose fixations fit each other's picture.
 
     Args:
-        evidence: the fixations of N pictures, and the pictures' densities.
-        own_fits: `(N,)`, the fit of the fixations of each picture in it.
+        names: the N pictures.
+        fits: `(N, N)`, the fit of the fixations of picture i in picture j.
 
     Returns:
         A line for each pair.
     """
-    names = evidence.names
-    # Row i has the fits of the fixations of picture i in all pictures.
-    fits_in_pictures = np.array(
-        [[evidence.fit(name, picture, _PRESENT_READING) for picture in names] for name in names]
-    )
-    gains = fits_in_pictures - own_fits[:, None]
+    own_fits = fits.diagonal()
+    gains = fits - own_fits[:, None]
     lines = []
     for first, second in combinations(range(len(names)), 2):
         both_gain = min(gains[first, second], gains[second, first]) > _EXCHANGED

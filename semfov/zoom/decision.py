@@ -11,6 +11,7 @@ from semfov.belief.prior import Prior
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import FOUND, GO_ON, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
+from semfov.decision.state import DecisionState
 from semfov.episode import Forgetting
 from semfov.motion import Motion
 from semfov.settings import DecisionSettings
@@ -127,18 +128,14 @@ _DEFAULTS = Thresholds(0.9, 0.005)  # thresholds of searches whose evidence has 
 _LEAST_SCORE = 0.5  # default for the score from which on a search without evidence has found its target
 
 
-class WindowDecisions:
+class WindowDecisions(DecisionState):
     """What is decided after each look at windows (the table in `semfov.decision`); the base decides nothing.
 
     Attributes:
         ending: reason for an end that it makes.
-        criterion: what the decision `found` needs, in words; None where nothing is decided.
-        outcome: outcome of the last look, a number of `OUTCOMES`; `GO_ON` before the first one.
     """
 
     ending: Literal["decision", "detection"] = "decision"
-    criterion: str | None = None
-    outcome: int = GO_ON
 
     def see(self, step: WindowStep[Any], number: int, room: float) -> None:
         """Take in a step, and choose the place that is to be looked at closely.
@@ -149,24 +146,9 @@ class WindowDecisions:
             room: number of passes that remain.
         """
 
-    @property
-    def decision(self) -> Decision | None:
-        """The decision as it stands; None where nothing is decided, and before the first look."""
-        return None
-
     def conclude(self) -> Decision | None:
         """Make the decision of a search that ends."""
         return self.decision
-
-    @property
-    def candidate(self) -> CandidatePlace | None:
-        """The place that is to be looked at closely now; None if there is none."""
-        return None
-
-    @property
-    def looks(self) -> list[CloseUp]:
-        """The closer looks so far."""
-        return []
 
     def look(self) -> None:
         """Look closely at the candidate, and choose the next one."""

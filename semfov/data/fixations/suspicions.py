@@ -77,7 +77,7 @@ def _of_frames(
     records: Sequence[Fixations], points: _Array, sides: _Array, sizes: Mapping[str, tuple[int, int]] | None
 ) -> list[str]:
     """Say what is suspicious in the frames of points `(n, 2)`, with `sides` `(n, 2)`."""
-    other_frame = _looks_like(records)
+    other_frame = other_frame_of(records)
     if other_frame is not None:
         return [f"points look like {other_frame}"]
     lines = []
@@ -88,8 +88,16 @@ def _of_frames(
     return lines + (own_size or _letterbox(points, sides) or _middle(records, points, sides))
 
 
-def _looks_like(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
-    """Say what fixations look like that do not look like those of their frame; None if they do."""
+def other_frame_of(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
+    """Say what fixations look like that do not look like those of their frame.
+
+    Args:
+        fixations: the records, at least one.
+        units: whether they may be fractions that were read as pixels.
+
+    Returns:
+        The unit, origin, order of axes or frame that they look like, in words; None if they look like their own.
+    """
     points, sides = _joined(fixations)
     if len(points) < 3:
         return None
@@ -326,7 +334,7 @@ def warn_of_frames(
     Returns:
         The records.
     """
-    other_frame = _looks_like(fixations, units=units) if fixations else None
+    other_frame = other_frame_of(fixations, units=units) if fixations else None
     if other_frame is None:
         return warn_outside(source, fixations, stacklevel=stacklevel + 1)
     first = fixations[0]
