@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 
+from docs.site.llms import contents
 from docs.site.stage import ROOT, Stage
 from docs.site.tutorials import tutorials
 
@@ -35,6 +36,7 @@ def build(*, run: bool) -> None:
     for name, text in tutorials(PAGES / "tutorials", stage.page, run=run).items():
         stage.write(f"tutorials/{name}.md", text)
     stage.finish()
+    stage.write("llms.txt", contents((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), PAGES))
     print(f"pages: {time.monotonic() - began:.0f} s")
     call = [sys.executable, "-m", "zensical", "build", "--clean", "--strict"]
     done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -254,6 +254,30 @@ look. Or look yourself: click on the picture, and see what the fovea sees there 
 Pictures are kept nowhere, and nothing is sent elsewhere. Ctrl-C ends it.
 """,
     ),
+    "mcp": Subcommand(
+        summary="let a language model search, find and look in the pictures of a folder",
+        positional="folder",
+        positional_help="the folder with the pictures",
+        options="cli.options:McpOptions",
+        function="cli.mcp:serve",
+        help=f"""\
+semfov mcp: tools for language models, by the Model Context Protocol
+
+  semfov mcp PICTURES                                  (pip install "semfov[mcp]")
+
+usage: semfov mcp FOLDER [options]
+
+  FOLDER               the folder with the pictures (default: this one); files elsewhere are refused, also by links
+{_AGENT}
+
+A program with a language model starts this command, and talks to it on standard input and output:
+
+  {{"mcpServers": {{"semfov": {{"command": "semfov", "args": ["mcp", "PICTURES"]}}}}}}
+
+The tools are pictures, search, find, look (a crop, as a picture), where_people_look and check. Each answer has places,
+probabilities, the passes that were spent, and what further looks can bring. Nothing is written or sent elsewhere.
+""",
+    ),
     "check": Subcommand(
         summary="say what is suspicious in a file of fixations",
         positional="files",

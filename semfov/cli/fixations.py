@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,17 +67,20 @@ def check_fixations(options: CheckOptions) -> int:
     """
     check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
     arguments = _reading_arguments(options)
-    place = None if options.picture is None else Path(options.picture)
-    sizes = _PictureSizes(place) if place is not None and _shows_pictures(place) else None
+    sizes = _sizes(options)
     wrong = False
     for name in options.files:
         try:
-            wrong |= _report(Path(name), options, arguments, sizes)
+            report = _report(Path(name), options, arguments, sizes)
         except SemfovError as error:
             if len(options.files) == 1:
                 raise
             print(f"{printable(name)}: cannot be read: {error}")
             wrong = True
+        else:
+            print(f"{printable(name)}: {report.content}")
+            print(*(f"  {line}" for line in report.lines), sep="\n")
+            wrong |= len(report.suspicious) > 0
     return int(wrong)
 
 
@@ -110,8 +113,53 @@ def _shows_pictures(place: Path) -> bool:
     return place.is_dir() or (place.is_file() and place.suffix.lower() in PHOTOGRAPHS)
 
 
-def _report(path: Path, options: CheckOptions, arguments: dict[str, Any], sizes: _PictureSizes | None) -> bool:
-    """Print what is in one file, and what is suspicious; tell whether anything is."""
+class FixationReport(NamedTuple):
+    """What is in a file of fixations.
+
+    Attributes:
+        content: what it holds, in a line.
+        suspicious: what is suspicious, a line each.
+        was_compared: whether frames were compared with pictures.
+    """
+
+    content: str
+    suspicious: list[str]
+    was_compared: bool
+
+    @property
+    def lines(self) -> list[str]:
+        """What is suspicious, a line each, or that nothing is."""
+        if self.suspicious:
+            return [f"suspicious: {line}" for line in self.suspicious]
+        not_compared = "" if self.was_compared else "; frames were not compared with pictures (--picture FOLDER)"
+        return [f"nothing is suspicious{not_compared}"]
+
+
+def fixation_report(path: Path, options: CheckOptions) -> FixationReport:
+    """Read one file of fixations, and say what is suspicious.
+
+    Args:
+        path: the file.
+        options: what the file does not tell itself; its `files` are not read.
+
+    Returns:
+        The report.
+
+    Raises:
+        SemfovError: the file cannot be read.
+    """
+    return _report(path, options, _reading_arguments(options), _sizes(options))
+
+
+def _sizes(options: CheckOptions) -> _PictureSizes | None:
+    """Find the sizes of the pictures that the options name; None where they name none."""
+    place = None if options.picture is None else Path(options.picture)
+    return _PictureSizes(place) if place is not None and _shows_pictures(place) else None
+
+
+def _report(
+    path: Path, options: CheckOptions, arguments: dict[str, Any], sizes: _PictureSizes | None
+) -> FixationReport:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what the lines below say
         reader = reader_of(path, arguments.get("columns"))
@@ -126,13 +174,7 @@ def _report(path: Path, options: CheckOptions, arguments: dict[str, Any], sizes:
     data_set = DATA_SETS.get(reader)
     has_usual_frames = data_set in ("OSIE", "COCO-Search18") and "size" not in arguments
     usual = f" (those of {data_set}, or give --size)" if has_usual_frames else ""
-    print(f"{printable(str(path))}: {_content(records, usual)}")
-    for line in suspicious:
-        print(f"  suspicious: {line}")
-    if not suspicious:
-        not_compared = "" if sizes is not None else "; frames were not compared with pictures (--picture FOLDER)"
-        print(f"  nothing is suspicious{not_compared}")
-    return bool(suspicious)
+    return FixationReport(_content(records, usual), suspicious, was_compared=sizes is not None)
 
 
 def _records(

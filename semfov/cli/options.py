@@ -234,6 +234,19 @@ class AppOptions(AgentOptions):
 
 
 @dataclass(frozen=True)
+class McpOptions(AgentOptions):
+    """Tools for language models, over the pictures below a folder.
+
+    Args:
+        folder: the folder; files elsewhere are refused, also by links.
+    """
+
+    unused: ClassVar[tuple[str, ...]] = ("seed", "start")
+
+    folder: Path = Path()
+
+
+@dataclass(frozen=True)
 class DemoOptions(Settings):
     """A page of what semfov does, on the photographs that come with it.
 

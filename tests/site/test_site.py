@@ -185,3 +185,12 @@ def test_the_search_works_and_requests_nothing_from_elsewhere(site, serve, opene
                 break
         assert wanted in answers, words
     assert [other for other in asked if not other.startswith((address, "data:", "blob:"))] == []
+
+
+def test_language_models_get_a_table_of_contents_whose_links_lead_to_pages(site):
+    text = (site / "llms.txt").read_text(encoding="utf-8")
+    assert text.startswith("# semfov\n\n> ")
+    links = re.findall(r"^- \[[^\]]+\]\(([^)]+)\)", text, re.MULTILINE)
+    assert "tasks/language-model.html" in links
+    missing = [link for link in links if not (site / link).is_file()]
+    assert not missing

@@ -1,0 +1,306 @@
+"""What `semfov mcp` offers a language model: searches, crops and gaze in the pictures below one folder."""
+
+import threading
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from semfov.agent import ActivePerception
+from semfov.cli.fixations import fixation_report
+from semfov.cli.options import CheckOptions
+from semfov.data.large import open_large
+from semfov.data.sources import picture_files
+from semfov.data.windowed import resized
+from semfov.detection import Objects
+from semfov.errors import DataError, check, printable
+from semfov.paths import Record
+from semfov.report.episode import jpeg
+
+MOST_PASSES = 64
+"""Largest number of passes of the detector in one answer."""
+
+_SECONDS = 60.0  # longest time of one answer
+_MOST_PICTURES = 1000  # names in one answer
+_SIDE = 1024  # longest side in pixels of a crop that is shown
+_SMALLEST = 8  # shortest side in pixels of the picture of which a crop is shown
+_MAGNIFIED = 4.0  # largest magnification of a crop
+_QUALITY = 90  # of its JPEG
+
+_Arguments = ParamSpec("_Arguments")
+_Answer = TypeVar("_Answer")
+
+
+@dataclass(frozen=True)
+class Found:
+    """An object: its class, the probability (or score) that it is there, and its box in pixels of the picture."""
+
+    name: str
+    probability: float
+    box: list[float]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer of a search or a find.
+
+    `result` says it in words, and `ended` why no further look was taken. `expected` has the number of objects of each
+    class that is expected in all, also where nobody looked, and `further` that of those which are not listed yet: what
+    further looks can bring.
+    """
+
+    result: str
+    ended: str
+    probability: float | None
+    objects: list[Found]
+    expected: dict[str, float]
+    further: dict[str, float]
+    passes: int
+    size: list[int]
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A place that people look at: its pixel, and the share of fixations near it."""
+
+    x: float
+    y: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Gaze:
+    """Where people look: the places in the order of their shares, and what speaks against the prediction."""
+
+    result: str
+    places: list[Peak]
+    caution: str | None
+    size: list[int]
+
+
+class View(NamedTuple):
+    """A crop: its JPEG, its box in the picture, and what the detector shows in it."""
+
+    jpeg: bytes
+    box: tuple[int, int, int, int]
+    objects: list[Found]
+
+
+def _one_at_a_time(
+    method: Callable[Concatenate["PictureTools", _Arguments], _Answer],
+) -> Callable[Concatenate["PictureTools", _Arguments], _Answer]:
+    """Let calls wait for each other: the agent looks at one picture at a time."""
+
+    @wraps(method)
+    def call(self: "PictureTools", /, *arguments: _Arguments.args, **options: _Arguments.kwargs) -> _Answer:
+        with self._lock:
+            return method(self, *arguments, **options)
+
+    return call
+
+
+class PictureTools:
+    """Tools that look at the pictures below a folder, and at nothing else.
+
+    Args:
+        folder: the folder.
+        agent: the agent that looks.
+
+    Raises:
+        DataError: there is no such folder.
+    """
+
+    def __init__(self, folder: Path, agent: ActivePerception) -> None:
+        if not folder.is_dir():
+            raise DataError(f"folder: expected a folder with pictures, got {printable(str(folder))}")
+        self.folder = folder.resolve()
+        self.agent = agent
+        self._lock = threading.Lock()
+
+    @_one_at_a_time
+    def pictures(self) -> list[str]:
+        """List the pictures by their names, which are paths from the folder; at most a thousand."""
+        with _other_files_ignored():
+            files = picture_files(self.folder, recursive=True)
+        inside = (file for file in files if self._is_inside(file))
+        names = [file.relative_to(self.folder).as_posix() for file in inside]
+        return names[:_MOST_PICTURES]
+
+    @_one_at_a_time
+    def search(self, picture: str, target: str, passes: int = 16, prior: float = 0.5) -> Answer:
+        """Search a picture for one object of a class.
+
+        Args:
+            picture: its name.
+            target: the class.
+            passes: most passes of the detector.
+            prior: how likely the class is in the picture before anybody looks.
+
+        Returns:
+            The answer.
+        """
+        path = self._path(picture)
+        _check_passes(passes)
+        record = self.agent.search(path, target, passes=passes, seconds=_SECONDS, prior=prior)
+        return _answer(record)
+
+    @_one_at_a_time
+    def find(self, picture: str, classes: list[str], passes: int = 24) -> Answer:
+        """Find all objects of some classes in a picture.
+
+        Args:
+            picture: its name.
+            classes: the classes; none for all that the detector knows.
+            passes: most passes of the detector.
+
+        Returns:
+            The answer.
+        """
+        path = self._path(picture)
+        _check_passes(passes)
+        record = self.agent.find_all(path, classes or None, passes=passes, seconds=_SECONDS)
+        return _answer(record)
+
+    @_one_at_a_time
+    def look(self, picture: str, x: float, y: float, width: float) -> View:
+        """Look closely at one place: a crop as wide as it is high, and what the detector shows in it.
+
+        Args:
+            picture: its name.
+            x: centre in pixels of the picture, from its left side.
+            y: centre likewise, from above.
+            width: width of the crop in pixels of the picture. A narrow crop is magnified, at most four times.
+
+        Returns:
+            The crop, which is moved into the picture where it would reach beyond it.
+        """
+        source = open_large(self._path(picture))
+        box = _crop_box(source.size, x, y, width)
+        pixels = source.read(box)
+        crop = _shown(pixels)
+        record = self.agent.find_all(pixels, passes=1, how="windows")
+        left, top, _, _ = box
+        return View(crop, box, _rows(record.objects, record.classes, (left, top)))
+
+    @_one_at_a_time
+    def where_people_look(self, picture: str) -> Gaze:
+        """Predict where people look in a picture that they view freely for some seconds.
+
+        Args:
+            picture: its name.
+
+        Returns:
+            The places, in the order of their shares.
+        """
+        prediction = self.agent.gaze(self._path(picture))
+        places = [Peak(x=peak["x"], y=peak["y"], share=peak["share"]) for peak in prediction.peaks()]
+        return Gaze(
+            result=prediction.describe(),
+            places=places,
+            caution=prediction.caution,
+            size=list(prediction.size),
+        )
+
+    @_one_at_a_time
+    def check(self, fixations: str) -> list[str]:
+        """Say what is suspicious in a file of fixations, beside the pictures of the folder.
+
+        Args:
+            fixations: the file's path from the folder.
+
+        Returns:
+            What is in the file, and what is suspicious.
+        """
+        path = self._path(fixations)
+        options = CheckOptions(files=(str(path),), picture=str(self.folder), quiet=True)
+        with _other_files_ignored():
+            report = fixation_report(path, options)
+        return [report.content, *report.lines]
+
+    def _path(self, name: str) -> Path:
+        """Find a file by its path from the folder; raises `InputError` for any other."""
+        expected = "the path of a file below the folder, as `pictures` lists them"
+        check("\0" not in name, "picture", expected, printable(name))
+        path = self.folder / name
+        check(self._is_inside(path), "picture", expected, printable(name))
+        try:
+            is_there = path.is_file()
+        except OSError:  # the name is too long
+            is_there = False
+        check(is_there, "picture", expected, f"{printable(name)}, which is none")
+        return path
+
+    def _is_inside(self, path: Path) -> bool:
+        """Tell whether a path, with all links followed, leads to a place below the folder."""
+        try:
+            return path.resolve().is_relative_to(self.folder)
+        except (OSError, RuntimeError):  # a name that is too long, or links in a ring
+            return False
+
+
+@contextmanager
+def _other_files_ignored() -> Iterator[None]:
+    """Silence the warning of files that are no pictures: in this folder they are expected."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def _check_passes(passes: int) -> None:
+    check(1 <= passes <= MOST_PASSES, "passes", f"1 to {MOST_PASSES}", passes)
+
+
+def _answer(record: Record) -> Answer:
+    """Make the answer from a record."""
+    listed = Counter(record.classes[label] for label in record.objects.labels.tolist())
+    further = {name: round(max(number - listed[name], 0.0), 2) for name, number in record.expected.items()}
+    return Answer(
+        result=record.describe(),
+        ended=record.why_it_ended(),
+        probability=None if record.decision is None else round(record.decision.probability, 4),
+        objects=_rows(record.objects, record.classes),
+        expected={name: round(number, 2) for name, number in record.expected.items()},
+        further=further,
+        passes=record.passes,
+        size=list(record.size),
+    )
+
+
+def _rows(objects: Objects, classes: tuple[str, ...], corner: tuple[int, int] = (0, 0)) -> list[Found]:
+    """Make a row for each object; boxes of a crop are moved by its corner in the picture."""
+    offset = torch.tensor([*corner, *corner])
+    boxes = (objects.boxes + offset).tolist()
+    rows = []
+    for box, score, label in zip(boxes, objects.scores.tolist(), objects.labels.tolist(), strict=True):
+        rows.append(Found(name=classes[label], probability=round(score, 4), box=[round(edge, 1) for edge in box]))
+    return rows
+
+
+def _crop_box(size: tuple[int, int], x: float, y: float, width: float) -> tuple[int, int, int, int]:
+    """Place a square crop in a picture; it is moved, and at most cut to the picture, where it would reach beyond it."""
+    longest = max(size)
+    check(_SMALLEST <= width <= longest, "width", f"{_SMALLEST} to {longest} pixels", width)
+    for name, place, side in (("x", x, size[0]), ("y", y, size[1])):
+        check(0 <= place <= side, name, f"0 to {side}, a pixel of the picture", place)
+    lengths = [min(round(width), side) for side in size]
+    starts = [
+        min(max(round(place - length / 2), 0), side - length)
+        for place, length, side in zip((x, y), lengths, size, strict=True)
+    ]
+    left, top = starts
+    return left, top, left + lengths[0], top + lengths[1]
+
+
+def _shown(pixels: Tensor) -> bytes:
+    """Make a JPEG of a crop of bytes `(3, h, w)`, whose longer side has at most `_SIDE` pixels."""
+    height, width = pixels.shape[1:]
+    scale = min(_SIDE / max(height, width), _MAGNIFIED)
+    size = max(round(height * scale), 1), max(round(width * scale), 1)
+    return jpeg(resized(pixels, size)[0], _QUALITY)
