@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.fixations import Fixations, suspicions
-from semfov.data.fixations.reading import read_fixations
 from semfov.data.reading import read_image
 from semfov.detection.load import load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.human import content_suspicions
+from semfov.human.fixations.reading import read_fixations
 from semfov.paths.gaze import GazePrediction
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig

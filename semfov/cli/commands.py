@@ -283,7 +283,7 @@ probabilities, the passes that were spent, and what further looks can bring. Not
         positional="files",
         positional_help="files of fixations",
         options="cli.options:CheckOptions",
-        function="cli.fixations:check_fixations",
+        function="human.check:check_fixations",
         help="""\
 semfov check: is a file of fixations what it seems to be?
 

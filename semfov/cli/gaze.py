@@ -16,7 +16,7 @@ from semfov.cli.options import GazeOptions
 from semfov.cli.results import held_outputs, tell_written, unfinished
 from semfov.cli.sources import example_source, picture_sources
 from semfov.data.examples import EXAMPLES
-from semfov.data.fixations import Fixations, write_table
+from semfov.data.fixations import Fixations
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -143,6 +143,8 @@ class _GazeJob:
 
     def write(self, *, complete: bool) -> None:
         """Write scanpaths and page of the pictures so far, and list all files."""
+        from semfov.human.fixations.table import write_table
+
         outcomes = dict(sorted(self.outcomes.items()))
         written: list[object] = [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
         names = self._names()

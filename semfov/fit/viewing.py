@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from semfov.data.fixations import Fixations, by_picture, read_fixations
-from semfov.data.fixations.reading import frame_of
+from semfov.data.fixations import Fixations, by_picture
 from semfov.data.pictures import Pictures
 from semfov.detection import Detections, Detector, FeatureMaps, Placement
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
+from semfov.human.fixations.reading import frame_of, read_fixations
 from semfov.io.code import modules_digest
 from semfov.io.files import sha256
 from semfov.io.schema import Field, Schema

@@ -57,7 +57,8 @@ class Policy(nn.Module):
     ) -> None:
         super().__init__()
         if not isinstance(function, type):
-            function = FUNCTIONS[lookup(function, FUNCTIONS, "policy")]
+            # All names are listed for the message alone.
+            function = FUNCTIONS[function if function in FUNCTIONS else lookup(function, FUNCTIONS, "policy")]
         kind = getattr(function, "__name__", function)
         check(issubclass(function, AcquisitionFunction), "function", "a class of acquisition functions", kind)
         self.function = function

@@ -155,7 +155,7 @@ class Record(Conversion):
         Returns:
             Each measure of this record and of the people among themselves; it prints as a table.
         """
-        from semfov.metrics.scanpath.beside import compare_scanpath
+        from semfov.human.scanpath.beside import compare_scanpath
 
         return compare_scanpath(self, people)
 

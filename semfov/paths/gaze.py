@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.fixations import Fixations, write_table
-from semfov.data.fixations.suspicions import check_viewed, warn_of_frames
+from semfov.data.fixations import Fixations
 from semfov.detection import Detections, Detector, FeatureMaps
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
@@ -319,7 +318,7 @@ class GazePrediction(OtherWords):
                 their frame has other proportions.
             DataError: the file cannot be read.
         """
-        from semfov.metrics.scanpath.beside import compare_density
+        from semfov.human.scanpath.beside import compare_density
 
         return compare_density(self, people)
 
@@ -388,6 +387,8 @@ class GazePrediction(OtherWords):
             seconds: time for which each views the picture.
             seed: seed of all draws.
         """
+        from semfov.human.fixations.table import write_table
+
         write_table(path, self.scanpaths(people, seconds=seconds, seed=seed))
 
     def save_density(self, path: str | PathLike[str]) -> Path:
@@ -497,6 +498,8 @@ def _fixations_of(given: object, argument: str, size: tuple[int, int], source: s
     Raises:
         InputError: they are not those of one viewer of this picture.
     """
+    from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
+
     expected = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
     if isinstance(given, Record):
         given = given.as_fixations(given.source or source or "")

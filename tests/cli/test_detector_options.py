@@ -178,7 +178,7 @@ PRINTED_BY = {
     "cli/search.py": ["search", "find", "explore"],
     "cli/outcome.py": ["search", "find", "explore"],
     "cli/live.py": ["live"],
-    "cli/fixations.py": ["check"],
+    "human/check.py": ["check"],
     "cli/sources.py": ["search", "find", "explore", "gaze"],
     "model_folder.py": ["search", "find", "explore", "live", "app"],
 }

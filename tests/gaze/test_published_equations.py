@@ -12,8 +12,8 @@ from scipy import integrate
 from scipy.stats import norm
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
+from semfov.baselines.ideal import _correct_localisation
 from semfov.gaze.acquisition import CorrectLocalisation, EntropyLimit, TargetPosterior
-from semfov.gaze.acquisition.ideal import _correct_localisation
 from semfov.gaze.policies import Policy
 from semfov.observation import visibility
 from tests.small import kaplan

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from eval.human.search.trials import in_cells, shift_found
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture
+from semfov.human.scanpath.sequence import fitted_clusters
 from semfov.metrics.episodes import cumulative_performance, standard_error
 from semfov.metrics.scanpath import (
     edit_distance,
@@ -24,7 +25,6 @@ from semfov.metrics.scanpath import (
     sequence_score,
     tfp_auc,
 )
-from semfov.metrics.scanpath.sequence import fitted_clusters
 
 _Array = NDArray[np.float64]
 

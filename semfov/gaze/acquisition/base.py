@@ -1,7 +1,7 @@
 """The base class of acquisition functions, and their registry by name."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from inspect import Parameter, signature
 from typing import ClassVar, Literal, get_args
 
@@ -11,7 +11,47 @@ from semfov.belief.belief import Belief
 from semfov.errors import check
 
 Task = Literal["search", "exploration"]
-FUNCTIONS: dict[str, type["AcquisitionFunction"]] = {}  # all named acquisition functions
+
+
+class _Registry(MutableMapping[str, type["AcquisitionFunction"]]):
+    """Named acquisition functions, in the order of their registration.
+
+    The baselines (`semfov.baselines`) stand on this room, which imports none of them before all names are listed, or
+    one is asked for that is not registered yet.
+
+    Attributes:
+        registered: those that are registered so far, by name.
+    """
+
+    def __init__(self) -> None:
+        self.registered: dict[str, type[AcquisitionFunction]] = {}
+
+    def __getitem__(self, name: str) -> type["AcquisitionFunction"]:
+        if name not in self.registered:
+            register_baselines()
+        return self.registered[name]
+
+    def __setitem__(self, name: str, function: type["AcquisitionFunction"]) -> None:
+        self.registered[name] = function
+
+    def __delitem__(self, name: str) -> None:
+        del self.registered[name]
+
+    def __iter__(self) -> Iterator[str]:
+        register_baselines()
+        return iter(self.registered)
+
+    def __len__(self) -> int:
+        register_baselines()
+        return len(self.registered)
+
+
+FUNCTIONS = _Registry()
+
+
+def register_baselines() -> None:
+    """Register the acquisition functions of `semfov.baselines`, by importing them."""
+    import semfov.baselines  # noqa: F401
 
 
 class AcquisitionFunction(nn.Module, ABC):
@@ -73,7 +113,9 @@ class AcquisitionFunction(nn.Module, ABC):
     @classmethod
     def _register(cls, by_name: bool) -> None:
         """Check the name, the arguments and the tasks of a subclass, and register it."""
-        owner = FUNCTIONS.get(cls.name, cls)
+        if not cls.__module__.startswith("semfov."):
+            register_baselines()  # whose names a user's class may not take
+        owner = FUNCTIONS.registered.get(cls.name, cls)
         # A cell of a notebook that is run again defines its class again.
         same = owner.__qualname__ == cls.__qualname__
         check(same, "name", f"one not taken by {owner.__qualname__}", repr(cls.name))

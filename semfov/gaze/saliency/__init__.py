@@ -4,12 +4,15 @@ VOCUS2 is the baseline of Luzio, Bernardino and Moreno (2024, section IV-B), com
 fixation. VOCUS2 builds on the model of Itti, Koch and Niebur; the paper has no figures for that model.
 """
 
+from typing import TYPE_CHECKING
+
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
-from semfov.gaze.saliency.itti import IttiKoch, itti_koch_saliency
 from semfov.gaze.saliency.oculomotor import OculomotorBias
-from semfov.gaze.saliency.vocus2 import VOCUS2, vocus2_saliency
+
+if TYPE_CHECKING:
+    from semfov.baselines import VOCUS2, IttiKoch, itti_koch_saliency, vocus2_saliency
 
 __all__ = [
     "VOCUS2",
@@ -21,3 +24,12 @@ __all__ = [
     "itti_koch_saliency",
     "vocus2_saliency",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import a baseline when it is first asked for."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import semfov.baselines
+
+    return getattr(semfov.baselines, name)

@@ -7,12 +7,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from semfov.data.fixations.columns import DataFrame
-from semfov.data.fixations.exports import table_reader
-from semfov.data.fixations.eyelink import read_eyelink
-from semfov.data.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, InputError, check, check_options
+from semfov.human.fixations.columns import DataFrame
+from semfov.human.fixations.exports import table_reader
+from semfov.human.fixations.eyelink import read_eyelink
+from semfov.human.fixations.formats import read_cocosearch, read_osie, read_ruarte
 from semfov.io.files import read_text
 
 _Reader = Callable[..., list[Fixations]]

@@ -10,11 +10,11 @@ from typing import NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations.columns import DataFrame, Row, Table, table_of
-from semfov.data.fixations.programs import Origin, Units
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check, check_data, lookup
+from semfov.human.fixations.columns import DataFrame, Row, Table, table_of
+from semfov.human.fixations.programs import Origin, Units
+from semfov.human.fixations.suspicions import warn_of_frames
 from semfov.io.files import write_text
 
 _COLUMNS = ("picture", "subject", "x", "y")

@@ -12,6 +12,7 @@ from scipy.stats import wasserstein_distance
 from sklearn.cluster import MeanShift
 
 from semfov.errors import InputError
+from semfov.human.scanpath.sequence import fitted_clusters
 from semfov.metrics.scanpath import (
     cell_labels,
     cluster_labels,
@@ -26,7 +27,6 @@ from semfov.metrics.scanpath import (
     sequence_score,
     time_delay_embedding,
 )
-from semfov.metrics.scanpath.sequence import fitted_clusters
 from tests.refusals import refused
 
 RNG = np.random.default_rng(0)

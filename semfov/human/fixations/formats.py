@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.fixations.record import Fixations, by_picture
-from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, InputError, check, check_data
+from semfov.human.fixations.suspicions import warn_of_frames
 from semfov.io.files import read_json, write_text
 from semfov.io.schema import Array, Json, Maybe, Number, Object, Text, check_content
 

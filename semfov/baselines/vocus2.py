@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.baselines.blur import enlarge, gaussian_blur, rescale
+from semfov.baselines.opponent import anchor, lab_colours, opponent_colours
 from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, lookup
-from semfov.gaze.saliency.blur import enlarge, gaussian_blur, rescale
-from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
 _ColorSpace = Literal["opponent", "lab"]
 _Fusion = Literal["mean", "max"]
@@ -92,7 +92,7 @@ def vocus2_saliency(
         scales: number of scales of a layer.
         fusion: `mean` or `max`, within and across features.
         color_space: `opponent`, the intensity and two opponencies of Frintrop, Werner and Martin García
-            (`semfov.gaze.saliency.opponent.opponent_colours`); or `lab`, CIELAB, which the authors' program offers too
+            (`semfov.baselines.opponent.opponent_colours`); or `lab`, CIELAB, which the authors' program offers too
             (`lab_colours` in the same module). The program rounds CIELAB to bytes; we do not.
         normalise: scale every map to [0, 1].
 

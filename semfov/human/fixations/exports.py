@@ -8,11 +8,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
-from semfov.data.fixations.columns import DataFrame, Row, Table, table_of
-from semfov.data.fixations.programs import LENGTHS, PROGRAMS, TIMES, Column, Origin, Program, Units, program_of
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.table import Coordinates, FrameError, Size, named_columns, read_table, records_of
 from semfov.errors import DataError, check, check_data
+from semfov.human.fixations.columns import DataFrame, Row, Table, table_of
+from semfov.human.fixations.programs import LENGTHS, PROGRAMS, TIMES, Column, Origin, Program, Units, program_of
+from semfov.human.fixations.table import Coordinates, FrameError, Size, named_columns, read_table, records_of
 
 _SCANPATH = ("picture", "subject", "target", "trial")
 """Our names of the fields that the fixations of a scanpath share."""

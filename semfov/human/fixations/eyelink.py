@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from semfov.data.fixations.record import Fixations
-from semfov.data.fixations.suspicions import warn_of_frames
 from semfov.errors import DataError, check, check_data
+from semfov.human.fixations.suspicions import warn_of_frames
 from semfov.io.files import read_text
 
 _MESSAGE = re.compile(r"^MSG\s+(\d+(?:\.\d+)?)\s+(?:(-?\d+)\s+(?=!V\s|TRIAL))?(.*)$")

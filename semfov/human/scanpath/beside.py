@@ -8,13 +8,14 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations import Fixations, read_fixations
-from semfov.data.fixations.suspicions import check_viewed, warn_of_frames
+from semfov.data.fixations import Fixations
 from semfov.errors import check
-from semfov.metrics.scanpath.alignment import dynamic_time_warping, multimatch, scanmatch, time_delay_embedding
-from semfov.metrics.scanpath.maps import auc, auc_judd, correlation, kullback_leibler, log_likelihood, nss, similarity
-from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
-from semfov.metrics.scanpath.sequence import cell_labels, edit_distance, sequence_score
+from semfov.human.fixations.reading import read_fixations
+from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
+from semfov.human.scanpath.alignment import dynamic_time_warping, multimatch, scanmatch, time_delay_embedding
+from semfov.human.scanpath.maps import auc, auc_judd, correlation, kullback_leibler, log_likelihood, nss, similarity
+from semfov.human.scanpath.saccades import direction_distance, length_distance, saccades
+from semfov.human.scanpath.sequence import cell_labels, edit_distance, sequence_score
 from semfov.paths import GazePrediction, Record
 
 _CELLS = 8  # rows and columns of the grid whose cells are the words of a scanpath

@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from semfov.cli.content import suspicions_by_content
 from semfov.cli.options import CheckOptions
-from semfov.data.fixations import Fixations, suspicions
-from semfov.data.fixations.exports import PictureError
-from semfov.data.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
-from semfov.data.fixations.suspicions import other_frame_of
-from semfov.data.fixations.table import FrameError
+from semfov.data.fixations import Fixations
 from semfov.data.large import picture_size
 from semfov.data.sources import PHOTOGRAPHS, picture_files
 from semfov.errors import DataError, SemfovError, check, printable
+from semfov.human.density_check import suspicions_by_content
+from semfov.human.fixations.exports import PictureError
+from semfov.human.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
+from semfov.human.fixations.suspicions import other_frame_of, suspicions
+from semfov.human.fixations.table import FrameError
 
 _FRAMES_NAMED = 3  # largest number of sizes of frames that are named
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from semfov.data.fixations.record import as_array, as_path
 from semfov.errors import check, check_number, check_whole
-from semfov.metrics.scanpath.sequence import cell_labels
+from semfov.human.scanpath.sequence import cell_labels
 
 _Array = NDArray[np.float64]
 

@@ -5,15 +5,15 @@ Definitions differ between groups, and each function names the group whose defin
 sequences need `pip install semfov[human]`.
 """
 
-from semfov.metrics.scanpath.alignment import (
+from semfov.human.scanpath.alignment import (
     MultiMatch,
     dynamic_time_warping,
     multimatch,
     scanmatch,
     time_delay_embedding,
 )
-from semfov.metrics.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
-from semfov.metrics.scanpath.maps import (
+from semfov.human.scanpath.beside import BesidePeople, ScanpathComparison, compare_scanpath
+from semfov.human.scanpath.maps import (
     auc,
     auc_borji,
     auc_judd,
@@ -26,7 +26,7 @@ from semfov.metrics.scanpath.maps import (
     nss,
     similarity,
 )
-from semfov.metrics.scanpath.performance import (
+from semfov.human.scanpath.performance import (
     found_at,
     mean_performance,
     performance_area,
@@ -34,8 +34,8 @@ from semfov.metrics.scanpath.performance import (
     scanpath_ratio,
     tfp_auc,
 )
-from semfov.metrics.scanpath.saccades import direction_distance, length_distance, saccades
-from semfov.metrics.scanpath.sequence import (
+from semfov.human.scanpath.saccades import direction_distance, length_distance, saccades
+from semfov.human.scanpath.sequence import (
     cell_labels,
     cluster_labels,
     edit_distance,

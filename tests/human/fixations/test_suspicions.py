@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from semfov.cli.fixations import _PictureSizes
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, read_fixations, suspicions, write_cocosearch, write_osie, write_table
+from semfov.human.check import _PictureSizes
 from tests.refusals import unusable
 
 SIZE = (800, 600)
