@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.machine import use_threads
 from benchmarks.tables import comparison_rows, table
 from benchmarks.timing import Clock, Comparison, clock_for, measure
-from semfov.baselines.blur import _gaussian_kernel, gaussian_blur
+from semfov.baselines.saliency.blur import _gaussian_kernel, gaussian_blur
 from semfov.sensor import foveate, laplacian_pyramid, pyramid
 
 LEVELS = 4

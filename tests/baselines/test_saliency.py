@@ -10,9 +10,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.baselines.blur import enlarge, gaussian_blur
-from semfov.baselines.itti import _promote
-from semfov.baselines.opponent import double_opponency, lab_colours, opponent_colours
+from semfov.baselines.saliency.blur import enlarge, gaussian_blur
+from semfov.baselines.saliency.itti import _promote
+from semfov.baselines.saliency.opponent import double_opponency, lab_colours, opponent_colours
 from semfov.gaze.saliency import VOCUS2, IttiKoch, itti_koch_saliency, vocus2_saliency
 from tests.lightness import lab_of
 from tests.refusals import refused
@@ -137,7 +137,7 @@ def test_colour_channels_of_grey_are_zero(level: float, dtype: torch.dtype) -> N
 def test_rows_that_are_worked_on_together_change_no_bit(monkeypatch) -> None:
     image = torch.rand(2, 3, 37, 50, generator=torch.Generator().manual_seed(0))
     expected = double_opponency(image)
-    monkeypatch.setattr("semfov.baselines.opponent._PIXELS", 300)
+    monkeypatch.setattr("semfov.baselines.saliency.opponent._PIXELS", 300)
     assert torch.equal(double_opponency(image), expected)
 
 

@@ -19,7 +19,7 @@ from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTarg
 from semfov.gaze.acquisition.static import Static, Uniform
 
 if TYPE_CHECKING:
-    from semfov.baselines import CorrectLocalisation, EntropyLimit
+    from semfov.baselines.ideal import CorrectLocalisation, EntropyLimit
 
 __all__ = [
     "FUNCTIONS",
@@ -50,6 +50,6 @@ def __getattr__(name: str) -> object:
     """Import a baseline when it is first asked for."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import semfov.baselines
+    import semfov.baselines.ideal
 
-    return getattr(semfov.baselines, name)
+    return getattr(semfov.baselines.ideal, name)

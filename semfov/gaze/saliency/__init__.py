@@ -12,7 +12,7 @@ from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 
 if TYPE_CHECKING:
-    from semfov.baselines import VOCUS2, IttiKoch, itti_koch_saliency, vocus2_saliency
+    from semfov.baselines.saliency import VOCUS2, IttiKoch, itti_koch_saliency, vocus2_saliency
 
 __all__ = [
     "VOCUS2",
@@ -30,6 +30,6 @@ def __getattr__(name: str) -> object:
     """Import a baseline when it is first asked for."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import semfov.baselines
+    import semfov.baselines.saliency
 
-    return getattr(semfov.baselines, name)
+    return getattr(semfov.baselines.saliency, name)

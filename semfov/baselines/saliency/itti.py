@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.baselines.blur import rescale
-from semfov.baselines.opponent import anchor, double_opponency
+from semfov.baselines.saliency.blur import rescale
+from semfov.baselines.saliency.opponent import anchor, double_opponency
 from semfov.data.inputs import ImageLike, as_batch
 from semfov.sensor.constants import constant
 from semfov.sensor.pyramid import pyrdown

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.baselines.blur import enlarge, gaussian_blur, rescale
-from semfov.baselines.opponent import anchor, lab_colours, opponent_colours
+from semfov.baselines.saliency.blur import enlarge, gaussian_blur, rescale
+from semfov.baselines.saliency.opponent import anchor, lab_colours, opponent_colours
 from semfov.data.inputs import ImageLike, as_batch
 from semfov.errors import check, lookup
 
@@ -92,8 +92,8 @@ def vocus2_saliency(
         scales: number of scales of a layer.
         fusion: `mean` or `max`, within and across features.
         color_space: `opponent`, the intensity and two opponencies of Frintrop, Werner and Martin García
-            (`semfov.baselines.opponent.opponent_colours`); or `lab`, CIELAB, which the authors' program offers too
-            (`lab_colours` in the same module). The program rounds CIELAB to bytes; we do not.
+            (`semfov.baselines.saliency.opponent.opponent_colours`); or `lab`, CIELAB, which the authors' program offers
+            too (`lab_colours` in the same module). The program rounds CIELAB to bytes; we do not.
         normalise: scale every map to [0, 1].
 
     Returns:
