@@ -212,7 +212,7 @@ class Record(Conversion):
         """
         from semfov.report.page import write_page
 
-        return write_page(Path(path), f"semfov: {self.describe()}", [self.page_data(**options)])
+        return write_page(Path(path), f"semfov: {self.words.task}", [self.page_data(**options)])
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> Values:
         """Collect the data of the record for a page (`semfov.report.zoom.zoom_data`, for a scanpath `episode_data`).

@@ -51,6 +51,15 @@ class Words(ABC):
         return []
 
     @property
+    def task(self) -> str:
+        """What was asked, in a few words, such as `search for “cup”`."""
+        record = self.record
+        names = ", ".join(f"“{record.classes[label]}”" for label in record.sought)
+        if not names:
+            return "what is where"
+        return f"search for {names}" if record.target is not None and not record.targets else f"all objects: {names}"
+
+    @property
     def measure(self) -> str:
         """What the scores of objects are: `probability` with a fitted certainty, otherwise `score`."""
         return "score" if self.record.unseen is None else "probability"

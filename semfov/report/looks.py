@@ -12,7 +12,7 @@ from semfov.viz.labels import LabelBox, place_labels, place_within
 _NAMED = 25  # largest number of objects whose names are shown at first; more would cover the picture
 
 
-def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str]) -> str:
+def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str], *, is_named: bool = True) -> str:
     """Make the article of a record: the picture with its objects and windows, the list of the objects, and all looks.
 
     Args:
@@ -20,6 +20,7 @@ def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str])
         place: id of the article.
         objects: HTML of the list of the objects.
         facts: facts that are shown without the script, by their names; empty for none.
+        is_named: whether the name of the picture is shown.
 
     Returns:
         HTML.
@@ -34,8 +35,9 @@ def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str])
         f'<label><input type="checkbox" class="names-shown"{names_shown}> Names</label></span>'
     )
     legend = "".join(f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in _legend(data))
+    unseen = "" if is_named else ' class="unseen"'
     return (
-        f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>'
+        f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name"{unseen}>{name}</h3>'
         f'{noscript}<div class="panes"><figure class="overview"><figcaption><ul class="key">{legend}</ul>{switches}'
         f'</figcaption>{_overview(data, place)}</figure><section class="found-objects" '
         f'aria-labelledby="{place}-objects"><h4 id="{place}-objects">Objects</h4>{objects}</section></div>'
@@ -185,7 +187,7 @@ def _look_facts(look: Data, number: int) -> dict[str, str]:
         facts["Value when it was chosen"] = f"{look['value']:.2g}"
     elif number == 0:
         facts["Value when it was chosen"] = "none: the first look"
-    facts["Objects that no look shows more sharply"] = look["brought"]
+    facts["Best seen in this look"] = look["brought"] or "no object"
     if look["seconds"] is not None:
         warm_up = ", with the warm-up of the detector" if look["warm"] else ""
         facts["End"] = f"after {look['seconds']:.2f} s{warm_up}"

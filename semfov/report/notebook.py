@@ -134,6 +134,6 @@ def _frame(scanpath: Scanpath, views: Sequence[Tensor] | None, classes: int, wid
     words = scanpath.describe()
     return (
         f'<iframe title="{escape(words)}" sandbox="allow-scripts" loading="lazy" '
-        f'srcdoc="{escape(page_html(f"semfov: {words}", [data]))}" '
+        f'srcdoc="{escape(page_html(f"semfov: {scanpath.words.task}", [data]))}" '
         f'style="width:100%;height:{_HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
     )

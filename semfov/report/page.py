@@ -5,7 +5,7 @@ Looks at windows are complete without the script (`semfov.report.parts`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
@@ -70,16 +70,17 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
-    about = _about_html(episodes)
-    # The facts about one of several episodes stand where it is chosen.
-    chosen_below = bool(sections) or len(episodes) > 1
+    # The facts about one of several episodes stand where it is chosen; a single one begins with its outcome.
+    is_chosen = bool(sections) or len(episodes) != 1
     script_draws = not episodes or any(isinstance(part, EpisodePart) for part in parts)
     contents = {
         "title": escape(title),
         "sections": sections,
-        "about": "" if chosen_below else about,
-        "of_episode": about if chosen_below else "",
-        "looks": "".join(part.looks_html for part in parts),
+        "outcome": "" if is_chosen else _outcome_html(episodes[0]),
+        "heading": "" if is_chosen else ' class="unseen"',
+        "of_episode": _about_html(episodes) if is_chosen else "",
+        "details": "" if is_chosen else _details_html(episodes[0]),
+        "looks": "".join(part.looks_html(is_named=is_chosen) for part in parts),
         "objects": "".join(part.section_html for part in parts),
         "least": f"{CONFIDENT:g}",
         "fixations": "" if script_draws else " hidden",
@@ -87,14 +88,32 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     return filled("page", data, contents)
 
 
+def _outcome_html(episode: Data) -> str:
+    """Say what came of a single episode, below the title."""
+    fact = escape(episode.get("decision") or "")
+    hidden = "" if fact else " hidden"
+    return f'<div{hidden}><p class="outcome" data-about="decision">{fact}</p></div>'
+
+
+def _details_html(episode: Data) -> str:
+    """List the facts about a single episode, at the end of its page."""
+    # A picture without a file is named by its size.
+    is_named = episode.get("name") != episode.get("pixels")
+    facts = [fact for fact in ABOUT if fact != "decision" and (is_named or fact != "name")]
+    return f"<h3>Details</h3>{_facts_html([episode], facts)}\n"
+
+
 def _about_html(episodes: Sequence[Data]) -> str:
     """List facts about the first episode, which the script updates for other episodes; empty without episodes."""
-    if not episodes:
-        return ""
+    return _facts_html(episodes, ABOUT) if episodes else ""
+
+
+def _facts_html(episodes: Sequence[Data], facts: Iterable[str]) -> str:
+    """List facts about the first episode; those that only others have are hidden until one of these is chosen."""
     rows = []
-    for key, label in ABOUT.items():
+    for key in facts:
         if any(key in episode for episode in episodes):
             fact = episodes[0].get(key) or ""
             hidden = "" if fact else " hidden"
-            rows.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{escape(fact)}</dd></div>')
+            rows.append(f'<div{hidden}><dt>{ABOUT[key]}</dt><dd data-about="{key}">{escape(fact)}</dd></div>')
     return f'<dl id="about" class="facts">{"".join(rows)}</dl>'

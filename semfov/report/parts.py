@@ -67,9 +67,12 @@ class Part(ABC):
         """Pictures that the script draws, as data URIs."""
         return []
 
-    @property
-    def looks_html(self) -> str:
-        """Its article with looks; empty where the script draws them."""
+    def looks_html(self, *, is_named: bool) -> str:
+        """Make its article with looks; empty where the script draws them.
+
+        Args:
+            is_named: whether the name of the picture is shown.
+        """
         return ""
 
     @property
@@ -191,11 +194,15 @@ class LooksPart(Part):
         """Id of its article."""
         return f"large-{self.number}"
 
-    @property
-    def looks_html(self) -> str:
-        """Its article; without the script the facts stand in it, except for those of the first part of the page."""
+    def looks_html(self, *, is_named: bool) -> str:
+        """Make its article; without the script the facts stand in it, but for those of the first part of the page.
+
+        Args:
+            is_named: whether the name of the picture is shown.
+        """
         facts = {ABOUT[name]: self.data[name] for name in ABOUT if self.data[name] is not None}
-        return article_html(self.data, self.place, self.objects_html(), {} if self.number == 0 else facts)
+        shown = {} if self.number == 0 else facts
+        return article_html(self.data, self.place, self.objects_html(), shown, is_named=is_named)
 
     def script_data(self, numbers: Mapping[str, int]) -> Data:
         """Make what the script reads: facts and words about the looks."""

@@ -8,6 +8,8 @@ function stepper({ last, show, word, pause }) {
   const steps = { at: 0, stepped: false, draw, go, start, stop };
   let playing = null;
   function draw() {
+    // There is nothing to step through where there was one look.
+    document.querySelector(".controls").hidden = last() === 0;
     find("fixation").max = last();
     find("fixation").value = steps.at;
     find("fixation").setAttribute("aria-valuetext", `${word()} ${steps.at} of ${last()}`);

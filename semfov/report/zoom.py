@@ -6,6 +6,7 @@ from statistics import median
 
 from torch import Tensor
 
+from semfov.data.classes import counted
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
@@ -113,7 +114,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
                 f"Look {look.number} of {len(path) - 1}{_where_in_words(path, look, magnification, turned)}.",
                 *([] if look.value is None else [f"Its value was {look.value:.2g}."]),
                 *([] if closer is None else [_closer_in_words(closer)]),
-                f"Objects that no look shows more sharply: {brought}.",
+                *([f"Best seen in this look: {brought}."] if brought else []),
             ]
         ),
     }
@@ -130,10 +131,10 @@ def _closer_in_words(closer: CloseUp) -> str:
 
 
 def _brought_in_words(path: Record, look: RecordedLook) -> str:
-    """Count the objects by class that no look shows more sharply."""
+    """Count the objects by class that no look shows more sharply; empty for none."""
     labels = path.objects.labels[path.objects.passes == look.number].tolist()
     counts = Counter(path.classes[label] for label in labels)
-    return ", ".join(f"{count} × {name}" for name, count in counts.most_common()) or "none"
+    return ", ".join(counted(count, name) for name, count in counts.most_common())
 
 
 def _pose_in_words(look: RecordedLook) -> str:

@@ -57,12 +57,13 @@ def test_names_are_never_interpreted_as_markup(kind, hostile, request):
     assert hostile in {each["label"] for each in episode["maps"]}
 
 
-def test_a_page_begins_with_its_summary_or_else_with_the_facts_of_the_episode(run_page, scanpath, image, tmp_path):
+def test_a_page_begins_with_its_summary_or_else_with_the_outcome_of_the_episode(run_page, scanpath, image, tmp_path):
     run = run_page.read_text(encoding="utf-8")
     assert run.index("<section><h2>") < run.index('id="viewer"') < run.index('id="about"')
     data = episode_data(scanpath, image, [image] * 3, name="kitchen")
     single = write_page(tmp_path / "page.html", "Cup", [data]).read_text(encoding="utf-8")
-    assert single.index('id="about"') < single.index('id="viewer"')
+    outcome = single.index(html.escape(data["decision"]))
+    assert outcome < single.index('id="viewer"') < single.index('id="path"') < single.index('id="about"')
     both = page_html("Cup", [data, data])
     assert both.index('id="episode"') < both.index('id="about"')
 

@@ -104,8 +104,8 @@ def test_confirmed_objects_are_told_only_where_something_can_confirm_them(zoom_p
 
 def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_picture, hostile):
     looks = zoom_data(zoom_path, large_picture, name="field")["looks"]
-    assert [look["brought"] for look in looks] == ["none", f"1 × {hostile}", f"1 × {hostile}"]
-    assert looks[0]["status"] == "Look 0 of 2, at the whole picture. Objects that no look shows more sharply: none."
+    assert [look["brought"] for look in looks] == ["", f"1 {hostile}", f"1 {hostile}"]
+    assert looks[0]["status"] == "Look 0 of 2, at the whole picture."
     assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
 
 
