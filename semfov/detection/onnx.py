@@ -291,7 +291,11 @@ def load_onnx(
     path = file
     if published_name in _ONNX_MODELS and input_size is not None:
         path = with_input_size(file, _sides(input_size))
-    session = OnnxSession(path, threads=threads, device=device, providers=providers)
+    digest = sha256(path) if path.is_file() else ""
+    # The budget of a published file is known to suffice, and to read it again takes as long as its first pass.
+    is_known = digest in NETWORKS
+    open_ended = False if is_known else None
+    session = OnnxSession(path, threads=threads, device=device, providers=providers, open_ended=open_ended)
     settings = _overridden(
         read_settings(file, session.metadata),
         name=published_name,
@@ -302,7 +306,7 @@ def load_onnx(
         logits=logits,
     )
     size = _canvas_size(session, settings.get("input_size"))
-    if None in session.shape[2:]:
+    if None in session.shape[2:] and not is_known:
         check_file(path, size)  # the sizes inside follow from the canvas, which is known only now
     outputs = session.probe(size)
     published = published_name is not None
@@ -322,7 +326,7 @@ def load_onnx(
         preprocessing=preprocessing,
         logits=settings.get("logits", False),
         background=settings.get("background"),
-        digest=_model_digest(file),
+        digest=digest if is_known else _model_digest(file),
     )
     detector.selection = replace(detector.selection, per_class=settings.get("per_class", False))
     return detector

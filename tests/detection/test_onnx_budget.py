@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from contextlib import suppress
 
 import numpy as np
 import onnx
@@ -11,10 +12,13 @@ import torch
 from onnx import TensorProto
 
 from semfov import load_detector
+from semfov.detection import onnx_session
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_budget import Budget
 from semfov.detection.onnx_check import check_file
 from semfov.detection.onnx_session import OnnxSession
+from semfov.detection.weights import fetch
+from semfov.errors import DataError
 from tests.detection.hostile_models import HOSTILE, node, write
 from tests.refusals import unusable
 from tests.small import write_network
@@ -163,3 +167,20 @@ def test_shipped_detectors_are_far_below_the_limits(shared, name):
     found = Budget.of(onnx.load(path), (416, 416), name)
     assert found.bytes() < 2**27 / 4
     assert sum(map(found._work, found.graph.node)) < 2**34 / 4
+
+
+def test_a_published_file_keeps_within_its_budget_and_is_not_read_twice(fresh):
+    # Its check is left out when it is loaded, so this is where it is made.
+    assert not check_file(fetch("yolox-nano"))
+    code = "import sys, semfov; semfov.load_detector('yolox-nano'); print('onnx' in sys.modules)"
+    assert fresh(code) == "False\n"
+
+
+def test_another_file_under_a_published_name_is_checked(tmp_path, monkeypatch):
+    path = tmp_path / "other.onnx"
+    path.write_bytes(fetch("yolox-nano").read_bytes() + b"\0")
+    checked = []
+    monkeypatch.setattr(onnx_session, "check_file", lambda path: checked.append(path) or False)
+    with suppress(DataError):
+        load_onnx("yolox-nano", weights=path)
+    assert checked == [path]
