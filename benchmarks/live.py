@@ -1,57 +1,67 @@
-"""Cost of a frame of a stream beside the detector: `python -m benchmarks.live --weights yolox_nano_416.onnx`.
+"""Cost of a frame of a stream beside a plain loop: `python -m benchmarks.live`.
 
-The agent searches frames of 640 x 480 by a fovea for a person. In the same repetition the detector alone gets the same
-frames as whole pictures.
+The agent searches frames of 640 x 480 for a person, by windows and by a fovea. In the same repetition a plain loop of
+onnxruntime and OpenCV (`benchmarks.bare`), and semfov's detector alone, get the same frames as whole pictures.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 
+from benchmarks.bare import BareYolox
 from benchmarks.tables import begin, command, comparison_rows, page, table, write
 from benchmarks.timing import Comparison, measure
 from semfov import ActivePerception, EmbeddedScenes, as_image
 from semfov.data.images import to_bytes
+from semfov.detection.weights import fetch
 
 FRAMES = 30
 TEXT = f"""\
-Written by `python -m benchmarks.live`. YOLOX-nano, {FRAMES} frames of embedded scenes. Ratios with quartiles; above 1,
-semfov is faster."""
+Written by `python -m benchmarks.live`. YOLOX-nano, {FRAMES} frames of embedded scenes, one look at each. The
+plain loop is onnxruntime with OpenCV's letterbox and its suppression of boxes (`benchmarks/bare.py`). Ratios with
+quartiles; above 1, semfov is faster."""
 
 
 def frames(classes: tuple[str, ...]) -> list[np.ndarray]:
     """Embedded scenes as a camera gives them, `(480, 640, 3)` bytes."""
     scenes = EmbeddedScenes(classes, count=FRAMES)
-    return [to_bytes(scenes[number].image) for number in range(FRAMES)]
+    return [cv2.resize(to_bytes(scenes[number].image), (640, 480)) for number in range(FRAMES)]
 
 
-def stream(weights: str | None) -> Comparison:
+def stream(how: Literal["windows", "fovea"], threads: int) -> Comparison:
     """A search in a stream, compared with the detector on every frame."""
-    agent = ActivePerception.recommended("yolox-nano", weights=weights)
+    agent = ActivePerception.recommended("yolox-nano")
     pictures, detector = frames(agent.classes[1:]), agent.eye.detector
+    bare = BareYolox(fetch("yolox-nano"), threads)
 
     def ours() -> object:
-        live = agent.live("person", how="fovea")
+        live = agent.live("person", how=how)
         return [live.step(picture) for picture in pictures]
 
     def alone() -> object:
         return [detector(as_image(picture)[None]) for picture in pictures]
 
-    return Comparison(f"{FRAMES} frames", ours, {"the detector": alone})
+    def loop() -> object:
+        return [bare(picture) for picture in pictures]
+
+    return Comparison(f"{FRAMES} frames, {how}", ours, {"a plain loop": loop, "semfov's detector": alone})
 
 
 @torch.inference_mode()
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and write the table."""
     parser = command("benchmarks.live", __doc__, seconds=20.0)
-    parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     clock, about = begin(options)
-    measured = measure(stream(options.weights), options.seconds, clock)
+    measured = [measure(stream(how, options.threads), options.seconds, clock) for how in ("windows", "fovea")]
     head = ["work", "peer", "semfov, ms", "peer, ms", "peer / semfov"]
-    text = page("Frames of a stream", TEXT, about, table(head, comparison_rows(measured)))
-    write(options.out, "live", text, {"machine": about, "comparisons": [asdict(measured)]})
+    rows = [row for one in measured for row in comparison_rows(one)]
+    text = page("Frames of a stream", TEXT, about, table(head, rows))
+    write(options.out, "live", text, {"machine": about, "comparisons": [asdict(one) for one in measured]})
 
 
 if __name__ == "__main__":

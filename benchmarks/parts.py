@@ -16,11 +16,14 @@ import torch
 from torch import Tensor
 
 from benchmarks.tables import begin, command, number, page, table, write
-from benchmarks.zoom import detector_alone
+from benchmarks.timing import Run
 from semfov import ActivePerception, Detections, Detector, ZoomAgent, as_image
 from semfov.data.large import open_large
+from semfov.detection.selection import select
 from semfov.errors import check
 from semfov.eye import Eye, View
+from semfov.paths import ZoomPath
+from semfov.zoom.eye import WindowView
 
 FIXATIONS, PASSES = 8, 24
 TEXT = f"""\
@@ -46,6 +49,22 @@ class _Parts(dict[str, list[float]]):
         whole = sum(means.values())
         shares = [[kind, part, number(each), f"{100 * each / whole:.0f} %"] for part, each in means.items()]
         return [*shares, [kind, "all", number(whole), f"{1e3 / whole:.2g} a second"]]
+
+
+def detector_alone(agent: ZoomAgent, view: WindowView, path: ZoomPath) -> Run:
+    """The detector with the selection of its boxes, on the canvases of a path."""
+    detector = agent.eye.detector
+    fixations = torch.tensor([look.window.fixation for look in path.window_looks], dtype=torch.float64)
+    # Bytes, channels last, as the eye passes them on.
+    canvases = agent.eye.glimpse(view, fixations)[0].mul(255).round().to(torch.uint8, memory_format=torch.channels_last)
+
+    def run() -> object:
+        return [
+            select(detector.propose_bytes(canvas[None]), None, detector.selection, detector.background)
+            for canvas in canvases
+        ]
+
+    return run
 
 
 def photographs(files: Iterable[Path], weights: str | None) -> _Parts:
