@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from semfov.agent import ActivePerception
-from semfov.cli.fixations import fixation_report
 from semfov.cli.options import CheckOptions
 from semfov.data.large import open_large
 from semfov.data.sources import picture_files
@@ -218,6 +217,8 @@ class PictureTools:
         Returns:
             What is in the file, and what is suspicious.
         """
+        from semfov.human.check import fixation_report
+
         path = self._path(fixations)
         options = CheckOptions(files=(str(path),), picture=str(self.folder), quiet=True)
         with _other_files_ignored():
