@@ -8,9 +8,7 @@ present frame fits neither the key frame nor the last one, it becomes the key fr
 as `_lost` for some frames, and each of them is compared with it, too: `CameraStep.recovered` says where it was found.
 """
 
-from collections.abc import Iterator
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,7 +122,8 @@ class _GreyFrame:
         factor = max(1.0, max(width, height) / _LONGER)
         size = max(1, round(width / factor)), max(1, round(height / factor))
         self.ratio = width / size[0], height / size[1]
-        self.grey = cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        # A third of the values is left to average where the frame is grey first.
+        self.grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
 
     @cached_property
     def corners(self) -> NDArray[np.float32]:
@@ -265,25 +264,49 @@ class CameraMotion:
         cv2 = self._cv2
         height, width = present.shape
         moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
-        shown = cv2.warpAffine(np.ones_like(first), similarity, (width, height), flags=cv2.INTER_NEAREST)
-        correlations = []
-        for block in _blocks(height, width):
-            if shown[block].size and shown[block].all():
-                correlation = _correlation(moved[block], present[block])
-                if correlation is not None:
-                    correlations.append(correlation)
-        agreeing = sum(correlation >= _ALIKE for correlation in correlations)
-        return len(correlations) >= _LEAST_BLOCKS and agreeing >= _LEAST_AGREEING * len(correlations)
+        blocks = _Blocks.of(height, width)
+        textured, correlation = _correlations(cv2, moved, present, blocks)
+        compared = textured & blocks.shown_by(similarity)
+        count = int(compared.sum())
+        agreeing = int((correlation[compared] >= _ALIKE).sum())
+        return count >= _LEAST_BLOCKS and agreeing >= _LEAST_AGREEING * count
 
 
-def _blocks(height: int, width: int) -> Iterator[tuple[slice, slice]]:
-    """Divide a frame into blocks; yields their rows and columns."""
-    columns, rows = _BLOCKS
-    edges_down = np.linspace(0, height, rows + 1).astype(int)
-    edges_across = np.linspace(0, width, columns + 1).astype(int)
-    for top, bottom in pairwise(edges_down):
-        for left, right in pairwise(edges_across):
-            yield slice(top, bottom), slice(left, right)
+class _Blocks(NamedTuple):
+    """Blocks of a frame `(height, width)`, by the edges between them."""
+
+    down: NDArray[np.intp]
+    across: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, height: int, width: int) -> "_Blocks":
+        """Divide a frame into blocks of nearly the same size."""
+        columns, rows = _BLOCKS
+        return cls(np.linspace(0, height, rows + 1).astype(np.intp), np.linspace(0, width, columns + 1).astype(np.intp))
+
+    @property
+    def pixels(self) -> NDArray[np.intp]:
+        """Number of pixels of each, `(rows, columns)`."""
+        return np.outer(np.diff(self.down), np.diff(self.across))
+
+    def sums(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum over each by a table of sums over all rectangles from the corner, `(height + 1, width + 1)`."""
+        corners = table[np.ix_(self.down, self.across)]
+        return np.diff(np.diff(corners, axis=0), axis=1)
+
+    def shown_by(self, similarity: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which of them another frame of this size shows as a whole, if a similarity `(2, 3)` moves it here."""
+        back = np.linalg.inv(np.vstack([similarity, _STILL[2]]))
+        sizes = self.across[-1], self.down[-1]
+        # A block is convex, so its corner pixels tell. They are taken from the nearest pixel of the other frame.
+        inside = []
+        for y in (self.down[:-1], self.down[1:] - 1):
+            for x in (self.across[:-1], self.across[1:] - 1):
+                columns, rows = np.meshgrid(x, y)
+                places = np.stack([columns, rows, np.ones_like(rows)])
+                origin = np.rint(np.einsum("ij,jkl->ikl", back[:2], places))
+                inside.append(((origin >= 0) & (origin < np.reshape(sizes, (2, 1, 1)))).all(0))
+        return np.logical_and.reduce(inside) & (self.pixels > 0)
 
 
 def _is_plausible(similarity: NDArray[np.float64], agreeing: int, followed: int) -> bool:
@@ -294,16 +317,33 @@ def _is_plausible(similarity: NDArray[np.float64], agreeing: int, followed: int)
     return has_support and 1 / _MOST_SCALE <= scale <= _MOST_SCALE and abs(turn) <= _MOST_TURN
 
 
-def _correlation(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float | None:
-    """Compute Pearson's correlation of two blocks; None where neither has texture, 0 where one has none at all."""
-    a = first.astype(np.float32)
-    b = second.astype(np.float32)
-    spread = float(a.std()), float(b.std())
-    if max(spread) < _TEXTURE:
-        return None
-    if min(spread) == 0:
-        return 0.0
-    return float(((a - a.mean()) * (b - b.mean())).mean() / (spread[0] * spread[1]))
+def _correlations(
+    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], blocks: _Blocks
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Compute Pearson's correlation of each block of two frames.
+
+    Args:
+        cv2: OpenCV.
+        first: grey values `(h, w)`.
+        second: likewise.
+        blocks: the blocks.
+
+    Returns:
+        Whether either frame has texture in a block, and the correlation, 0 where one has none at all; both
+        `(rows, columns)`.
+    """
+    products = cv2.multiply(first, second, dtype=cv2.CV_32F)
+    (a, aa), (b, bb) = (map(blocks.sums, cv2.integral2(frame)) for frame in (first, second))
+    ab = blocks.sums(cv2.integral(products))
+    # n² times variances and covariance: whole numbers below 2⁵³, so that a block of one grey value has exactly 0.
+    count = blocks.pixels.astype(np.float64)
+    variance_a = count * aa - a.astype(np.float64) ** 2
+    variance_b = count * bb - b.astype(np.float64) ** 2
+    covariance = count * ab - a.astype(np.float64) * b
+    spread = np.sqrt(variance_a) * np.sqrt(variance_b)
+    correlation = np.divide(covariance, spread, out=np.zeros_like(spread), where=spread > 0)
+    has_texture = np.sqrt(np.maximum(variance_a, variance_b)) >= _TEXTURE * count
+    return has_texture, correlation
 
 
 def _at_full_size(similarity: NDArray[np.float64], ratio: tuple[float, float]) -> Motion:
