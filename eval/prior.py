@@ -3,10 +3,12 @@
     python -m eval.prior --data.root DIR --data.annotations instances.json --detector.name yolox-nano --out runs/prior
 
 Without photographs it uses the embedded scenes. All photographs are searched by windows for each of the classes that
-are in most of them, once without `prior` and once with the share of the photographs that hold the class. Then each one
-is searched for some classes that are drawn evenly from all, likewise, and for one that it holds and one that it does
-not hold. The table has the mean probability, the Brier score and the expected calibration error beside the share of the
-searches whose target is there. If the command is stopped, repeat it to continue.
+are in most of them: without `prior`, with one half, and with the share of the photographs that hold the class. Then
+each one is searched for some classes that are drawn evenly from all, likewise, and for one that it holds and one that
+it does not hold, whose share is one half. The table has the mean probability, the Brier score, the expected calibration
+error, the area under ROC and the decisions beside the share of the searches whose target is there, and the difference
+of the Brier score to that without `prior`, paired over the photographs. If the command is stopped, repeat it to
+continue.
 """
 
 import sys
@@ -18,6 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from eval.bootstrap import Bootstrap
 from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_summary
 from semfov.agents.episode import EpisodeLimits, Goal
@@ -27,6 +30,7 @@ from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.protocols import choose_classes
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
+from semfov.metrics.episodes import area_under_roc
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.results import ResultRecord
@@ -34,7 +38,7 @@ from semfov.runs.scene_run import SceneRun, finish
 from semfov.runs.seeds import generator_for
 from semfov.runs.settings import Count, Seed, Share, Whole
 from semfov.runs.setup import check_sources, make_detector, make_scenes
-from semfov.runs.tables import table
+from semfov.runs.tables import plus_minus, share, table
 from semfov.settings import DecisionSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
@@ -42,6 +46,14 @@ from semfov.zoom.looks import WindowLooks
 
 RANDOM, PAIR = "a class drawn from all", "one there, one not"
 """Names of the questions that are not about one class."""
+
+_ALWAYS = "always "  # begins the names of the questions about one class
+
+_MISSING = {_ALWAYS: "one of these classes, not there", PAIR: "the one that is not there"}
+"""Names for the searches without their target, by how the names of their questions begin."""
+
+_PRIORS = {"without": "-", "half": "0.5", "with": "share"}
+"""The priors of a search, by their names in the records, as the table names them."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +116,7 @@ class PriorRun(SceneRun):
         generator = generator_for("prior", self.config.seed, self.scenes.ids[index])
         drawn = (torch.randperm(len(self.scenes.classes), generator=generator) + 1)[: self.config.drawn].tolist()
         pair = choose_classes(self.scenes, index, annotation, 1, self.config.max_target_area, self.config.seed)
-        always = [(f"always {self.scenes.classes[target - 1]}", target) for target in self.always]
+        always = [(f"{_ALWAYS}{self.scenes.classes[target - 1]}", target) for target in self.always]
         questions = [*always, *((RANDOM, target) for target in drawn), *((PAIR, target) for target in pair)]
         records = []
         for question, target in questions:
@@ -116,6 +128,7 @@ class PriorRun(SceneRun):
                     "target": self.scenes.classes[target - 1],
                     "present": bool((annotation.labels == target).any()),
                     "without": self._search(source, target, None),
+                    "half": self._search(source, target, 0.5),
                     "with": None if prior is None else self._search(source, target, prior),
                 }
             )
@@ -138,16 +151,26 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
     by_question: dict[str, list[ResultRecord]] = {}
     for record in records:
         by_question.setdefault(record["question"], []).append(record)
-    measures = ["mean p", "Brier", "ECE", "passes"]
-    rows = [["searches for", "number", "there", *measures, *(f"{name}, `prior=`" for name in measures)]]
+    for beginning, name in _MISSING.items():
+        by_question[name] = [
+            record
+            for question, some in by_question.items()
+            for record in some
+            if question.startswith(beginning) and not record["present"]
+        ]
+    heads = ["mean p", "Brier", "difference", "ECE", "area", *_DECIDED, "passes"]
+    rows = [["searches for", "`prior=`", "number", "there", *heads]]
     for question, some in by_question.items():
         there = torch.tensor([record["present"] for record in some])
-        share = f"{float(there.double().mean()):.3f}"
-        rows.append([question, str(len(some)), share, *_measured(some, "without"), *_measured(some, "with")])
+        frequency = f"{float(there.double().mean()):.3f}"
+        for way, name in _PRIORS.items():
+            if some and some[0][way] is not None:
+                rows.append([question, name, str(len(some)), frequency, *_measured(some, way)])
     return "\n".join(
         [
-            "Probability that a photograph holds the class, without `prior=`, and with the share of the photographs "
-            "that hold it. `there`: share of the searches whose target is there.",
+            "Probability that a photograph holds the class: without `prior=`, with one half, and with the share of the "
+            "photographs that hold it. `there`: share of the searches whose target is there. Decisions are in % of the "
+            "searches whose target is there, and of those whose target is not.",
             "",
             *table(rows),
             "",
@@ -155,15 +178,37 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
     )
 
 
+_DECIDED = ("found, there", "absent, there", "found, not there", "absent, not there")
+
+
 def _measured(records: Sequence[ResultRecord], way: str) -> list[str]:
-    """Mean probability, Brier score, calibration error and mean number of passes; dashes where nothing was searched."""
-    searched = [record for record in records if record[way] is not None]
-    if not searched:
-        return ["-"] * 4
-    probability = torch.tensor([record[way]["probability"] for record in searched], dtype=torch.float64)
-    sums = BinarySums.of(probability, torch.tensor([record["present"] for record in searched]))
-    passes = sum(record[way]["passes"] for record in searched) / len(searched)
-    return [f"{float(probability.mean()):.3f}", f"{sums.brier:.3f}", f"{sums.ece:.3f}", f"{passes:.1f}"]
+    """Measure probabilities, in the order of the headings, and count decisions and passes."""
+    probability = torch.tensor([record[way]["probability"] for record in records], dtype=torch.float64)
+    there = torch.tensor([record["present"] for record in records])
+    usual = torch.tensor([record["without"]["probability"] for record in records], dtype=torch.float64)
+    squares = torch.stack([(values - there.double()).square() for values in (probability, usual)])
+    brier = Bootstrap.of(lambda chosen: squares[:, chosen].mean(1), [record["scene"] for record in records])
+    apart = brier.less(1)
+    difference = "" if way == "without" else plus_minus(float(apart.value[0]), float(apart.error[0]), 3, sign="+")
+    area = f"{area_under_roc(probability, there):.3f}" if there.any() and not there.all() else "-"
+    return [
+        f"{float(probability.mean()):.3f}",
+        plus_minus(float(brier.value[0]), float(brier.error[0]), 3),
+        difference,
+        f"{BinarySums.of(probability, there).ece:.3f}",
+        area,
+        *_decided(records, way),
+        f"{sum(record[way]['passes'] for record in records) / len(records):.1f}",
+    ]
+
+
+def _decided(records: Sequence[ResultRecord], way: str) -> list[str]:
+    """Shares that end found and absent, of the searches whose target is there, then of the others, in percent."""
+    cells = []
+    for present in (True, False):
+        outcomes = [record[way]["outcome"] for record in records if record["present"] == present]
+        cells += [share(outcomes.count(outcome), len(outcomes)) for outcome in ("found", "absent")]
+    return cells
 
 
 def measure_priors(config: PriorConfig) -> None:

@@ -48,19 +48,22 @@ class Strategy(nn.Module):
         """Make the acquisition function of episodes that fixate `cell` `(B,)`."""
         return self.policy(target, grid)
 
-    def with_prior(self, share: float, target: int) -> tuple["Strategy", Prior]:
+    def with_prior(self, share: float | None, target: int) -> tuple["Strategy", Prior]:
         """Change a search for a class by how often it is there.
 
         Args:
-            share: share of searches in which the class is there.
+            share: share of searches in which the class is there; None leaves the search as it was fitted.
             target: the class, 1..K.
 
         Returns:
             The strategy of the search, and the prior by which its probabilities change.
         """
         observer = self.observer
-        check(not isinstance(observer, AnyOf), "prior", "None for a search for any of several classes", share)
+        is_about_several = isinstance(observer, AnyOf) and share is not None
+        check(not is_about_several, "prior", "None for a search for any of several classes", share)
         prior = Prior.of(share, observer.model.shares if isinstance(observer, Target) else None, target)
+        if share is None:
+            return self, prior
         assert isinstance(observer, Target)
         return Strategy(Target(observer.model, together=observer.together, prior=prior), self.policy), prior
 

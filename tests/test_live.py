@@ -94,6 +94,28 @@ def test_live_search_of_a_constant_image_at_rate_zero_equals_a_search(name, one_
     assert set(moments[0].seconds[0]) == {"open", "foveate", "detect", "weigh", "update belief", "choose"}
 
 
+def test_a_prior_changes_the_fovea_in_a_search_and_in_a_stream_by_the_odds(one_thread):
+    model = learned(TargetEvidence)
+    model.shares = torch.tensor([0.7, 0.9])
+    model.thresholds = Thresholds(1.0, 0.0, 0.5)
+    agent, image = agent_with(Target(model)), scene(100, 80)
+    live = agent.live("green", rate=0, start=3, seed=5, how="fovea", prior=0.2)
+    with torch.inference_mode():
+        usual = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", give_up=0.0)
+        rare = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", prior=0.2, give_up=0.0)
+        several = agent.search(image, ["red", "green"], shifts=1, how="fovea")
+    moments = [live.step(image) for _ in range(5)]
+    assert (usual.prior, usual.assumed) == (None, pytest.approx(0.9))
+    odds = usual.presence / (1 - usual.presence) * (0.2 / 0.8) * (0.1 / 0.9)
+    assert torch.equal(rare.cells, usual.cells)
+    torch.testing.assert_close(rare.presence, odds / (1 + odds), rtol=1e-4, atol=1e-6)
+    assert usual.probability_at(0.2) == pytest.approx(rare.decision.probability, rel=1e-4)
+    for number, moment in enumerate(moments):
+        assert (moment.prior, moment.assumed) == (0.2, 0.2)
+        assert moment.decision.probability == pytest.approx(float(rare.presence[number]), rel=1e-5)
+    assert several.assumed is None
+
+
 def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration(one_thread):
     model = learned(MapEvidence)
     agent = agent_with(Semantic(3))

@@ -27,7 +27,7 @@ from semfov.decision.stopping import ByCloserLooks, ByPresence, StoppingCriterio
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, LiveLooks, Step, rollout
 from semfov.episode.stopwatch import Stopwatch
-from semfov.errors import InputError, check, check_whole
+from semfov.errors import check, check_whole
 from semfov.eye import Eye
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
@@ -81,6 +81,8 @@ class GazePlan:
     Attributes:
         thresholds: thresholds of the decision; None if nothing was learned.
         verification: model of the closer looks; None if none are made.
+        given_prior: share of the pictures that hold the target, as it was given; None for none.
+        prior: the share that the probabilities assume, and that of the fit.
         beside: observer of the map of all classes beside the belief of a search; None if the belief is that map.
     """
 
@@ -100,6 +102,7 @@ class GazePlan:
     ) -> None:
         decisions = decisions or DecisionSettings()
         usual = agent.exploring if target is None else agent.searching
+        self.given_prior = decisions.prior
         chosen, self.prior = _with_prior(strategy or usual, target, decisions.prior)
         self.agent = agent
         self.target = target
@@ -266,6 +269,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
         eye = plan.agent.eye
         self._trace = Trace(plan.grid(image), self.goal.classes, plan.target, plan.beside, eye.detector.least)
         self._gaze = FoveaGaze(plan, image, self._trace.look_closely, criterion)
+        self._plan = plan
         self._stimulus = Stimulus.of(eye, image)
         self._photograph = reduced_copy(image[0])
         self._detector = eye.detector.name
@@ -321,6 +325,8 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
             decision=decision,
             closer=tuple(criterion.looks),
             ending=self.ending,
+            prior=self._plan.given_prior,
+            assumed=self._plan.prior.assumed,
             stimulus=self._stimulus,
             photograph=self._photograph,
             detector=self._detector,
@@ -458,6 +464,8 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
             next_cell=int(step.next_cell) if next_cell is None else next_cell,
             closer=tuple(replace(close_up, fixation=0, number=0) for close_up in closer),
             found=decision is not None and decision.outcome == "found",
+            prior=self.plan.given_prior,
+            assumed=self.plan.prior.assumed,
             photograph=partial(_reduced, self._pixels, gaze.image),  # type: ignore[arg-type]
             detector=self.plan.agent.eye.detector.name,
         )
@@ -465,10 +473,9 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
 
 def _with_prior(strategy: Strategy, target: int | None, share: float | None) -> tuple[Strategy, Prior]:
     """Give a strategy the share of the searches whose target is there; None leaves it as it was fitted."""
-    if share is None:
-        return strategy, Prior()
     if target is None:
-        raise InputError(f"prior: expected None without a target, got {share}")
+        check(share is None, "prior", "None without a target", share)
+        return strategy, Prior(known=False)
     return strategy.with_prior(share, target)
 
 

@@ -135,7 +135,8 @@ class HeadAgent(nn.Module):
             start: first action (`Views`); None looks straight ahead (`Views.ahead`).
             confirm: probability at which the search ends as found; None takes 0.7.
             give_up: probability below which a cell is not worth a look; None takes that of a cell that was never seen.
-            prior: how often the target is there, as a share of the scenes that are searched; None: in half of them.
+            prior: how often the target is there, as a share of the scenes that are searched; None: as often as in the
+                searches of the fit.
             foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
             chance: probability that a cell that was never seen holds the target, without a `prior`.
             seed: of the generator that breaks ties.
@@ -162,7 +163,7 @@ class HeadAgent(nn.Module):
         thresholds = Thresholds(sure, never_seen if give_up is None else give_up, sure)
         return HeadEpisode(
             self, observer, gain, index,
-            thresholds=thresholds, limits=limits, start=start, duration=duration, seed=seed,
+            thresholds=thresholds, limits=limits, start=start, duration=duration, seed=seed, prior=prior,
         ).run()  # fmt: skip
 
     def find_all(
@@ -243,6 +244,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         start: first action (`Views`); None looks straight ahead.
         duration: time limit of the scene in seconds.
         seed: of the generator that breaks ties.
+        prior: how often the target is there, as it was given for the observer; None for none.
     """
 
     def __init__(
@@ -259,6 +261,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         start: int | None = None,
         duration: float = _DURATION,
         seed: int = 0,
+        prior: float | None = None,
     ) -> None:
         super().__init__(Goal.of(agent.classes, target, targets), limits)
         check_number(duration, "duration", 0, float("inf"))
@@ -271,6 +274,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         self.duration = duration
         self.least = agent.eye.detector.least
         self._detector = agent.eye.detector.name
+        self._prior = prior
         self._steps = look_around(
             views,
             live(agent.eye, views),
@@ -341,6 +345,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
             found=decision is not None and decision.outcome == "found",
             decision=decision,
             ending=self.ending,
+            prior=self._prior,
             targets=self.goal.targets,
             photograph=None if picture is None else reduced_copy(picture),
             detector=self._detector,

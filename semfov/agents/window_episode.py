@@ -230,6 +230,8 @@ class WindowSession:
             "lattice": self.source.lattice,
             "classes": task.goal.classes,
             "target": task.goal.target,
+            "prior": task.decisions.prior,
+            "assumed": self.decisions.prior.assumed,
             "targets": task.goal.targets,
             "looks": tuple(looks),
             "candidates": merged.objects,

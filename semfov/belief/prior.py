@@ -43,17 +43,26 @@ class Prior:
     """The share of the searches whose target is there, and that share in the searches of the fit.
 
     Calls change a probability of presence, a float or a tensor (`with_prior`). The same shares change nothing.
+
+    Attributes:
+        share: share of the searches whose target is there, which changed probabilities assume.
+        fitted: share in the searches of the fit.
+        known: whether the share of the fit is known; if not, both are equal and nothing changes.
+
+    >>> Prior(share=0.5, fitted=0.97)(0.99)  # of a class that nearly all searches of the fit found
+    0.7537688442211054
     """
 
     share: float = 0.5
     fitted: float = 0.5
+    known: bool = True
 
     @classmethod
     def of(cls, share: float | None, shares: Tensor | None, target: int) -> Self:
         """Compare a share with that of the fit.
 
         Args:
-            share: share of the searches whose target is there; None changes nothing.
+            share: share of the searches whose target is there; None takes that of the fit, and changes nothing.
             shares: `(K,)`, by class, those of the fit; None if they are not known.
             target: class 1..K.
 
@@ -64,12 +73,18 @@ class Prior:
             InputError: the share is no probability between 0 and 1, or those of the fit are not known.
         """
         check_prior(share)
-        if share is None:
-            return cls()
-        if shares is None:
+        if shares is not None:
+            fitted = float(shares[target - 1])
+            return cls(fitted if share is None else float(share), fitted)
+        if share is not None:
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
             raise InputError(f"prior: expected None for models without the shares of their fit, got {share}; {remedy}")
-        return cls(float(share), float(shares[target - 1]))
+        return cls(known=False)
+
+    @property
+    def assumed(self) -> float | None:
+        """Share of the searches whose target is there, which the probabilities assume; None if it is not known."""
+        return self.share if self.known else None
 
     @property
     def changes_nothing(self) -> bool:

@@ -4,7 +4,7 @@ import os
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from html import escape
 from ipaddress import ip_address
@@ -174,7 +174,9 @@ class _Calls:
         scene = next(self._turns)
         return pillow(scene.image), self.classes[int(scene.labels.mode().values) - 1]
 
-    def look(self, path: str | None, target: str, task: str, passes: float, visitor: str = "") -> tuple[str, str]:
+    def look(
+        self, path: str | None, target: str, task: str, passes: float, prior: float | None = None, visitor: str = ""
+    ) -> tuple[str, str]:
         """Look at a picture; `stop` of the same visitor ends it.
 
         Args:
@@ -182,6 +184,7 @@ class _Calls:
             target: class, or all of them.
             task: one of `_TASKS`.
             passes: largest number of passes of the detector.
+            prior: for a search, share of such pictures that hold the class; None as in the fit.
             visitor: who asks.
 
         Returns:
@@ -194,23 +197,25 @@ class _Calls:
                 prediction = self.agent.gaze(picture)
                 part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
                 return prediction.describe(), _framed(gaze_page_html("Where people look", [part]))
-            record = self._record(picture, target, task, int(passes), visitor)
+            stop = self._stops[visitor] = threading.Event()
+
+            def go_on(_: Record) -> bool:
+                return not stop.is_set()
+
+            limits: dict[str, Any] = {"passes": int(passes), "seconds": _SECONDS, "on_look": go_on}
+            if task == "search":
+                limits["prior"] = prior
+            record = self._record(picture, target, task, limits)
             data = record.page_data(picture if record.kind.fine else None)
             return record.summary(), _framed(page_html(record.describe(), [data]))
 
-    def _record(self, picture: Tensor, target: str, task: str, passes: int, visitor: str) -> Record:
-        """Search a picture, find all objects in it or explore it, until the visitor stops it."""
-        stop = self._stops[visitor] = threading.Event()
-
-        def go_on(_: Record) -> bool:
-            return not stop.is_set()
-
+    def _record(self, picture: Tensor, target: str, task: str, options: Mapping[str, Any]) -> Record:
+        """Search a picture, find all objects in it or explore it."""
         if task == "search":
-            return self.agent.search(picture, target, passes=passes, seconds=_SECONDS, on_look=go_on)
+            return self.agent.search(picture, target, **options)
         if task == "find all":
-            classes = None if target == _EVERY else target
-            return self.agent.find_all(picture, classes, passes=passes, seconds=_SECONDS, on_look=go_on)
-        return self.agent.explore(picture, passes=passes, seconds=_SECONDS, on_look=go_on)
+            return self.agent.find_all(picture, None if target == _EVERY else target, **options)
+        return self.agent.explore(picture, **options)
 
     def stop(self, visitor: str = "") -> None:
         """End a visitor's search after the look that it is at; what was found is shown."""
@@ -288,8 +293,10 @@ def _make_page(agent: ActivePerception) -> Any:
 
     calls = _Calls(agent)
 
-    def look(path: Any, target: str, task: str, passes: float, request: gradio.Request) -> tuple[str, str]:
-        return calls.look(path, target, task, passes, request.session_hash)
+    def look(
+        path: Any, target: str, task: str, passes: float, prior: float | None, request: gradio.Request
+    ) -> tuple[str, str]:
+        return calls.look(path, target, task, passes, prior, request.session_hash)
 
     def stop(request: gradio.Request) -> None:
         calls.stop(request.session_hash)
@@ -315,6 +322,9 @@ def _make_page(agent: ActivePerception) -> Any:
                 target = gradio.Dropdown([_EVERY, *calls.classes], value=_EVERY, label="Class", filterable=True)
                 task = gradio.Radio(list(_TASKS), value=_TASKS[0], label="What to do")
                 passes = gradio.Slider(1, 64, value=16, step=1, label="Passes of the detector at most")
+                prior = gradio.Number(
+                    label="Of your pictures, what share holds the class?", info="For a search. Empty: as in the fit."
+                )
                 go = gradio.Button("Look", variant="primary")
                 end = gradio.Button("Stop")
             with gradio.Column(scale=2, min_width=300), gradio.Tabs():
@@ -331,7 +341,7 @@ def _make_page(agent: ActivePerception) -> Any:
                         belief = gradio.Image(label="What is believed", **fixed)
         outputs = [cells, looks, view, belief, about]
         example.click(calls.take, [], [picture, target], api_visibility="private")
-        go.click(look, [picture, target, task, passes], [words, shown], api_visibility="private")
+        go.click(look, [picture, target, task, passes, prior], [words, shown], api_visibility="private")
         end.click(stop, [], [], api_visibility="private", queue=False)
         for changed in (picture.change, again.click, target.change):
             changed(calls.fresh, [picture], outputs, api_visibility="private")

@@ -44,6 +44,9 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
     headline = record.words.objects if decision is None else _decision_text(record, decision)
     reason = "" if limit else record.why_it_ended()
     lines = [f"{name}, {width} × {height} px: {headline}", f"  {reason} {looks}.".replace("   ", "  ")]
+    assumption = record.words.assumption("--prior 0.5")
+    if assumption:
+        lines.append(f"  {assumption}")
     if decision is None:
         if isinstance(record, Scanpath) and record.target is None:
             lines += _regions_lines(record)

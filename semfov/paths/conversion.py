@@ -40,7 +40,7 @@ _PLACE = ("x", "y", "x1", "y1", "x2", "y2")
 COLUMNS = ("object", "class", "score", "confirmed", *_PLACE, "look")
 """Columns of the table of objects."""
 
-DECISION_COLUMNS = ("target", "outcome", "probability", *_PLACE, "passes")
+DECISION_COLUMNS = ("target", "outcome", "probability", "assumed", *_PLACE, "passes")
 """Values of `to_dict` that stand in a table of searches, a line for each picture."""
 
 
@@ -154,6 +154,8 @@ class Conversion(Outcome, OtherWords):
         return {
             "outcome": decision.outcome,
             "probability": digits(decision.probability),
+            "prior": self.prior,
+            "assumed": None if self.assumed is None else round(self.assumed, 6),
             **_rounded_place(*point, *box),
         }
 

@@ -1,6 +1,7 @@
 """Files of records: tensors, with JSON values that describe them."""
 
 from collections.abc import Mapping, Sequence
+from math import nextafter
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
@@ -27,6 +28,7 @@ machine was over, the time of the scene was over, or the caller stopped it."""
 WHOLE = Number(low=0, whole=True)
 POSITIVE = Number(above=0)
 CHANCE = Number(0, 1)
+_SHARE = Number(above=0, high=nextafter(1, 0))
 
 _DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell": Maybe(WHOLE), "place": Maybe(CHANCE)}
 _CLOSER = {
@@ -57,6 +59,8 @@ _SHARED = {
     "target": Maybe(WHOLE),
     "targets": Array(WHOLE),
     "found": Flag(),
+    "prior": Maybe(_SHARE),
+    "assumed": Maybe(_SHARE),
     "least": CHANCE,
     "source": Maybe(Text()),
     "shown": Maybe(Object({"white": Json(), "bands": Json()})),
@@ -65,7 +69,8 @@ _SHARED = {
     "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
-_PLAIN = ("target", "found", "least", "source", "shown", "detector", "ending")  # attributes that are JSON values
+_PLAIN = ("target", "found", "prior", "assumed", "least", "source", "shown", "detector", "ending")
+"""Attributes that are JSON values."""
 
 
 _OTHERS = {

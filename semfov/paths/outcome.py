@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.belief.prior import Prior, check_prior
 from semfov.data.classes import class_index
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
@@ -55,6 +56,8 @@ class Outcome(ABC):
     closer: tuple[CloseUp, ...] = ()
     ending: Ending | None = None
     decision: Decision | None = None
+    prior: float | None = None
+    assumed: float | None = None
     targets: tuple[int, ...] = ()
     least: float = LEAST
     unseen: tuple[float, float] | None = None
@@ -114,6 +117,40 @@ class Outcome(ABC):
     def target_name(self) -> str | None:
         """Name of the class that was searched for; None for all classes."""
         return None if self.target is None else self.classes[self.target]
+
+    def probability_at(self, prior: float) -> float:
+        r"""Give the probability of the decision for another share of pictures that hold the target.
+
+        .. math:: \operatorname{logit} P' = \operatorname{logit} P + \operatorname{logit} \pi
+                  - \operatorname{logit} \pi_{\mathrm{assumed}}
+
+        (`semfov.belief.prior.with_prior`). It is that of the looks that were made: a search with this `prior` may end
+        after others.
+
+        Args:
+            prior: share of the pictures that hold the target, above 0 and below 1.
+
+        Returns:
+            The probability that the picture holds the target.
+
+        Raises:
+            InputError: the share is no probability between 0 and 1, or the record has no decision, or it is not known
+                what its probability assumes.
+
+        Example::
+
+            record = agent.search("kitchen.jpg", "chair")
+            print(record.decision.probability, record.assumed, record.probability_at(0.15))
+        """
+        check_prior(prior)
+        check(prior is not None, "prior", "a share above 0 and below 1", prior)
+        decision = self.decision
+        known = decision is not None and self.assumed is not None
+        expected = "a search by models with the shares of their fit"
+        check(known, "record", expected, "one whose assumed share is not known")
+        assert decision is not None
+        assert self.assumed is not None
+        return Prior(prior, self.assumed)(decision.probability)
 
     @property
     def found_at(self) -> tuple[float, float] | None:

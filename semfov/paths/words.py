@@ -9,6 +9,8 @@ from semfov.data.classes import counted
 from semfov.detection.objects import box_text
 from semfov.paths.outcome import Outcome
 
+_MATTERS = 0.1  # change of the probability, at one half, from which on the assumed share is said
+
 
 class Words(ABC):
     """Words for a record; each kind of record has its own (`Record.words`).
@@ -37,6 +39,9 @@ class Words(ABC):
         "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
     }
     """Why it ended, by the ending, or by the outcome of the decision that ended the search."""
+
+    _pictures: ClassVar[str] = "pictures"
+    """What is searched, in the plural."""
 
     def __init__(self, record: Outcome) -> None:
         self.record = record
@@ -143,11 +148,36 @@ class Words(ABC):
         sentence = self._sentences["closer found"]
         return self._sentences.get("first found", sentence) if numbers == [0] else sentence
 
+    def assumption(self, option: str = "prior=0.5") -> str:
+        """Say how many pictures the probability assumes to hold the target, and what it would be with half of them.
+
+        It is said where it matters: the target was not found, and with half of the pictures the probability would be
+        at least 0.1 higher or lower. So nothing is said where the assumed share is near one half, or where what was
+        seen leaves no doubt.
+
+        Args:
+            option: how one half is asked for, where no share was given.
+
+        Returns:
+            The sentence; empty where it does not matter, or where it is not known what is assumed.
+        """
+        record = self.record
+        decision = record.decision
+        if decision is None or decision.outcome == "found" or record.assumed is None:
+            return ""
+        at_half = record.probability_at(0.5)
+        if abs(at_half - decision.probability) < _MATTERS:
+            return ""
+        share = f"{min(100 * record.assumed, 99.9):.3g} % of your {self._pictures} hold it"
+        given = f" ({option})" if record.prior is None else ""
+        return f"This assumes that {share}; if half of them did, it would be {at_half:.2f}{given}."
+
     def summary(self) -> str:
-        """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt."""
+        """Describe the outcome, explain why it ended, name the best place of doubt, and say what is assumed."""
         text = self.describe() + self._ending
         place = self.best_place.capitalize()
-        return f"{text} {place}." if place else text
+        sentences = [text, f"{place}." if place else "", self.assumption()]
+        return " ".join(sentence for sentence in sentences if sentence)
 
     @property
     def _ending(self) -> str:
@@ -157,6 +187,8 @@ class Words(ABC):
 
 class MomentWords(Words):
     """Words for one frame of a stream."""
+
+    _pictures = "frames"
 
     @property
     def decision(self) -> str | None:

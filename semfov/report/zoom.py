@@ -76,14 +76,14 @@ def _opened(path: Record, picture: LargePicture | ImageLike | None) -> LargePict
 
 
 def _outcome_in_words(path: Record) -> str:
-    """Tell the decision or the objects, why the record ended, and the best place of doubt."""
+    """Tell the decision or the objects, why the record ended, the best place of doubt, and what is assumed."""
     result = f"{path.words.objects}."
     if path.decision is not None:
         by_probability = path.words.decided_by == "probability"
         measure = "probability that the picture holds it" if by_probability else "best score"
         result = f"“{path.target_name}” {path.decision.outcome}, {measure}: {path.decision.probability:.2f}."
     place = path.words.best_place.capitalize()
-    sentences = [result, path.why_it_ended(), f"{place}." if place else ""]
+    sentences = [result, path.why_it_ended(), f"{place}." if place else "", path.words.assumption()]
     return " ".join(sentence for sentence in sentences if sentence)
 
 

@@ -133,9 +133,11 @@ class WindowDecisions(DecisionState):
 
     Attributes:
         ending: reason for an end that it makes.
+        prior: the share of pictures with the target that the probabilities assume, and that of the fit.
     """
 
     ending: Literal["decision", "detection"] = "decision"
+    prior = Prior(known=False)
 
     def see(self, step: WindowStep[Any], number: int, room: float) -> None:
         """Take in a step, and choose the place that is to be looked at closely.
@@ -338,9 +340,7 @@ def decisions_of(
 
 def _prior_of(share: float | None, photograph: PhotographEvidence | None, target: int) -> Prior:
     """Compare the share that was given with that of the fit, which for large pictures is one half."""
-    if share is None:
-        return Prior()
     if photograph is None:
         # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
-        return Prior(share)
+        return Prior() if share is None else Prior(share)
     return Prior.of(share, photograph.shares, target)

@@ -54,6 +54,11 @@ def test_without_a_share_nothing_changes():
         assert prior(chances) is chances
         assert prior.place(chances, chances) is chances
     assert Prior.of(0.2, torch.tensor([0.5, 0.75]), 2) == Prior(0.2, 0.75)
+    fitted = Prior.of(None, torch.tensor([0.5, 0.75]), 2)
+    assert fitted(chances) is chances
+    assert [prior.assumed for prior in (fitted, Prior(0.2, 0.75), Prior(), Prior.of(None, None, 1))] == [
+        0.75, 0.2, 0.5, None,
+    ]  # fmt: skip
 
 
 def test_certain_probabilities_stay():
@@ -94,6 +99,7 @@ def test_a_strategy_reads_the_shares_of_its_evidence():
     changed, prior = strategy.with_prior(0.3, 2)
     assert prior == Prior(0.3, 0.75)
     assert changed.observer.prior == prior
+    assert strategy.with_prior(None, 2) == (strategy, Prior(0.75, 0.75))
     assert strategy.observer.prior == Prior()
     several, _, _ = strategy.sought(["person", "bicycle"], ("background", "person", "bicycle", "car"))
     with pytest.raises(InputError, match="prior: expected None for a search for any of several classes"):

@@ -91,6 +91,9 @@ def test_what_the_page_calls_needs_no_gradio_but_for_its_errors(agent, calls, ph
         words, page = calls.look(path, target, task, 3.0)
         assert words
         assert page.startswith('<iframe title="The looks" sandbox="allow-scripts" srcdoc="&lt;!DOCTYPE html')
+    with pytest.raises(Told, match="prior: expected a share above 0 and below 1"):
+        calls.look(path, "red", "search", 3.0, 1.5)
+    assert calls.look(path, "all classes", "find all", 3.0, 1.5)[0]  # which has no use for it
     cells: list[int] = []
     for x, y in ((5, 5), (width - 5, height - 5)):
         cells, clicked, seen, believed, words = calls.click(path, "red", cells, SimpleNamespace(index=(x, y)))
@@ -154,7 +157,7 @@ def test_a_visitor_stops_its_own_search(calls, agent, photo, monkeypatch):
 
     monkeypatch.setattr(type(agent), "explore", lambda _, picture, **limits: explored(picture, **limits))
     for visitor in ("patient", "impatient"):
-        calls.look(str(photo), "red", "explore", 4.0, visitor)
+        calls.look(str(photo), "red", "explore", 4.0, visitor=visitor)
     assert counts["impatient"] < counts["patient"] == 4
 
 

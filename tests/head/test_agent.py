@@ -70,6 +70,33 @@ def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     assert limited.why_it_ended() == "The next look would end after the time limit of the scene, 1 s (duration)."
 
 
+def test_a_prior_scales_all_cells_of_a_view_as_it_changes_the_presence(agent, panorama):
+    """By the odds o that the view holds the target, P' / P = k (1 + o) / (1 + k o), with k the ratio of the priors."""
+    fitted, chance = 0.8, 0.03
+    agent.target_evidence.shares = torch.full((3,), fitted)
+    agent.target_evidence.judge[-1].bias.fill_(1.0)  # no cell is more probable than the view
+
+    def look(prior=None):
+        path = agent.search(Panorama(panorama), "blue", passes=1, prior=prior, chance=chance)
+        assert (path.prior, path.assumed) == (prior, None)
+        refused("record: expected a search by models", path.probability_at, 0.5)
+        return path.maps[0].double()
+
+    usual = look()
+    seen = usual != torch.tensor(chance, dtype=torch.float32)
+    assert 0 < int(seen.sum()) < len(seen)
+    odds = []
+    for prior in (0.1, 0.4):
+        k = prior / (1 - prior) * (1 - fitted) / fitted
+        rare = look(prior)
+        never = k * chance / (1 - chance)
+        torch.testing.assert_close(rare[~seen], torch.full_like(rare[~seen], never / (1 + never)))
+        ratio = rare[seen] / usual[seen]
+        torch.testing.assert_close(ratio, ratio.mean().expand_as(ratio), rtol=1e-4, atol=0)
+        odds.append(float((k - ratio.mean()) / (k * (ratio.mean() - 1))))
+    assert odds[0] == pytest.approx(odds[1], rel=1e-3)
+
+
 def test_detections_of_a_path_equal_those_of_the_eye(agent, panorama):
     world = Panorama(panorama)
     path = agent.search(world, "blue", passes=2, confirm=1.0)

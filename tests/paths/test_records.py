@@ -202,6 +202,46 @@ def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
     assert both.why_it_ended() == "No closer look was sure enough, but the target is too probable to call it absent."
 
 
+def test_what_the_probability_assumes_is_said_where_it_matters():
+    """The odds 99 with the share 0.9, whose odds are 9, are 11 at one half; 2 to 3 are then 2 to 27."""
+    undecided = replace(zoom_path(), decision=Decision("undecided", 0.99), assumed=0.9)
+    assert undecided.probability_at(0.5) == pytest.approx(11 / 12)
+    absent = replace(undecided, decision=Decision("absent", 0.4), ending="decision", closer=())
+    assert absent.words.assumption("--prior 0.5") == (
+        "This assumes that 90 % of your pictures hold it; if half of them did, it would be 0.07 (--prior 0.5)."
+    )
+    assert absent.summary().endswith(f" {absent.words.assumption()}")
+    given = replace(absent, prior=0.9)
+    assert given.words.assumption() == (
+        "This assumes that 90 % of your pictures hold it; if half of them did, it would be 0.07."
+    )
+    sure = replace(absent, assumed=0.99999)
+    assert "99.9 % of your pictures" in sure.words.assumption()
+    assert "0.02 % of your frames" in replace(moment(), assumed=0.0002).words.assumption()
+    silent = [
+        undecided,  # 0.99 and 0.92 say the same
+        replace(absent, assumed=0.5),
+        replace(absent, assumed=None),
+        replace(absent, decision=None),
+        replace(absent, decision=replace(zoom_path().decision, probability=0.4)),
+    ]
+    assert [record.words.assumption() for record in silent] == [""] * len(silent)
+
+
+@pytest.mark.parametrize("make", [scanpath, zoom_path, moment, window_moment])
+def test_files_and_json_keep_what_the_probability_assumes(make, tmp_path):
+    record = replace(make(), prior=0.25, assumed=0.25)
+    record.save(tmp_path / "record.safetensors")
+    again = type(record).load(tmp_path / "record.safetensors")
+    assert (again.prior, again.assumed) == (0.25, 0.25)
+    assert again.probability_at(0.5) == record.probability_at(0.5)
+    assert {"prior": 0.25, "assumed": 0.25}.items() <= record.to_dict().items()
+    for share in (0, 1, None):
+        refused("prior: expected a share above 0 and below 1", record.probability_at, share)
+    for unknown in (replace(record, assumed=None), replace(record, decision=None)):
+        refused("record: expected a search by models with the shares of their fit", unknown.probability_at, 0.5)
+
+
 @pytest.mark.parametrize("make", RECORDS)
 def test_every_record_is_written_as_tables_and_as_json(make, tmp_path):
     """Read back by the modules csv and json, and by pandas."""

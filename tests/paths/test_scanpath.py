@@ -222,7 +222,7 @@ def spoil(tensors, record):
         yield name.split(".")[0], (tensors, {key: value for key, value in record.items() if key != name})
 
 
-OPTIONAL = "decision", "ending", "target", "source", "shown", "detector", "placement", "settings"
+OPTIONAL = "decision", "ending", "target", "prior", "assumed", "source", "shown", "detector", "placement", "settings"
 
 
 def test_inconsistent_files_are_refused_with_the_name_of_the_field(scanpath, tmp_path):

@@ -530,6 +530,22 @@ def test_a_prior_changes_the_log_odds_of_a_search_by_that_of_the_fit(detector, p
             assert rare / (1 - rare) == pytest.approx(float(expected), rel=1e-4)
 
 
+def test_a_record_says_what_its_probability_assumes_and_gives_others(detector, photograph, picture):
+    agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
+    usual = agent.search(photograph, "green", closer=0)
+    assert (usual.prior, usual.assumed) == (None, pytest.approx(0.4))
+    for share in (0.05, 0.5, 0.9):
+        searched = agent.search(photograph, "green", closer=0, prior=share)
+        assert (searched.prior, searched.assumed) == (share, share)
+        assert usual.probability_at(share) == pytest.approx(searched.decision.probability, rel=1e-4)
+        assert searched.probability_at(0.4) == pytest.approx(usual.decision.probability, rel=1e-4)
+    assert usual.probability_at(usual.assumed) == usual.decision.probability
+    assert agent.search(picture, "green", passes=1, closer=0).assumed == 0.5
+    assert ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "green").assumed is None
+    moment = agent.stream(2, (), StreamSettings(prior=0.2), follows=False).step(photograph)
+    assert (moment.prior, moment.assumed) == (0.2, 0.2)
+
+
 def test_closer_looks_read_the_probabilities_of_the_fit_and_give_those_of_the_prior(detector, photograph):
     model, share = evidence_with_shares(give_up=0.0), 0.1
     agent = ZoomAgent(WindowEye(detector), model)
