@@ -7,8 +7,9 @@ are in most of them: without `prior`, with one half, and with the share of the p
 each one is searched for some classes that are drawn evenly from all, likewise, and for one that it holds and one that
 it does not hold, whose share is one half. The table has the mean probability, the Brier score, the expected calibration
 error, the area under ROC and the decisions beside the share of the searches whose target is there, and the difference
-of the Brier score to that without `prior`, paired over the photographs. If the command is stopped, repeat it to
-continue.
+of the Brier score to that without `prior`, paired over the photographs. `best` is the Brier score after an offset and a
+slope of the log odds that are fitted to these searches themselves: what is left is ranking, not calibration. If the
+command is stopped, repeat it to continue.
 """
 
 import sys
@@ -27,6 +28,7 @@ from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
 from semfov.data.classes import class_index
 from semfov.episode.stopwatch import Stopwatch
+from semfov.fit.logistic import logistic_regression
 from semfov.fit.protocols import choose_classes
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
@@ -158,7 +160,7 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
             for record in some
             if question.startswith(beginning) and not record["present"]
         ]
-    heads = ["mean p", "Brier", "difference", "ECE", "area", *_DECIDED, "passes"]
+    heads = ["mean p", "Brier", "difference", "best", "ECE", "area", *_DECIDED, "passes"]
     rows = [["searches for", "`prior=`", "number", "there", *heads]]
     for question, some in by_question.items():
         there = torch.tensor([record["present"] for record in some])
@@ -190,16 +192,27 @@ def _measured(records: Sequence[ResultRecord], way: str) -> list[str]:
     brier = Bootstrap.of(lambda chosen: squares[:, chosen].mean(1), [record["scene"] for record in records])
     apart = brier.less(1)
     difference = "" if way == "without" else plus_minus(float(apart.value[0]), float(apart.error[0]), 3, sign="+")
-    area = f"{area_under_roc(probability, there):.3f}" if there.any() and not there.all() else "-"
+    area = best = "-"
+    if there.any() and not there.all():
+        area = f"{area_under_roc(probability, there):.3f}"
+        best = f"{_best_brier(probability, there):.3f}"
     return [
         f"{float(probability.mean()):.3f}",
         plus_minus(float(brier.value[0]), float(brier.error[0]), 3),
         difference,
+        best,
         f"{BinarySums.of(probability, there).ece:.3f}",
         area,
         *_decided(records, way),
         f"{sum(record[way]['passes'] for record in records) / len(records):.1f}",
     ]
+
+
+def _best_brier(probability: Tensor, there: Tensor) -> float:
+    """Compute the Brier score after the best offset and slope of the log odds of probabilities `(n,)`."""
+    log_odds = probability.logit(1e-6)
+    offset, slope = logistic_regression(log_odds[:, None], there, ridge=0.0)
+    return BinarySums.of((slope * log_odds + offset).sigmoid(), there).brier
 
 
 def _decided(records: Sequence[ResultRecord], way: str) -> list[str]:
