@@ -1,6 +1,6 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Self
@@ -369,13 +369,9 @@ class ActivePerception(nn.Module):
         )
         any_of_several = len(classes_named(target)) > 1
         of_fovea = any(value is not None for value in (start, boxes, shifts))
-        if any_of_several and how == "auto" and not isinstance(target, Mapping):
-            check(
-                of_fovea,
-                "target",
-                "one class; find_all takes several, and how='fovea' searches for any of them",
-                target,
-            )
+        if any_of_several and how == "auto":
+            expected = "one class; find_all takes several, and how='fovea' searches for any of them"
+            check(of_fovea, "target", expected, target)
         opened = OpenedPicture.of(picture, color, white, bands)
         return self._look(opened, settings, foveal=of_fovea or any_of_several).search(opened, target, settings)
 

@@ -402,7 +402,8 @@ def test_search_for_any_of_several_classes_finds_the_one_that_is_present(agent, 
     assert torch.equal(listed.cells, weighted.cells)
     assert agent.search(image, ["red", "green"], how="fovea").found
     refused("one class for a search by windows", agent.search, image, ["red", "green"], how="windows")
-    refused("one class; find_all takes several, and how='fovea'", agent.search, image, ["red", "green"])
+    for several in (["red", "green"], {"red": 1.0, "green": 1.0}):
+        refused("one class; find_all takes several, and how='fovea'", agent.search, image, several)
 
 
 @pytest.mark.parametrize("task", ["search", "explore"])

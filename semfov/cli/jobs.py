@@ -215,7 +215,9 @@ class SearchJob(PictureJob[SearchOptions]):
             )
         if is_fovea and settings["start"] is None:
             settings = {**settings, "start": self._start_off_target(source)}
-        return self.agent.search(picture, weights if several and is_fovea else next(iter(weights)), **settings)
+        if several and is_fovea:
+            return self.agent.search(picture, weights, **{**settings, "how": "fovea"})
+        return self.agent.search(picture, next(iter(weights)), **settings)
 
     def _start_off_target(self, source: PictureSource) -> int | None:
         """Draw a first cell off the target of an example; None for other pictures, whose target is not known."""

@@ -256,7 +256,7 @@ def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, 
         The shares, `(K,)`.
     """
     classes = torch.arange(scores.shape[-1]) + 1
-    log_odds = evidence.presence(scores, classes.expand(scores.shape)).double()
+    log_odds = evidence.presence(scores, classes.expand(scores.shape)).detach().double()
     present = held.double()
     usual = _log_odds_held(held.sum(0), len(held))
     expected = usual - shares.double().logit()
