@@ -3,7 +3,8 @@
     picture ── strip by strip ──► largest copy ── halved ──► copy ── halved ──► …
 
 A window that is resampled to far fewer pixels is read from a copy of the picture, reduced by a power of two. Copies are
-in memory and made when they are first needed; where the file has reduced copies itself (overviews), these are read.
+in memory and made when they are first needed; where the file has reduced copies itself (overviews), these are read. In
+a very large picture the largest copy is a coarse one, and finer windows are reduced strip by strip as they are read.
 """
 
 from abc import ABC, abstractmethod
@@ -118,7 +119,7 @@ class LargePicture(ABC):
         nothing: the colour in which pixels without data are shown; None where there are none, or nothing tells them.
 
     Private attributes: `_has_overviews` tells whether coarse windows are read from reduced copies in the file.
-    `_copies` has the copies in memory that were made so far, by their reduction: that by `_least_reduction`, the
+    `_copies` has the copies in memory that were made so far, by their reduction: that by `_of_largest_copy`, the
     largest, is made of the picture, and each other one of the copy that is twice as large.
     """
 
@@ -154,7 +155,7 @@ class LargePicture(ABC):
             The factor, of which the edges of the windows are to be multiples.
         """
         reduction = reduction_for(ratio, oversampling) if self._is_large else 1
-        return reduction if reduction >= self._least_reduction else 1
+        return reduction if reduction >= _FIRST else 1
 
     def read(self, box: Box, reduction: int = 1) -> Tensor:
         """Read a window; coarse ones of large pictures are read from reduced copies.
@@ -174,7 +175,7 @@ class LargePicture(ABC):
         inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
         check(inside, "box", f"a window inside {width} × {height} pixels", box)
         has_copies = self._has_overviews or self._is_large
-        if has_copies and reduction >= self._least_reduction:
+        if has_copies and reduction >= _FIRST:
             return self._reduced(box, reduction)
         return _bytes_of(self._checked_pixels(box))
 
@@ -192,24 +193,25 @@ class LargePicture(ABC):
         return self.size[0] * self.size[1] > _LARGE
 
     @cached_property
-    def _least_reduction(self) -> int:
-        """Least factor by which windows are read reduced, so that the largest copy has at most `_LARGEST` pixels."""
+    def _of_largest_copy(self) -> int:
+        """Reduction of the largest copy, which has at most `_LARGEST` pixels."""
         reduction = _FIRST
-        while not self._has_overviews and self.size[0] * self.size[1] > _LARGEST * reduction**2:
+        while self.size[0] * self.size[1] > _LARGEST * reduction**2:
             reduction *= 2
         return reduction
 
     def _reduced(self, box: Box, reduction: int) -> Tensor:
-        """Cut a window out of a copy, `(3, h, w)`."""
-        copy = self._copy(reduction)
-        height, width = copy.shape[1:]
+        """Cut a window out of a copy, or reduce it as it is read, `(3, h, w)`."""
         x1, y1, x2, y2 = box
+        width, height = self._size_reduced(reduction)
         # The copy lacks what is left of the picture's sides, so that windows at its end have its last pixel.
         left = min(x1 // reduction, width - 1)
         top = min(y1 // reduction, height - 1)
         right = max(-(-x2 // reduction), left + 1)
         bottom = max(-(-y2 // reduction), top + 1)
-        return copy[:, top:bottom, left:right]
+        if reduction < self._of_largest_copy:
+            return self._reduced_in_strips((left, top, min(right, width), min(bottom, height)), reduction)
+        return self._copy(reduction)[:, top:bottom, left:right]
 
     @cached_property
     def _copies(self) -> dict[int, Tensor]:
@@ -219,63 +221,70 @@ class LargePicture(ABC):
     def _copy(self, reduction: int) -> Tensor:
         """Find or make a copy, without the rest of sides that are no multiples of the reduction."""
         if reduction not in self._copies:
-            if reduction == self._least_reduction:
-                self._copies[reduction] = self._largest_copy()
+            if reduction == self._of_largest_copy:
+                self._copies[reduction] = self._reduced_in_strips((0, 0, *self._size_reduced(reduction)), reduction)
             else:
                 larger = self._copy(reduction // 2)
                 height, width = (max(1, length // 2) for length in larger.shape[1:])
                 self._copies[reduction] = resized(larger[:, : 2 * height, : 2 * width], (height, width))[0]
         return self._copies[reduction]
 
-    def _largest_copy(self) -> Tensor:
-        """Make the largest copy strip by strip; what is not stored is not read."""
-        width, height = self._copy_size
-        # Rows of the copy whose pixels in the picture fit into memory at once.
-        rows = max(1, _STRIP // self.size[0] // self._least_reduction)
-        copy = torch.empty(height, width, 3, dtype=torch.uint8)
-        for top in range(0, height, rows):
-            bottom = min(top + rows, height)
-            for left, right, stored in self._runs(top, bottom):
+    def _reduced_in_strips(self, box: Box, reduction: int) -> Tensor:
+        """Read and reduce a window, `(3, h, w)`, strip by strip; what is not stored is not read.
+
+        Args:
+            box: the window in pixels of the reduced picture.
+            reduction: the factor.
+
+        Returns:
+            Bytes, channels last in memory.
+        """
+        x1, y1, x2, y2 = box
+        # Rows whose pixels in the picture fit into memory at once.
+        rows = max(1, _STRIP // ((x2 - x1) * reduction) // reduction)
+        window = torch.empty(y2 - y1, x2 - x1, 3, dtype=torch.uint8)
+        for top in range(y1, y2, rows):
+            bottom = min(top + rows, y2)
+            for left, right, stored in self._runs((x1, top, x2, bottom), reduction):
                 # One pixel is the colour of all that is not stored.
-                box = (left, top, right, bottom) if stored else (left, top, left + 1, top + 1)
-                copy[top:bottom, left:right] = self._part(box)
-        return copy.permute(2, 0, 1)
+                part = (left, top, right, bottom) if stored else (left, top, left + 1, top + 1)
+                window[top - y1 : bottom - y1, left - x1 : right - x1] = self._part(part, reduction)
+        return window.permute(2, 0, 1)
 
-    @property
-    def _copy_size(self) -> tuple[int, int]:
-        """`(width, height)` of the largest copy."""
+    def _size_reduced(self, reduction: int) -> tuple[int, int]:
+        """`(width, height)` of the picture when it is reduced, without the rest of sides that are no multiples."""
         width, height = self.size
-        return max(1, width // self._least_reduction), max(1, height // self._least_reduction)
+        return max(1, width // reduction), max(1, height // reduction)
 
-    def _runs(self, top: int, bottom: int) -> Iterator[tuple[int, int, bool]]:
-        """Find runs of columns of a strip of the largest copy, `(left, right, stored)`, that are stored or are not."""
-        width, _ = self._copy_size
-        step = max(1, _PIECE // self._least_reduction)
+    def _runs(self, box: Box, reduction: int) -> Iterator[tuple[int, int, bool]]:
+        """Find runs of columns of a strip of the reduced picture, `(left, right, stored)`, by whether they are."""
+        x1, top, x2, bottom = box
+        step = max(1, _PIECE // reduction)
         pieces = []
-        for left in range(0, width, step):
-            right = min(left + step, width)
-            stored = self.holds(self._around((left, top, right, bottom)))
+        for left in range(x1, x2, step):
+            right = min(left + step, x2)
+            stored = self.holds(self._around((left, top, right, bottom), reduction))
             pieces.append((left, right, stored))
         for stored, run in groupby(pieces, itemgetter(2)):
             columns = list(run)
             yield columns[0][0], columns[-1][1], stored
 
-    def _with_border(self, box: Box) -> Box:
-        """Widen a part of the largest copy by what the filter reaches, less than one pixel at each side."""
+    def _with_border(self, box: Box, reduction: int) -> Box:
+        """Widen a part of the reduced picture by what the filter reaches, less than one pixel at each side."""
         x1, y1, x2, y2 = box
-        width, height = self._copy_size
+        width, height = self._size_reduced(reduction)
         return max(x1 - 1, 0), max(y1 - 1, 0), min(x2 + 1, width), min(y2 + 1, height)
 
-    def _around(self, box: Box) -> Box:
-        """Find the window of the picture of which a part of the largest copy is made."""
-        left, top, right, bottom = (side * self._least_reduction for side in self._with_border(box))
+    def _around(self, box: Box, reduction: int) -> Box:
+        """Find the window of the picture of which a part of the reduced picture is made."""
+        left, top, right, bottom = (side * reduction for side in self._with_border(box, reduction))
         width, height = self.size
         return left, top, min(right, width), min(bottom, height)
 
-    def _part(self, box: Box) -> Tensor:
-        """Make a part of the largest copy, `(h, w, 3)`."""
+    def _part(self, box: Box, reduction: int) -> Tensor:
+        """Make a part of the reduced picture, `(h, w, 3)`."""
         x1, y1, x2, y2 = box
-        left, top, right, bottom = self._with_border(box)
-        pixels = _bytes_of(self._checked_pixels(self._around(box)))
+        left, top, right, bottom = self._with_border(box, reduction)
+        pixels = _bytes_of(self._checked_pixels(self._around(box, reduction)))
         part = resized(pixels, (bottom - top, right - left))[0, :, y1 - top : y2 - top, x1 - left : x2 - left]
         return part.permute(1, 2, 0)

@@ -312,10 +312,25 @@ def test_copies_of_very_large_pictures_begin_at_a_coarser_one(strips, monkeypatc
     monkeypatch.setattr("semfov.data.windowed._LARGEST", 1600)
     array = pixels(256, 384)
     picture = Counting(array)
-    assert [picture.reduction(ratio) for ratio in (6, 11.9, 12, 24)] == [1, 1, 8, 16]
+    assert [picture.reduction(ratio) for ratio in (6, 11.9, 12, 24)] == [4, 4, 8, 16]
     assert torch.equal(
         picture.read((0, 0, 384, 256), 8), resized(torch.from_numpy(array).permute(2, 0, 1), (32, 48))[0]
     )
     assert max(picture.rows) < 256
     assert picture.read((0, 0, 384, 256), 16).shape == (3, 16, 24)
-    assert picture.read((8, 8, 40, 40), 4).shape == (3, 32, 32)
+    assert {*picture._copies} == {8, 16}
+
+
+def test_windows_finer_than_the_largest_copy_are_reduced_as_they_are_read(strips, monkeypatch):
+    """They are what a copy would have, and no strip has more pixels than one of a copy."""
+    array = pixels(256, 384)
+    of_copy = ArrayPicture(array).read((0, 0, 384, 256), 4)
+    monkeypatch.setattr("semfov.data.windowed._LARGEST", 1600)
+    picture = Counting(array)
+    for box in ((0, 0, 384, 256), (16, 8, 96, 72), (200, 100, 384, 256)):
+        x1, y1, x2, y2 = (side // 4 for side in box)
+        assert torch.equal(picture.read(box, 4), of_copy[:, y1:y2, x1:x2])
+    assert not picture._copies
+    assert max(picture.rows) < 256
+    thin = ArrayPicture(np.full((1, 90_000, 3), 9, np.uint8))
+    assert thin.read((89_990, 0, 90_000, 1), 4).unique().tolist() == [9]
