@@ -4,7 +4,9 @@
 
 The photographs are those that the models were fitted to. The shares follow from the rule by which a fit draws its
 searches. Evidence for windows looks at the photographs `looked`, one pass each, to correct them by class. Fits write
-the shares themselves, so this is for models that were fitted without them.
+the shares themselves, so this is for models that were fitted without them. The Brier score that is printed is that of
+searches of the photographs looked at for each of the commonest classes, with its share of these photographs as
+`prior`; each half of them has the correction of the other half.
 """
 
 import sys
@@ -14,6 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from semfov.belief.prior import with_prior
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.errors import check
@@ -24,7 +27,7 @@ from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.progress import track
 from semfov.runs.setup import make_detector, make_scenes
-from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import Window
 
@@ -82,6 +85,41 @@ def _write_windows(path: Path, scenes: Scenes, looked: Scenes, eye: WindowEye) -
     photograph.shares = measured_shares(photograph, scores, held, drawn)
     model.save(path)
     print(f"{path}: {_span(photograph.shares)}")
+    before, after = _held_out_brier(photograph, scores, held, drawn)
+    print(f"Brier score of the {_COMMONEST} commonest classes: {before:.4f} by frequency, {after:.4f} corrected")
+
+
+_COMMONEST = 10  # number of classes whose probabilities are judged
+
+
+@torch.inference_mode()
+def _held_out_brier(evidence: PhotographEvidence, scores: Tensor, held: Tensor, drawn: Tensor) -> tuple[float, float]:
+    """Judge shares by halves of the photographs, each with the shares that the other half gives.
+
+    Args:
+        evidence: the evidence for photographs.
+        scores: `(P, K)`, highest ones in the looks at the whole.
+        held: `(P, K)` boolean, the classes of each photograph.
+        drawn: `(K,)`, the shares by frequency.
+
+    Returns:
+        The Brier scores with the shares by frequency, and with corrected ones.
+    """
+    common = held.sum(0).argsort(descending=True)[:_COMMONEST]
+    priors = (held.sum(0) + 0.5) / (len(held) + 1)
+    log_odds = evidence.presence(scores, torch.arange(scores.shape[-1]).expand(scores.shape) + 1)
+    is_first = torch.arange(len(held)) % 2 == 0
+    errors = []
+    for half in (is_first, ~is_first):
+        corrected = measured_shares(evidence, scores[~half], held[~half], drawn)
+        for shares in (drawn, corrected):
+            wrong = [
+                with_prior(log_odds[half, number], float(priors[number]), float(shares[number])).sigmoid()
+                - held[half, number].float()
+                for number in common.tolist()
+            ]
+            errors.append(float(torch.stack(wrong).square().mean()))
+    return (errors[0] + errors[2]) / 2, (errors[1] + errors[3]) / 2
 
 
 def _span(shares: Tensor) -> str:
