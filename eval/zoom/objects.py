@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
@@ -18,9 +19,10 @@ from semfov.detection.selection import Selection, suppress
 from semfov.fit.window_looking import right_boxes
 from semfov.metrics.calibration import BinarySums
 from semfov.observation.matching import box_iou
+from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table
-from semfov.zoom.certainty import SPREAD, number_of
+from semfov.zoom.certainty import SPREAD, number_of, number_of_faint
 from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge
 
@@ -32,13 +34,24 @@ _SAME = 0.5
 
 
 class Returned(NamedTuple):
-    """All objects, those that are listed, and the number that was not seen, if known, with the spread of all."""
+    """All objects, those that are listed, and the number that was not seen, if known, with the spread of all.
+
+    `given` tells whether a number of objects in all is given, and `faint` whether it is that of a class to which the
+    detector hardly reacts.
+    """
 
     objects: Objects
     listed: Objects
     unseen: tuple[float, float] | None = None
     spread: float = SPREAD
     given: bool = False
+    faint: bool = False
+
+
+def expected_of(path: ZoomPath) -> Returned:
+    """The objects of a search or an exploration, and what it says of their number in all."""
+    given = any(not math.isnan(number) for number in path.expected.values())
+    return Returned(path.candidates, path.objects, path.unseen, path.spread, given, given and not path.reacts)
 
 
 def merged(looks: Sequence[WindowLook], target: int | None) -> Returned:
@@ -84,13 +97,14 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
         are left out.
     """
     after = {}
-    for number, (objects, listed, unseen, spread, given) in returned.items():
+    for number, (objects, listed, unseen, spread, given, faint) in returned.items():
         right, sure = right_boxes(objects, annotation), right_boxes(listed, annotation)
         counts = right >= 0
-        mean, variance = number_of(objects.scores[counts], unseen or (0.0, 0.0), spread)
+        chances = objects.scores[counts]
+        mean, variance = number_of_faint(chances) if faint else number_of(chances, unseen or (0.0, 0.0), spread)
         alike = (box_iou(plain.boxes, listed.boxes) >= _SAME) & (plain.labels[:, None] == listed.labels)
         after[str(number)] = {
-            "scores": objects.scores[counts].tolist(),
+            "scores": chances.tolist(),
             "labels": objects.labels[counts].tolist(),
             "right": right[counts].tolist(),
             "listed": int((sure >= 0).sum()),

@@ -15,7 +15,7 @@ from torch import Tensor
 from eval.comparison.records import own_settings
 from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
-from eval.zoom.objects import AFTER, Returned, merged, object_record, suppressed, sure_boxes
+from eval.zoom.objects import AFTER, expected_of, merged, object_record, suppressed, sure_boxes
 from eval.zoom.observed import ObservedRates, make_zoom_observation
 from eval.zoom.orders import adaptive_slices, in_order, oracle, quad_tree, shuffled, sparse
 from semfov.agents.episode import Goal
@@ -230,12 +230,7 @@ class ZoomRun(WindowLooking, SceneRun):
             number: suppressed(seen[RASTER][:number], self.target) for number in self.numbers
         }
         ways[f"{SEMFOV}, scores of the detector"] = ways[SEMFOV]
-        ways[SEMFOV] = {
-            number: Returned(
-                path.candidates, path.objects, path.unseen, path.spread, path.reacts and len(path.objects) > 1
-            )
-            for number, path in paths.items()
-        }
+        ways[SEMFOV] = {number: expected_of(path) for number, path in paths.items()}
         for way, returned in ways.items():
             yield object_record(way, returned, annotation, plain) | {"scene": self.scenes.ids[index]}
 

@@ -19,6 +19,7 @@ from eval.zoom.objects import (
     Returned,
     average_precision,
     class_mean,
+    expected_of,
     in_all_table,
     object_figures,
     object_record,
@@ -31,6 +32,7 @@ from semfov import MapEvidence, TargetEvidence
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Detections, Objects
 from semfov.head.views import Views
+from semfov.paths import ZoomPath
 from semfov.runs.config import DataConfig
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import SPREAD
@@ -290,6 +292,24 @@ def test_boxes_of_a_plain_pass_are_kept_where_one_of_their_class_is_listed():
     assert (record["objects"], record["by class"], record["plain"]) == (2, {"1": 1, "2": 1}, 3)
     assert (after["listed"], after["listed right"], after["kept"]) == (2, 1, 1)
     assert (after["in all"], after["error"]) == pytest.approx((3.7, (3 * 0.09 + 0.25 + (SPREAD * 3.7) ** 2) ** 0.5))
+
+
+def test_a_number_is_given_where_the_record_has_one_also_where_nothing_is_listed():
+    """In a photograph without a cup none is expected, with an error of one; the faint ones count twice."""
+    nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
+    lattice, names = Lattice.over((300, 200), (416, 416)), ("background", "cup", "cat")
+    path = ZoomPath(lattice=lattice, classes=names, target=1, looks=(), candidates=nothing, unseen=(0.0, 0.0))
+    truth = Annotation(torch.zeros(0, 4), torch.zeros(0).long(), torch.zeros(0).bool(), (300, 200))
+    after = object_record("semfov", {1: expected_of(path)}, truth, nothing)["after"]["1"]
+    assert (after["given"], after["in all"], after["error"]) == (True, 0.0, 1.0)
+    boxes = torch.tensor([[0.0, 0, 9, 9], [20, 20, 30, 30]])
+    faint = Objects(boxes, torch.tensor([0.3, 0.1]), torch.tensor([1, 1]), torch.zeros(2).long())
+    after = object_record("semfov", {1: expected_of(replace(path, candidates=faint))}, truth, nothing)["after"]["1"]
+    assert after["given"]
+    assert after["in all"] == pytest.approx(0.8)
+    assert after["error"] == pytest.approx((0.21 + 0.09 + 1.8**2) ** 0.5)
+    large = replace(path, lattice=Lattice.over((4000, 3000), (416, 416)), candidates=faint)
+    assert not expected_of(large).given
 
 
 def test_average_precision_equals_that_of_coco():
