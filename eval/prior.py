@@ -54,6 +54,8 @@ _ALWAYS = "always "  # begins the names of the questions about one class
 _MISSING = {_ALWAYS: "one of these classes, not there", PAIR: "the one that is not there"}
 """Names for the searches without their target, by how the names of their questions begin."""
 
+_DECIDED = ("found, there", "absent, there", "found, not there", "absent, not there")
+
 _PRIORS = {"without": "-", "half": "0.5", "with": "share"}
 """The priors of a search, by their names in the records, as the table names them."""
 
@@ -180,9 +182,6 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
     )
 
 
-_DECIDED = ("found, there", "absent, there", "found, not there", "absent, not there")
-
-
 def _measured(records: Sequence[ResultRecord], way: str) -> list[str]:
     """Measure probabilities, in the order of the headings, and count decisions and passes."""
     probability = torch.tensor([record[way]["probability"] for record in records], dtype=torch.float64)
@@ -216,7 +215,7 @@ def _best_brier(probability: Tensor, there: Tensor) -> float:
 
 
 def _decided(records: Sequence[ResultRecord], way: str) -> list[str]:
-    """Shares that end found and absent, of the searches whose target is there, then of the others, in percent."""
+    """Compute which % end found and absent, of the searches whose target is there, then of the others."""
     cells = []
     for present in (True, False):
         outcomes = [record[way]["outcome"] for record in records if record["present"] == present]

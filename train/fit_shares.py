@@ -31,6 +31,8 @@ from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import Window
 
+_COMMONEST = 10  # number of classes whose probabilities are judged
+
 
 @dataclass(frozen=True)
 class FitSharesConfig(FitSearchConfig):
@@ -87,9 +89,6 @@ def _write_windows(path: Path, scenes: Scenes, looked: Scenes, eye: WindowEye) -
     print(f"{path}: {_span(photograph.shares)}")
     before, after = _held_out_brier(photograph, scores, held, drawn)
     print(f"Brier score of the {_COMMONEST} commonest classes: {before:.4f} by frequency, {after:.4f} corrected")
-
-
-_COMMONEST = 10  # number of classes whose probabilities are judged
 
 
 @torch.inference_mode()

@@ -49,7 +49,7 @@ class Returned(NamedTuple):
 
 
 def expected_of(path: ZoomPath) -> Returned:
-    """The objects of a search or an exploration, and what it says of their number in all."""
+    """Take the objects of a search or an exploration, and what it says of their number in all."""
     given = any(not math.isnan(number) for number in path.expected.values())
     return Returned(path.candidates, path.objects, path.unseen, path.spread, given, given and not path.reacts)
 
