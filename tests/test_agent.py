@@ -103,7 +103,7 @@ def test_predictive_policies_search_for_one_class_only(image):
     ahead = ActivePerception(
         squares_eye(), (Semantic(3), Policy("predictive", model)), (Semantic(3), Policy("random")), grid=(8, 6)
     )
-    refused("one class for policy 'predictive'", ahead.search, image, {"red": 1.0, "green": 0.8})
+    refused("one class for policy 'predictive'", ahead.search, image, {"red": 1.0, "green": 0.8}, how="fovea")
 
 
 class Weighted(Coloured):
