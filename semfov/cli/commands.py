@@ -154,7 +154,8 @@ semfov gaze: where people look in a picture that they view freely
 
   semfov gaze poster.jpg --report poster.html
   semfov gaze drafts/*.png --people 30 --seconds 5 --out drafts.csv
-  semfov gaze poster.jpg --out density.npy
+  semfov gaze poster.jpg --areas logo:10,20,200,80 price:300,40,420,90 --out map.png
+  semfov gaze before.png after.png --compare --areas areas.json --report drafts.html
 
 usage: semfov gaze [PICTURE ...] [options]
 
@@ -165,8 +166,12 @@ usage: semfov gaze [PICTURE ...] [options]
   --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
   --seconds S          time for which each views a picture (default 3)
   --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
-  --out FOLDER         scanpaths, and a heat map of each picture
-  --report PAGE.html   a page with heat map, contours and scanpaths, in which to step through the fixations
+  --out FOLDER         scanpaths, and a heat map of each picture; with scanpaths comes a table of the pictures
+  --report PAGE.html   a page with heat map, areas and scanpaths, in which to step through the fixations
+  --areas NAME:L,T,R,B share of all fixations in areas: left, top, right and bottom edge in pixels; or a file .json with
+                       {"logo": [10, 20, 200, 80]}
+  --compare            two pictures side by side: both maps on one scale, and what differs (default: a page,
+                       semfov-compare.html)
 
 If a command with --out of scanpaths or a folder is stopped, the same command continues with the pictures that are left.
 It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to

@@ -2,7 +2,7 @@
 
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +20,25 @@ from semfov.data.fixations import Fixations
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
-from semfov.io.files import check_writable, plain_name
+from semfov.io.files import check_writable, plain_name, write_text
+from semfov.io.tables import csv_text, digits
+from semfov.paths.areas import boxes_of, percent
+from semfov.paths.drafts import Drafts
 from semfov.paths.gaze import GazePrediction
+from semfov.report.drafts import drafts_section
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.template import page_path, write_html
 from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
+from semfov.viz.style import save_figure
 
 _DENSITIES = (".npy", ".tif", ".tiff", ".png")
 
+_PICTURES = "pictures.csv"  # name of the table of pictures, after that of the scanpaths
+_COMPARED = Path("semfov-compare.html")  # page of a comparison for which no file is named
+
 _Outcome = dict[str, Any]
-"""What is written of a picture, as JSON values: text, drawn viewers, part of a page, and file of the density."""
+"""What is written of a picture, as JSON values: text, drawn viewers, facts, part of a page, and file of the density."""
 
 
 def predict_gaze(options: GazeOptions) -> int:
@@ -54,6 +62,9 @@ class _GazeJob:
         kind: end of the name of the file that is written; empty for a folder or nothing.
         table: file of the scanpaths; None where none are written.
         outcomes: what is known of the pictures so far, by number.
+        report: the page that is written; None for none.
+        areas: areas of interest; None for none.
+        predictions: the predictions that are compared, by number.
         finished: the outcomes that the same command takes up after an interruption; None where it keeps none.
     """
 
@@ -61,10 +72,16 @@ class _GazeJob:
         self.options = options
         self.sources = picture_sources(options)
         self.several = len(self.sources) > 1
-        self.kind = _kind_of_output(options.out, several=self.several)
+        if options.compare:
+            check(len(self.sources) == 2, "compare", "two pictures", len(self.sources))
+        self.kind = _kind_of_output(options.out, several=self.several, compared=options.compare)
         self.table = _table_of(options.out, self.kind)
-        if options.report is not None:
-            check_writable(page_path(options.report))
+        self.areas = None if options.areas is None else boxes_of(options.areas)
+        self.report = (
+            _COMPARED if options.compare and options.out is None and options.report is None else options.report
+        )
+        if self.report is not None:
+            check_writable(page_path(self.report))
         check_detector(options.detector)
         check_onnx_options(options, options.detector)
         loading = detector_options(options)
@@ -76,9 +93,10 @@ class _GazeJob:
         if not self.sources:
             self.sources = [example_source(EXAMPLES[0])]
             print(f"no picture was given: looking at {self.sources[0].name}, which comes with semfov")
+        self.predictions: dict[int, GazePrediction] = {}
         self.outcomes: dict[int, _Outcome] = {}
         self.finished: SceneResults | None = None
-        if self.several and self.table is not None:
+        if self.several and self.table is not None and not options.compare:
             self.finished = self._take_up(self.table)
 
     def _take_up(self, table: Path) -> SceneResults:
@@ -101,33 +119,26 @@ class _GazeJob:
         given = None if self.options.model is None else self.model
         prediction = GazePrediction.of(self.detector, image, model=given, source=file)
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
+        shares = {} if self.areas is None else prediction.share(self.areas)
         outcome: _Outcome = {
-            "text": self._text(source.name, prediction, paths),
+            "text": _text(source.name, prediction, paths, shares),
             "size": prediction.size,
             "viewers": [[path.subject, path.points.tolist(), np.asarray(path.durations).tolist()] for path in paths],
-            "part": None if options.report is None else gaze_part(prediction, paths),
+            "facts": _facts(prediction, shares),
+            "part": None if self.report is None else gaze_part(prediction, paths, self.areas),
         }
-        if options.out is not None and self.kind != ".csv":
-            outcome["density"] = str(prediction.save_density(self._density_path(options.out, number, prediction)))
+        if options.out is not None and self.kind != ".csv" and not (options.compare and self.kind):
+            outcome["density"] = str(self._save_density(options.out, number, prediction))
+        if options.compare:
+            self.predictions[number] = prediction
         self.outcomes[number] = outcome
 
-    def _text(self, name: str, prediction: GazePrediction, paths: Sequence[Fixations]) -> str:
-        """Say what is known of a prediction and the viewers that are drawn from it."""
-        places = "; ".join(
-            f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %"
-            for number, peak in enumerate(prediction.peaks(), 1)
-        )
-        terms = ", ".join(f"{term} {bits:.2f}" for term, bits in prediction.parts.items())
-        mean = sum(map(len, paths)) / len(paths)
-        lines = [
-            f"{name}: {prediction.describe()}",
-            f"  places: {places}",
-            f"  added by each term, in bits: {terms}",
-            f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
-        ]
-        if prediction.caution is not None:
-            lines.append(f"  {prediction.caution}")
-        return "\n".join(lines)
+    def _save_density(self, out: Path, number: int, prediction: GazePrediction) -> Path:
+        """Write the density of a picture, a heat map with the areas."""
+        path = self._density_path(out, number, prediction)
+        if path.suffix.lower() == ".png":
+            return save_figure(prediction.plot(areas=self.areas), path)
+        return prediction.save_density(path)
 
     def _density_path(self, out: Path, number: int, prediction: GazePrediction) -> Path:
         """Name the file of a density: the one that is given, or one in the folder, numbered if there are several."""
@@ -142,24 +153,38 @@ class _GazeJob:
             self.finished.save(number, [self.outcomes[number]], {})
 
     def write(self, *, complete: bool) -> None:
-        """Write scanpaths and page of the pictures so far, and list all files."""
+        """Write scanpaths, table of pictures and page of the pictures so far, and list all files."""
         from semfov.human.fixations.table import write_table
 
         outcomes = dict(sorted(self.outcomes.items()))
         written: list[object] = [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
         names = self._names()
         if self.table is not None and outcomes:
-            write_table(
-                self.table,
-                [path for number, outcome in outcomes.items() for path in _fixations(names[number], outcome)],
+            paths = [path for number, outcome in outcomes.items() for path in _fixations(names[number], outcome)]
+            write_table(self.table, paths)
+            pictures = self.table.with_name(_PICTURES if not self.kind else f"{self.table.stem}-{_PICTURES}")
+            write_text(
+                pictures, _table_of_pictures({names[number]: each["facts"] for number, each in outcomes.items()})
             )
-            written.insert(0, self.table)
-        if self.options.report is not None and outcomes:
+            written[:0] = [self.table, pictures]
+        drafts = Drafts(*self.predictions.values()) if len(self.predictions) == 2 else None
+        if drafts is not None:
+            print(drafts.describe(self.areas))
+            written += self._figure_of(drafts)
+        if self.report is not None and outcomes:
             for number, outcome in outcomes.items():
                 outcome["part"]["picture"]["name"] = names[number]
             parts = [outcome["part"] for outcome in outcomes.values()]
-            written.append(write_html(self.options.report, gaze_page_html("semfov: where people look", parts)))
+            before = "" if drafts is None else drafts_section(drafts, self.areas)
+            written.append(write_html(self.report, gaze_page_html("semfov: where people look", parts, before)))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
+
+    def _figure_of(self, drafts: Drafts) -> list[Path]:
+        """Write the figure of two drafts, where one is asked for."""
+        out = self.options.out
+        if out is None or self.kind == ".csv":
+            return []
+        return [save_figure(drafts.plot(areas=self.areas), out if self.kind else out / "compare.png")]
 
     def _names(self) -> list[str]:
         """Name the pictures as in their folder, or as they were named where two would have the same."""
@@ -170,9 +195,49 @@ class _GazeJob:
         ]
 
 
-def _kind_of_output(out: Path | None, *, several: bool) -> str:
+def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], shares: Mapping[str, float]) -> str:
+    """Say what is known of a prediction and the viewers that are drawn from it."""
+    places = "; ".join(
+        f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %"
+        for number, peak in enumerate(prediction.peaks(), 1)
+    )
+    mean = sum(map(len, paths)) / len(paths)
+    lines = [
+        f"{name}: {prediction.describe()}",
+        f"  most of all fixations: {places}",
+        f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
+    ]
+    if shares:
+        said = ", ".join(f"{area} {percent(share)}" for area, share in shares.items())
+        lines.insert(1, f"  share of all fixations: {said}")
+    if prediction.caution is not None:
+        lines.append(f"  caution: {prediction.caution}")
+    return "\n".join(lines)
+
+
+def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> dict[str, object]:
+    """List what the table of pictures says of a prediction."""
+    facts: dict[str, object] = {"width": prediction.size[0], "height": prediction.size[1], "unlike": prediction.unlike}
+    facts["unlikeness"] = prediction.unlikeness
+    for number, place in enumerate(prediction.first_fixations(), 1):
+        facts |= {f"x {number}": place["x"], f"y {number}": place["y"], f"viewers {number}": place["share"]}
+    return facts | {f"share of {area}": digits(share) for area, share in shares.items()}
+
+
+def _table_of_pictures(facts: Mapping[str, Mapping[str, object]]) -> str:
+    """Write the table of pictures as CSV: a line for each, with its first fixations and shares of areas."""
+    columns = [*next(iter(facts.values()))]
+    rows: list[Sequence[object]] = [["picture", *columns]]
+    rows += [[name, *(of_picture[column] for column in columns)] for name, of_picture in facts.items()]
+    return csv_text(rows)
+
+
+def _kind_of_output(out: Path | None, *, several: bool, compared: bool) -> str:
     """Find the end of the name of the file that is written; empty for a folder or nothing."""
     kind = "" if out is None or out.is_dir() else out.suffix.lower()
+    if compared:
+        check(kind in ("", ".csv", ".png"), "out", "a folder, or a file .csv or .png", out)
+        return kind
     check(kind in ("", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", out)
     check(kind not in _DENSITIES or not several, "out", "a .csv file or a folder for several pictures", out)
     return kind

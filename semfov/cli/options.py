@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from semfov.data.tone import White
 from semfov.errors import InputError
-from semfov.io.ranges import Count, Range, Seed, Whole, Workers
+from semfov.io.ranges import Count, Form, Range, Seed, Whole, Workers
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 from semfov.settings import (
@@ -25,6 +25,11 @@ from semfov.settings import (
 
 ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 """Figures that are drawn unless others are named."""
+
+AreasText = Annotated[
+    str, Form("areas", "as NAME:LEFT,TOP,RIGHT,BOTTOM, with blanks between them, or a file .json", r".+:[\d.,-]+")
+]
+"""Areas of interest, as `semfov.paths.areas.boxes_of` reads them."""
 
 
 @dataclass(frozen=True)
@@ -201,6 +206,10 @@ class GazeOptions(DetectorOptions):
         out: file of scanpaths, `.csv`; of the density of one picture, `.npy`, `.tif` or `.png`; or a folder for
             scanpaths and a heat map of each picture.
         report: HTML page to write, in which to step through the fixations.
+        areas: areas of interest in pixels of each picture, of which the share of the fixations is said and drawn, as
+            `logo:10,20,200,80` (left, top, right and bottom edge), several with blanks between them; or a JSON file,
+            `{"logo": [10, 20, 200, 80]}`.
+        compare: compare two pictures: both maps on one scale, what differs, and the shares of areas beside each other.
         quiet: print errors and warnings alone.
     """
 
@@ -214,6 +223,8 @@ class GazeOptions(DetectorOptions):
     seed: Seed = 0
     out: Path | None = None
     report: Path | None = None
+    areas: AreasText | None = None
+    compare: bool = False
     quiet: bool = False
 
 

@@ -15,6 +15,7 @@ from semfov.fit.gaze import GazeFit, fitted_density
 from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores
 from semfov.fit.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.gaze.saliency.likeness import FEWEST, PictureLikeness, pooled
 from semfov.runs.settings import Whole
 from semfov.runs.tables import table
 
@@ -103,6 +104,7 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     scores = kept.scores(detector.name, folds)
     model = fitted_density(config.fit, groups, [list(range(len(group))) for group in groups], "all pictures")
     _describe_viewing(model, groups)
+    model.likeness = fitted_likeness(model, groups)
     settings = detector.settings()
     model.metadata |= {
         "detector": {name: settings[name] for name in ("name", "digest", "input_size", "stretch")},
@@ -114,6 +116,20 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
         },
     }
     return model, scores
+
+
+def fitted_likeness(model: FixationDensity, groups: Sequence[Viewed]) -> PictureLikeness | None:
+    """Fit the distance of other pictures from those of a fit.
+
+    Args:
+        model: names the feature maps.
+        groups: the pictures of the fit.
+
+    Returns:
+        The distance; None where there are too few pictures for one.
+    """
+    values = [pooled(group.some([picture]), model.layers) for group in groups for picture in range(len(group))]
+    return PictureLikeness.fitted(torch.cat(values)) if len(values) >= FEWEST else None
 
 
 def _check_pictures(config: GazeModelFit, groups: Sequence[Viewed]) -> None:

@@ -68,10 +68,12 @@ class Form:
     Args:
         noun: what the value is, such as `a cell`.
         words: how it is written.
+        more: pattern of further words of the command line that belong to the value; empty for none.
     """
 
     noun: str
     words: str
+    more: str = ""
 
     def __repr__(self) -> str:
         return self.words

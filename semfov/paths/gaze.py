@@ -23,9 +23,12 @@ from semfov.errors import InputError, check, check_number, check_whole
 from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density
 from semfov.gaze.saliency.glimpses import features_so_far
+from semfov.gaze.saliency.likeness import pooled
 from semfov.io.files import MADE_HERE, write_bytes
-from semfov.io.tables import digits, pixels
+from semfov.io.tables import digits
+from semfov.paths.areas import AreasLike, percent, read_areas, share_in
 from semfov.paths.base import Record
+from semfov.paths.places import Place, are_apart, places_of
 from semfov.paths.stimulus import reduced_copy
 from semfov.words import GAZE_PREDICTION, OtherWords
 
@@ -35,7 +38,9 @@ if TYPE_CHECKING:
 
 _MOST_FIXATIONS = 100  # of a drawn scanpath
 _SHORTEST = 60  # milliseconds of a fixation, by which the number of fixations in a time is bounded
-_REACH = 0.05  # distance, in longer sides of the picture, within which probability belongs to a peak
+_VIEWERS = 100  # whose first fixations are counted
+_WIDE = 2  # width over height from which a picture is wider than those of the shipped models
+_MOST_FIRST = 10  # first fixations that can be asked for
 
 ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
 """Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""
@@ -53,6 +58,8 @@ class GazePrediction(OtherWords):
         source: file of the picture; None if it does not come from a file.
         seen: number of fixations at which the fovea has seen the picture; None for the sharp picture.
         is_shipped: whether the model is the one that is shipped for the detector.
+        unlikeness: distance of the picture from those of the fit, 1 where it begins to be unlike them
+            (`semfov.gaze.saliency.PictureLikeness`); None where it is not known.
 
     Example::
 
@@ -69,6 +76,7 @@ class GazePrediction(OtherWords):
     source: str | None = None
     seen: int | None = None
     is_shipped: bool = False
+    unlikeness: float | None = None
 
     _other_words = GAZE_PREDICTION
 
@@ -114,17 +122,34 @@ class GazePrediction(OtherWords):
                 raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
             suits = image.dtype == fitted.read.dtype and image.device == fitted.read.device
             terms = (fitted if suits else deepcopy(fitted).to(image)).terms(features, size[::-1])
+            # What a fovea has shown is unlike a sharp picture, whatever the picture is.
+            unlikeness = None if fitted.likeness is None or seen is not None else _unlikeness(fitted, features)
         on_processor = {name: term.cpu() for name, term in terms.items()}
         number = None if fixations is None else len(fixations)
-        return cls(fitted, on_processor, size, reduced_copy(image), source, number, is_shipped=model is None)
+        photograph = reduced_copy(image)
+        return cls(
+            fitted, on_processor, size, photograph, source, number, is_shipped=model is None, unlikeness=unlikeness
+        )
+
+    @property
+    def unlike(self) -> bool:
+        """Whether the picture is unlike the pictures of the fit, as pages, charts and drawings are."""
+        return self.unlikeness is not None and self.unlikeness > 1
 
     @property
     def caution(self) -> str | None:
         """Why the prediction may be wrong for this picture; None where nothing is known against it."""
         width, height = self.size
+        cautions = []
+        if self.unlike:
+            cautions.append(
+                "this picture is unlike the photographs that the model learned from, so the map may be wrong"
+            )
         if self.is_shipped and width <= height:
-            return "the model was fitted to pictures that are wider than high, and may be wrong here"
-        return None
+            cautions.append("the model learned from pictures that are wider than high")
+        if self.is_shipped and width >= _WIDE * height:
+            cautions.append(f"the model learned from pictures of 4 : 3, and this one is {width / height:.1f} : 1")
+        return "; ".join(cautions) or None
 
     @cached_property
     def density(self) -> Tensor:
@@ -173,24 +198,66 @@ class GazePrediction(OtherWords):
         return [{**place} for place in self._places[:count]]
 
     @cached_property
-    def _places(self) -> list[dict[str, float]]:
+    def _places(self) -> list[Place]:
         """All places, as `peaks` orders them."""
-        rows, columns = self.cells.shape
-        width, height = self.size
-        x = (torch.arange(columns) + 0.5) * (width / columns)
-        y = (torch.arange(rows) + 0.5) * (height / rows)
-        centres = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
-        distance = torch.cdist(centres, centres) / (_REACH * max(self.size))
-        share = (distance <= 1).to(self.cells) @ self.cells.flatten()
-        value = (1 - distance).clamp(min=0).to(self.cells) @ self.cells.flatten()
-        free = torch.ones(len(centres), dtype=torch.bool)
-        places: list[dict[str, float]] = []
-        while bool(free.any()):  # all of them, since a later place can have a larger share
-            best = int(torch.where(free, value, -1.0).argmax())
-            x_best, y_best = centres[best].tolist()
-            places.append({"x": pixels(x_best - 0.5), "y": pixels(y_best - 0.5), "share": digits(float(share[best]))})
-            free &= distance[best] > 2
-        return sorted(places, key=lambda place: -place["share"])
+        return places_of(self.cells, self.size)
+
+    def first_fixations(self, count: int = 3) -> list[dict[str, float]]:
+        """List where people look first, in order.
+
+        A viewer's eyes are in the middle when the picture appears. For each fixation after that one, this is the place
+        that most of 100 drawn viewers reach with it, of those that no earlier fixation of the list has reached.
+
+        Args:
+            count: number of fixations, from 1 to 10.
+
+        Returns:
+            For each fixation `x` and `y` in pixels of the picture, and `share`, the share of the viewers whose fixation
+            of this number is within 5 % of the longer side of it. Fewer fixations are the first of more.
+
+        Raises:
+            InputError: `count` is out of range.
+        """
+        check_whole(count, "count", 1, _MOST_FIRST)
+        while len(self._first) < count:
+            cells = self.given(self._viewers, len(self._first) + 1)
+            places = places_of(cells, self.size)
+            apart = (place for place in places if are_apart(place, self._first, self.size))
+            self._first.append(next(apart, places[0]))
+        return [{**place} for place in self._first[:count]]
+
+    @cached_property
+    def _first(self) -> list[Place]:
+        """The first fixations that were asked for so far."""
+        return []
+
+    @cached_property
+    def _viewers(self) -> list[Fixations]:
+        """Viewers whose first fixations stand for those of all people; the same ones at each call."""
+        generator = torch.Generator().manual_seed(0)
+        start = self._starts(_VIEWERS, generator)
+        paths = self.model.sample(self.terms, self.size[::-1], start, _MOST_FIRST + 1, generator)
+        return [Fixations(self.name, f"viewer {n}", path.double().numpy(), self.size) for n, path in enumerate(paths)]
+
+    def share(self, areas: AreasLike) -> dict[str, float]:
+        """Compute the share of all fixations in areas of interest.
+
+        Args:
+            areas: boxes by name, as left, top, right and bottom edge in pixels of the picture; a text such as
+                `logo:10,20,200,80 price:300,40,420,90`; or a JSON file, `{"logo": [10, 20, 200, 80]}`.
+
+        Returns:
+            The shares by name, from 0 to 1. Areas that overlap share fixations.
+
+        Raises:
+            InputError: an area has another form, is empty or reaches out of the picture.
+            DataError: the file cannot be read.
+
+        Example::
+
+            agent.gaze("poster.jpg").share({"logo": (10, 20, 200, 80)})  # {'logo': 0.07}
+        """
+        return {name: share_in(self.density, area) for name, area in read_areas(areas, self.size).items()}
 
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.
@@ -211,7 +278,7 @@ class GazePrediction(OtherWords):
         check_whole(people, "people", 1, 10_000)
         check_number(seconds, "seconds", 0.1, 60.0)
         generator = torch.Generator().manual_seed(seed)
-        start = self._first_fixations(people, generator)
+        start = self._starts(people, generator)
         durations, lengths = self._drawn_durations(people, seconds, generator)
         paths = self.model.sample(self.terms, self.size[::-1], start, int(lengths.max()), generator)
         viewers = []
@@ -221,7 +288,7 @@ class GazePrediction(OtherWords):
             viewers.append(Fixations(self.name, f"viewer {number}", points, self.size, spent))
         return viewers
 
-    def _first_fixations(self, people: int, generator: torch.Generator) -> Tensor:
+    def _starts(self, people: int, generator: torch.Generator) -> Tensor:
         """Draw the first fixation of each viewer, `(people, 2)`, within two standard deviations and the picture."""
         side = torch.tensor(self.size)
         drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
@@ -323,11 +390,12 @@ class GazePrediction(OtherWords):
         return compare_density(self, people)
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
-        """Draw the density over the picture, with its peaks.
+        """Draw the smallest areas with 10 to 90 % of the fixations over the picture, and the first three fixations.
 
         Args:
             ax: axes to draw in; None makes a new figure.
-            options: `scanpaths`, to draw over it.
+            options: `areas`, to draw with their shares; `scanpaths`, to draw over it; `title`, whether lines above say
+                what is drawn.
 
         Returns:
             The figure.
@@ -356,14 +424,23 @@ class GazePrediction(OtherWords):
 
         return animate_gaze(self, path, **options)
 
-    def report(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> Path:
-        """Write an HTML page with the density, contours and scanpaths, a single file that loads nothing from elsewhere.
+    def report(
+        self,
+        path: str | PathLike[str],
+        *,
+        people: int = 15,
+        seconds: float = 3.0,
+        seed: int = 0,
+        areas: AreasLike | None = None,
+    ) -> Path:
+        """Write an HTML page with heat map, areas and scanpaths, a single file that loads nothing from elsewhere.
 
         Args:
             path: the file.
             people: number of viewers whose scanpaths are drawn.
             seconds: time for which each views the picture.
             seed: seed of all draws.
+            areas: areas of interest to show with their shares, as for `share`.
 
         Returns:
             The path.
@@ -375,7 +452,7 @@ class GazePrediction(OtherWords):
         from semfov.report.gaze import gaze_page_html, gaze_part
         from semfov.report.template import write_html
 
-        part = gaze_part(self, self.scanpaths(people, seconds=seconds, seed=seed))
+        part = gaze_part(self, self.scanpaths(people, seconds=seconds, seed=seed), areas)
         return write_html(Path(path), gaze_page_html(f"semfov: where people look in {self.name}", [part]))
 
     def to_csv(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> None:
@@ -421,20 +498,16 @@ class GazePrediction(OtherWords):
 
     def describe(self) -> str:
         """Describe the prediction in one line."""
-        first = self.peaks(1)[0]
-        reach = _REACH * max(self.size)
+        first = ", then ".join(f"({place['x']:.0f}, {place['y']:.0f})" for place in self.first_fixations())
         limit = ""
         if self.seen is not None:
             limit = f", after {self.seen} fixation{'s' if self.seen != 1 else ''} seen by the fovea"
-        return (
-            f"{100 * first['share']:.0f} % of fixations within {reach:.0f} px of ({first['x']:.0f}, {first['y']:.0f}); "
-            f"entropy {self.entropy:.1f} of {math.log2(self.cells.numel()):.1f} bits{limit}"
-        )
+        return f"people look first at {first}{limit}"
 
     def __repr__(self) -> str:
         """Return the description, and the places where most fixations are expected."""
         lines = [
-            f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {100 * peak['share']:.0f} %"
+            f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {percent(peak['share'])} of all fixations"
             for number, peak in enumerate(self.peaks(), 1)
         ]
         return "\n".join([f"{type(self).__name__}: {self.describe()}", *lines])
@@ -474,6 +547,13 @@ def _sharp_features(detector: Detector, image: Tensor, model: FixationDensity) -
     canvas, placement = detector.fit(image[None])
     maps = detector.feature_maps(canvas, [*model.layers])
     return FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
+
+
+def _unlikeness(model: FixationDensity, features: FeatureMaps) -> float:
+    """Compute the distance of a picture from those of the fit of a model that knows it."""
+    assert model.likeness is not None
+    values = pooled(features, model.layers).to(model.likeness.mean)
+    return digits(float(model.likeness(values)[0]))
 
 
 def _foveal_features(eye: Eye, image: Tensor, fixations: Fixations, model: FixationDensity) -> FeatureMaps:

@@ -31,11 +31,37 @@ function drawHeat(step) {
   canvas.getContext("2d").putImageData(image, 0, 0);
 }
 
-function drawContours(step) {
-  if (!find("contours").checked) return;
-  picture.contours[step].forEach((line, order) => {
-    drawn("path", { d: line, class: "contour under", "stroke-width": 3 + order });
-    drawn("path", { d: line, class: "contour", "stroke-width": 1 + order });
+function drawBorders(step) {
+  if (!find("borders").checked) return;
+  picture.borders[step].forEach((line, order) => {
+    drawn("path", { d: line, class: "border under", "stroke-width": 3 + order });
+    drawn("path", { d: line, class: "border", "stroke-width": 1 + order });
+  });
+}
+
+function write(words, attributes) {
+  drawn("text", attributes);
+  find("drawing").lastChild.textContent = words;
+}
+
+function drawAreas() {
+  if (!find("areas").checked) return;
+  const unit = Math.max(...picture.size) / 250;
+  for (const [words, left, top, right, bottom] of picture.areas) {
+    drawn("rect", { class: "area", x: left, y: top, width: right - left, height: bottom - top });
+    write(words, { x: left + 2 * unit, y: top + 8 * unit, "font-size": 7 * unit, "stroke-width": unit });
+  }
+}
+
+function drawFirst() {
+  if (!find("paths").checked) return;
+  const unit = Math.max(...picture.size) / 250;
+  const d = "M" + picture.first.map((point) => point.join(",")).join("L");
+  drawn("path", { d, class: "path", stroke: "#ffffff", "stroke-width": 3 });
+  drawn("path", { d, class: "path", stroke: data.colours[0], "stroke-width": 1.5 });
+  picture.first.forEach(([x, y], order) => {
+    drawn("circle", { cx: x, cy: y, r: 6 * unit, fill: data.colours[0], stroke: "#ffffff", "stroke-width": unit / 2 });
+    write(order + 1, { class: "order", x, y, "font-size": 8 * unit });
   });
 }
 
@@ -62,21 +88,24 @@ function show() {
   const step = steps.at;
   const there = picture.paths.filter((points) => points.length >= step).length;
   const words = step
-    ? `Density of the next fixation after ${step} fixation${step > 1 ? "s" : ""}, the mean of ${there} viewers`
-    : "Density of all fixations";
+    ? `Where ${there} viewer${there > 1 ? "s" : ""} will look next, after ${step} fixation${step > 1 ? "s" : ""}`
+    : "All fixations. 1 to 3: where people look first";
   find("status").textContent = who ? `Viewer ${who}. ${words}` : words;
   find("drawing").replaceChildren();
   find("drawing").setAttribute("viewBox", `0 0 ${picture.size.join(" ")}`);
   find("drawing").setAttribute("aria-label", `${words} in ${picture.name}`);
   drawHeat(step);
-  drawContours(step);
-  drawPaths(step);
+  drawBorders(step);
+  drawAreas();
+  if (step) drawPaths(step);
+  else drawFirst();
 }
 
 function choose(number) {
   picture = data.pictures[number];
   find("image").src = picture.image;
   find("image").alt = picture.name;
+  find("areas").closest("label").hidden = !picture.areas.length;
   data.pictures.forEach((_, each) => (find(`facts-${each}`).hidden = each !== number));
   find("who").replaceChildren(new Option("all viewers", 0), ...picture.paths.map((_, n) => new Option(`viewer ${n + 1}`, n + 1)));
   follow(Math.min(who, picture.paths.length));
@@ -97,5 +126,5 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
   follow(Math.min(Math.max(moves[event.key], 0), picture.paths.length));
 });
-for (const layer of ["heat", "contours", "paths"]) find(layer).addEventListener("change", show);
+for (const layer of ["heat", "borders", "areas", "paths"]) find(layer).addEventListener("change", show);
 choose(0);

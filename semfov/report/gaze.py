@@ -1,7 +1,8 @@
 """A page of where people look in pictures, with a slider over the fixations of drawn viewers."""
 
 import base64
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from html import escape
 
 import numpy as np
@@ -9,60 +10,67 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.fixations import Fixations
+from semfov.paths.areas import AreasLike, border_of, percent, read_areas, shares_around
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
 from semfov.report.template import colour_steps, filled
-from semfov.viz.style import COLOURS, overlay_colours
+from semfov.viz.gaze import BORDERS
+from semfov.viz.style import COLOURS, share_colours
 
 _WIDTH = 960  # of the picture in pixels
 _QUALITY = 80  # of the picture as JPEG
 _MOST_STEPS = 12  # largest number of fixations of the slider
 
 
-def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations]) -> Data:
+def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas: AreasLike | None = None) -> Data:
     """Collect what the page has of a prediction, as JSON values.
 
     Args:
         prediction: the prediction.
         scanpaths: drawn scanpaths of viewers.
+        areas: areas of interest, as for `GazePrediction.share`.
 
     Returns:
-        `picture`, for the script: maps relative to their largest values as bytes, contours and scanpaths; and `facts`,
-        HTML.
+        `picture`, for the script: shares of the fixations as bytes, borders of areas and scanpaths; and `facts`, HTML.
     """
     steps = min(max(map(len, scanpaths)), _MOST_STEPS)
     maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
+    boxes = {} if areas is None else read_areas(areas, prediction.size)
+    shares = {} if areas is None else prediction.share(areas)
     picture = {
         "name": prediction.name,
         "size": list(prediction.size),
         "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
         "cells": list(prediction.cells.shape),
         "maps": [_bytes_of_map(density) for density in maps],
-        "contours": [_contours(density, prediction.size) for density in maps],
+        "borders": [_borders(density, prediction.size) for density in maps],
         "paths": [[[round(x, 1), round(y, 1)] for x, y in path.points.tolist()] for path in scanpaths],
+        "first": [[place["x"], place["y"]] for place in prediction.first_fixations()],
+        "areas": [[f"{name} {percent(shares[name])}", *box] for name, box in boxes.items()],
     }
-    return {"picture": picture, "facts": _facts(prediction)}
+    return {"picture": picture, "facts": _facts(prediction, shares)}
 
 
 def _bytes_of_map(density: Tensor) -> str:
-    """Encode a density relative to its largest value as bytes, in base 64."""
-    relative = (density / density.max() * 255).round().byte()
-    return base64.b64encode(relative.numpy().tobytes()).decode()
+    """Encode the share of the fixations in the smallest area that reaches each cell as bytes, in base 64."""
+    shares = (shares_around(density).clamp(max=1) * 255).round().byte()
+    return base64.b64encode(shares.numpy().tobytes()).decode()
 
 
-def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
+def gaze_page_html(title: str, parts: Sequence[Data], before: str = "") -> str:
     """Make the page of one or several pictures.
 
     Args:
         title: plain text.
         parts: the pictures, from `gaze_part`.
+        before: HTML above them.
 
     Returns:
         The HTML of the page.
     """
     data = {
         "pictures": [part["picture"] for part in parts],
-        "heat": colour_steps(overlay_colours()),
+        "heat": colour_steps(share_colours()),
         "colours": list(COLOURS),
     }
     facts = [
@@ -70,14 +78,15 @@ def gaze_page_html(title: str, parts: Sequence[Data]) -> str:
         f"{part['facts']}</section>"
         for number, part in enumerate(parts)
     ]
-    return filled("gaze", data, {"title": escape(title), "facts": "".join(facts)})
+    contents = {"title": escape(title), "before": before, "borders": escape(BORDERS), "facts": "".join(facts)}
+    return filled("gaze", data, contents)
 
 
-_MASSES = (0.8, 0.5, 0.25)  # shares of all fixations that the smallest regions inside the contours hold
+_SHARES = (0.9, 0.5)  # shares of all fixations in the smallest areas whose borders are drawn
 
 
-def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
-    """Draw the borders of the smallest regions that hold given shares of all fixations.
+def _borders(cells: Tensor, size: tuple[int, int]) -> list[str]:
+    """Draw the borders of the smallest areas that hold given shares of all fixations.
 
     Args:
         cells: `(rows, columns)`, the density.
@@ -93,14 +102,11 @@ def _contours(cells: Tensor, size: tuple[int, int]) -> list[str]:
     rows, columns = values.shape
     x = (np.arange(-1, columns + 1) + 0.5) * width / columns
     y = (np.arange(-1, rows + 1) + 0.5) * height / rows
-    # An edge of zeros closes the contours at the border of the picture.
+    # An edge of zeros closes the lines at the border of the picture.
     generator = contour_generator(x.clip(0, width), y.clip(0, height), np.pad(values, 1))
-    ordered = np.sort(values.reshape(-1))[::-1]
     paths = []
-    for mass in _MASSES:
-        # The smallest region with this mass has the cells of the highest densities.
-        last = min(int(np.searchsorted(ordered.cumsum(), mass)), ordered.size - 1)
-        lines: list[NDArray[np.float64]] = generator.lines(ordered[last])  # type: ignore[assignment]
+    for share in _SHARES:
+        lines: list[NDArray[np.float64]] = generator.lines(border_of(cells, share))  # type: ignore[assignment]
         paths.append("".join(_svg_path(line) for line in lines))
     return paths
 
@@ -110,19 +116,48 @@ def _svg_path(line: NDArray[np.float64]) -> str:
     return "M" + "L".join(f"{x:.0f},{y:.0f}" for x, y in line.tolist()) + "Z"
 
 
-def _facts(prediction: GazePrediction) -> str:
-    """Tell what is known of a picture without the script: entropy, terms, and places in order."""
-    bits = ", ".join(f"{name} {value:.2f}" for name, value in prediction.parts.items())
-    rows = "".join(
-        f"<tr><td>{place}</td><td>{peak['x']:.0f}, {peak['y']:.0f}</td><td>{100 * peak['share']:.1f} %</td></tr>"
-        for place, peak in enumerate(prediction.peaks(), 1)
-    )
-    caution = "" if prediction.caution is None else f"<p>{escape(prediction.caution.capitalize())}.</p>"
+def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
+    """Tell what is known of a picture without the script: first fixations, areas, places, and details in bits."""
+    caution = "" if prediction.caution is None else f"<p><strong>Caution:</strong> {escape(prediction.caution)}.</p>"
+    first = [
+        (str(number), f"{place['x']:.0f}, {place['y']:.0f}", f"{percent(place['share'])}")
+        for number, place in enumerate(prediction.first_fixations(), 1)
+    ]
+    places = [
+        (str(number), f"{place['x']:.0f}, {place['y']:.0f}", percent(place["share"]))
+        for number, place in enumerate(prediction.peaks(), 1)
+    ]
+    tables = [
+        _table("Where people look first", ("Fixation", "x, y in pixels", "Viewers who look there then"), first),
+        _table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations around it"), places),
+    ]
+    if shares:
+        areas = [(name, percent(share)) for name, share in shares.items()]
+        tables.insert(0, _table("Share of all fixations in each area", ("Area", "Fixations"), areas))
+    return f'{caution}<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
+
+
+def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Make a table."""
+    headings = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+    lines = []
+    for row in rows:
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row)
+        lines.append(f"<tr>{cells}</tr>")
     return (
-        f'{caution}<dl class="facts"><div><dt>Entropy of the density</dt><dd>{prediction.entropy:.2f} bits</dd></div>'
-        f"<div><dt>Added by each term, bits</dt><dd>{escape(bits)}</dd></div></dl>"
-        '<div class="wide" tabindex="0" role="region" aria-label="Places">'
-        '<table><caption>Where most fixations are expected</caption><thead><tr><th scope="col">Place</th>'
-        '<th scope="col">x, y in pixels</th><th scope="col">Fixations within 5 % of the longer side</th></tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
+        f'<div class="wide" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
+        f"<caption>{escape(caption)}</caption><thead><tr>{headings}</tr></thead>"
+        f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
+
+
+def _details(prediction: GazePrediction) -> str:
+    """Tell the numbers that researchers ask for, with what they mean."""
+    uniform = math.log2(prediction.cells.numel())
+    spread = f"{prediction.entropy:.2f} of {uniform:.2f} bits, where people would look everywhere alike"
+    rows = [("Spread of the map (entropy)", spread)]
+    rows += [(f"What the {name} adds to the map", f"{bits:.2f} bits") for name, bits in prediction.parts.items()]
+    if prediction.unlikeness is not None:
+        alike = f"{prediction.unlikeness:.2f}; above 1 it is unlike the photographs that the model learned from"
+        rows.append(("Distance of the picture from those of the fit", alike))
+    return f"<details><summary>Numbers of the model</summary>{_table('Numbers of the model', ('', ''), rows)}</details>"

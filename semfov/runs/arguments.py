@@ -11,7 +11,7 @@ from types import UnionType
 from typing import Annotated, Literal, Union, get_args, get_origin, get_type_hints
 
 from semfov.errors import check
-from semfov.io.ranges import NOUNS, CheckedSettings
+from semfov.io.ranges import NOUNS, CheckedSettings, Form
 
 _FLAGS = ("true", "false", "yes", "no", "True", "False")
 """Words that may follow a flag as its value."""
@@ -77,10 +77,22 @@ def _value_after(hint: object, words: deque[str]) -> str | None:
     """Take the value of an option from the words after it; None leaves it to the parser."""
     if hint is bool:
         return words.popleft() if words and words[0] in _FLAGS else "true"
+    form = _form_of(hint)
+    if form is not None and form.more and words and not words[0].startswith("--"):
+        value = [words.popleft()]
+        while words and re.fullmatch(form.more, words[0]):
+            value.append(words.popleft())
+        return " ".join(value)
     takes_several = _is_list(hint) or _may_be_tuple(hint)
     if takes_several and words and not words[0].startswith("--"):
         return words.popleft()
     return None
+
+
+def _form_of(hint: object) -> Form | None:
+    """Return how a value of a type is written; None where nothing says it."""
+    annotations = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    return next((each for each in annotations if isinstance(each, Form)), None)
 
 
 def _in_brackets(hint: object, value: str) -> str:

@@ -9,19 +9,31 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING
 
+import numpy as np
 from torch import Tensor
+from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.errors import check
+from semfov.paths.areas import AreasLike, percent, read_areas, shares_around
 from semfov.paths.gaze import GazePrediction
 from semfov.viz.animation import Film, render
 from semfov.viz.drawing import draw_image
-from semfov.viz.style import GAZE, line_style, make_figure, only, overlay_colours, styled
+from semfov.viz.style import GAZE, LARGEST_SHARE, TARGET, line_style, make_figure, only, share_colours, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+BORDERS = "half of all fixations are inside the thick line, 90 % inside the thin one"
+"""What the lines of a map are."""
+
+_FIRST = 3  # first fixations that are drawn
+_BANDS = tuple(share / 10 for share in range(1, 10))  # shares of the fixations in the areas between two colours
+_BORDERS = {0.5: 1.8, LARGEST_SHARE: 0.8}  # widths of the lines around the areas with these shares
+_FINER = 8  # points of a band for a cell along each side
 
 
 @styled
@@ -31,40 +43,104 @@ def plot_gaze(
     ax: Axes | None = None,
     scanpaths: Sequence[Fixations] = (),
     cells: Tensor | None = None,
+    areas: AreasLike | None = None,
+    title: bool = True,
 ) -> Figure:
-    """Draw a density of fixations over the grey picture, and scanpaths.
+    """Draw the smallest areas with 10 to 90 % of the fixations over the picture, and the first three fixations.
 
     Args:
         prediction: the prediction.
         ax: axes to draw in; None makes a figure.
         scanpaths: scanpaths to draw over it.
-        cells: `(rows, columns)`, the density; None takes that of all fixations, with its peaks in order.
+        cells: `(rows, columns)`, the density; None takes that of all fixations, with the first three fixations.
+        areas: areas of interest to draw with their shares, as for `GazePrediction.share`.
+        title: whether lines above the picture say what is drawn.
 
     Returns:
         The figure.
     """
     width, height = prediction.size
-    figure, (axes,) = make_figure(1, 1, width=6.4, height=6.4 * height / width + 0.35, axes=only(ax))
-    draw_image(axes, prediction.image, Grid(1, 1, prediction.size), grey=True)
-    density = (prediction.cells if cells is None else cells).numpy()
-    axes.imshow(density / density.max(), extent=(0, width, height, 0), cmap=overlay_colours(), interpolation="bilinear")
+    size = {"width": 6.4, "height": 5.4 * height / width + 0.6}
+    figure, (axes,) = make_figure(1, 1, **size, layout="compressed", axes=only(ax))
+    draw_gaze(axes, prediction, prediction.cells if cells is None else cells)
     for order, scanpath in enumerate(scanpaths):
         points = scanpath.resized(prediction.size).points + 0.5
         axes.plot(*points.T, "-o", color=line_style(order, len(scanpaths))["color"], markersize=3, linewidth=1)
-    peaks = prediction.peaks() if cells is None else []
-    for number, peak in enumerate(peaks, 1):
+    if areas is not None:
+        draw_areas(axes, prediction, areas)
+    lines = [f"Where people look in {prediction.name}: {BORDERS}"]
+    if cells is None:
+        draw_first_fixations(axes, prediction)
+        lines.append(f"1 to {_FIRST}: the first fixations, in order")
+    if prediction.caution is not None:
+        lines.append(f"Caution: {prediction.caution}")
+    if title:
+        axes.set_title("\n".join(fill(line, 84) for line in lines), parse_math=False)
+    return figure
+
+
+def draw_gaze(axes: Axes, prediction: GazePrediction, cells: Tensor) -> None:
+    """Draw the smallest areas with 10 to 90 % of the fixations over the picture.
+
+    Args:
+        axes: axes to draw in.
+        prediction: gives the picture.
+        cells: `(rows, columns)`, the density.
+    """
+    from matplotlib.patheffects import withStroke
+
+    width, height = prediction.size
+    draw_image(axes, prediction.image, Grid(1, 1, prediction.size))
+    # Between cells the logarithm is interpolated, as for the density over the pixels.
+    finer = F.interpolate(cells.double().log()[None, None], scale_factor=_FINER, mode="bilinear")[0, 0].exp()
+    shares = shares_around(finer / finer.sum()).numpy()
+    rows, columns = shares.shape
+    x = (np.arange(columns) + 0.5) * width / columns
+    y = (np.arange(rows) + 0.5) * height / rows
+    axes.contourf(x, y, shares, levels=[0, *_BANDS], cmap=share_colours(), vmin=0, vmax=1)
+    lines = axes.contour(x, y, shares, levels=[*_BORDERS], colors="white", linewidths=[*_BORDERS.values()])
+    lines.set(path_effects=[withStroke(linewidth=2.8, foreground="black", alpha=0.5)])
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+
+
+def draw_first_fixations(axes: Axes, prediction: GazePrediction) -> None:
+    """Draw the first three fixations as numbers in circles, with a line from one to the next."""
+    first = prediction.first_fixations(_FIRST)
+    x = [place["x"] + 0.5 for place in first]
+    y = [place["y"] + 0.5 for place in first]
+    axes.plot(x, y, color="white", linewidth=2.4)
+    axes.plot(x, y, color=GAZE, linewidth=1.2)
+    for number, place in enumerate(first, 1):
         axes.annotate(
             str(number),
-            (peak["x"] + 0.5, peak["y"] + 0.5),
+            (place["x"] + 0.5, place["y"] + 0.5),
             color="white",
             ha="center",
             va="center",
             bbox={"boxstyle": "circle", "facecolor": GAZE, "edgecolor": "white"},
         )
-    # Without the words, the numbers look like the order of a viewer's fixations.
-    numbers = f"; 1 to {len(peaks)}: places with most fixations first" if peaks else ""
-    axes.set(title=fill(prediction.describe() + numbers, 80), xlim=(0, width), ylim=(height, 0))
-    return figure
+
+
+def draw_areas(axes: Axes, prediction: GazePrediction, areas: AreasLike) -> None:
+    """Draw areas of interest with their names and shares of the fixations."""
+    from matplotlib.patches import Rectangle
+
+    shares = prediction.share(areas)
+    for name, (left, top, right, bottom) in read_areas(areas, prediction.size).items():
+        corner, sides = (left, top), (right - left, bottom - top)
+        axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor="white", linewidth=2.6))
+        axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor=TARGET, linewidth=1.4))
+        axes.text(
+            left,
+            top,
+            f"{name} {percent(shares[name])}",
+            color="white",
+            fontsize=8,
+            va="top",
+            parse_math=False,
+            bbox={"facecolor": TARGET, "edgecolor": "none", "pad": 1.5},
+            zorder=4,
+        )
 
 
 def animate_gaze(

@@ -36,6 +36,9 @@ _OVERLAY = "plasma"
 
 _OPACITY = 0.85  # opacity of an overlay where the probability is 1
 
+LARGEST_SHARE = 0.9
+"""Share of all fixations in the largest area that is coloured."""
+
 STYLE: Any = {
     "font.family": "sans-serif",
     "font.size": 9,
@@ -207,6 +210,23 @@ def overlay_colours() -> Colormap:
     colours = colormaps[_OVERLAY](share)
     colours[:, 3] = _OPACITY * np.sqrt(share)
     return ListedColormap(colours, name="overlay")
+
+
+@cache
+def share_colours() -> Colormap:
+    """Make the colour map of shares from 0 to 1 over a photograph, whose own colours stay visible.
+
+    The smallest areas are the most opaque, and what only the whole picture holds is clear.
+    """
+    import numpy as np
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    share = np.linspace(0, 1, 256)
+    weight = (1 - share / LARGEST_SHARE).clip(0, 1)
+    colours = colormaps[_OVERLAY](0.4 + 0.55 * weight)
+    colours[:, 3] = np.where(share <= LARGEST_SHARE, 0.05 + 0.45 * weight, 0)
+    return ListedColormap(colours, name="shares")
 
 
 def line_style(order: int, count: int) -> dict[str, Any]:

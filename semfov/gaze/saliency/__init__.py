@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
+from semfov.gaze.saliency.likeness import PictureLikeness
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ __all__ = [
     "FixationDensity",
     "IttiKoch",
     "OculomotorBias",
+    "PictureLikeness",
     "cell_saliency",
     "features_so_far",
     "itti_koch_saliency",

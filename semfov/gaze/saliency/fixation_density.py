@@ -3,23 +3,23 @@
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from functools import cache
-from math import ceil, floor
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.detection import Detector, FeatureMaps, Placement
+from semfov.detection import Detector, FeatureMaps
 from semfov.errors import InputError, check, check_shape
+from semfov.gaze.saliency.likeness import PictureLikeness
 from semfov.gaze.saliency.oculomotor import OculomotorBias
+from semfov.gaze.saliency.on_picture import on_picture, sides_of
 from semfov.io.compatibility import check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Schema, Text
 from semfov.io.schema import Number as JsonNumber
-from semfov.sensor.constants import constant
 
 _CELLS = 52  # cells along the longer side of a picture in which densities are computed
 
@@ -47,6 +47,9 @@ class FixationDensity(Pretrained):
         centre: `(rows, columns)`, log density of the centre bias; None for none.
         metadata: JSON values to keep with the model; `detector` holds those settings of the detector that the feature
             maps depend on.
+
+    Attributes:
+        likeness: how unlike the pictures of the fit a picture is; None where that was not fitted.
 
     Shape:
         - features: maps `(B, C, h, w)` by name
@@ -82,6 +85,12 @@ class FixationDensity(Pretrained):
             "start": Field((2, 2), low=0, high=1),
             "duration": Field(("D", 2), low=0, high=1e2),
             "pause": Field((), low=0, high=1e4),
+            "likeness.mean": Field(("P",), low=-1e4, high=1e4, optional=True),
+            "likeness.deviation": Field(("P",), above=0, high=1e4, optional=True),
+            "likeness.axes": Field(("K", "P"), low=-1, high=1, optional=True),
+            "likeness.variance": Field(("K",), above=0, high=1e6, optional=True),
+            "likeness.rest": Field((), above=0, high=1e6, optional=True),
+            "likeness.limit": Field((), above=0, high=1e6, optional=True),
         },
         {"layers": Array(Array((Text(), JsonNumber(low=1, high=1e6, whole=True))), least=1)},
     )
@@ -120,6 +129,7 @@ class FixationDensity(Pretrained):
         self.register_buffer("start", torch.tensor([[0.5, 0.5], [0.12, 0.12]]))
         self.register_buffer("duration", torch.tensor([[5.3, 0.55]]))
         self.register_buffer("pause", torch.tensor(40.0))
+        self.likeness: PictureLikeness | None = None
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
@@ -254,8 +264,8 @@ class FixationDensity(Pretrained):
         cells = cells_of(size)
         hidden: Tensor | None = None
         for shape, units in self._units(features, self.read if read is None else read).items():
-            on_picture = _on_picture(units, features, shape, cells)
-            hidden = on_picture + self.shift[:, None, None] if hidden is None else hidden.add_(on_picture)
+            on_cells = on_picture(units, features, shape, cells)
+            hidden = on_cells + self.shift[:, None, None] if hidden is None else hidden.add_(on_cells)
         assert hidden is not None
         hidden = F.relu_(hidden).flatten(2).unflatten(1, (-1, self.mix.shape[-1]))
         hidden = F.relu_(self.mix @ hidden + self.mix_shift[..., None])
@@ -279,7 +289,7 @@ class FixationDensity(Pretrained):
                 raise InputError(f"features: expected the map {name!r}, got {', '.join(maps)}")
             check_shape(maps[name], f"features[{name!r}]", None, channels, None, None)
             shape = (int(maps[name].shape[-2]), int(maps[name].shape[-1]))
-            rows, columns = _sides(features, shape)
+            rows, columns = sides_of(features, shape)
             part = maps[name][..., rows.first : rows.stop, columns.first : columns.stop]
             # Before the interpolation, which is then of a few units and not of hundreds of channels.
             units = F.conv2d(part.to(weight), weight[..., None, None])
@@ -392,6 +402,8 @@ class FixationDensity(Pretrained):
         # Their sizes are those of the file.
         model.centre = tensors["centre"]
         model.duration = tensors["duration"]
+        if "likeness.mean" in tensors:  # models of earlier versions have none
+            model.likeness = PictureLikeness(len(tensors["likeness.mean"]), len(tensors["likeness.variance"]))
         model.to(tensors["shift"].dtype)
         model.load_state_dict({name: value.to(tensors["shift"].dtype) for name, value in tensors.items()})
         return model
@@ -419,82 +431,6 @@ def cells_of(size: tuple[int, int]) -> tuple[int, int]:
     """Count rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
     longer = max(size)
     return max(1, round(_CELLS * size[0] / longer)), max(1, round(_CELLS * size[1] / longer))
-
-
-class _Side(NamedTuple):
-    """Where the picture is along one side of a map of `length` pixels.
-
-    Attributes:
-        start: its first edge, in pixels of the map.
-        end: its last edge.
-        first: first pixel that its interpolation needs.
-        stop: pixel after the last one.
-        length: number of pixels of the map.
-    """
-
-    start: float
-    end: float
-    first: int
-    stop: int
-    length: int
-
-
-def _sides(features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]) -> tuple[_Side, _Side]:
-    """Find the picture along the rows and the columns of maps of a shape `(h, w)`."""
-    if not isinstance(features, FeatureMaps):
-        return _Side(0, shape[0], 0, shape[0], shape[0]), _Side(0, shape[1], 0, shape[1], shape[1])
-    placement: Placement = features.placement
-    sides = []
-    for axis, length in ((1, shape[0]), (0, shape[1])):
-        pixels = features.canvas[axis] / length
-        start = placement.offset[axis] / pixels
-        end = start + placement.size[axis] * placement.scale[axis] / pixels
-        sides.append(_Side(start, end, max(floor(start - 0.5), 0), min(ceil(end + 0.5), length), length))
-    return sides[0], sides[1]
-
-
-def _on_picture(
-    values: Tensor, features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int], cells: tuple[int, int]
-) -> Tensor:
-    """Interpolate values of maps of a shape at the cells of the picture.
-
-    Args:
-        values: `(B, U, h, w)`, where the picture is.
-        features: as for `FixationDensity.forward`.
-        shape: `(h, w)` of the whole maps.
-        cells: rows and columns of cells.
-
-    Returns:
-        `(B, U, rows, columns)`.
-    """
-    vertical, horizontal = _sides(features, shape)
-    if _interpolates(vertical, cells[0]):
-        values = _line(vertical, cells[0], values) @ values
-    if _interpolates(horizontal, cells[1]):
-        values = values @ _line(horizontal, cells[1], values).mT
-    return values
-
-
-def _interpolates(side: _Side, cells: int) -> bool:
-    """Tell whether the cells are others than the pixels of the map."""
-    return (side.start, side.end) != (0, side.length) or side.length != cells
-
-
-def _line(side: _Side, cells: int, like: Tensor) -> Tensor:
-    """Make the matrix of `_interpolation` for the pixels that it needs."""
-    matrix = _interpolation(cells, side.start, side.end, side.length, like.dtype, like.device)
-    return matrix[:, side.first : side.stop]
-
-
-@constant
-def _interpolation(
-    cells: int, start: float, end: float, length: int, dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    """Make the matrix `(cells, length)` of bilinear interpolation at centres of cells between two edges of a line."""
-    centres = torch.arange(cells, device=device, dtype=dtype) + 0.5
-    place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
-    pixels = torch.arange(length, device=device, dtype=dtype)
-    return (1 - (place[:, None] - pixels).abs()).clamp(min=0)
 
 
 def blurred(maps: Tensor, sigma: Tensor) -> Tensor:

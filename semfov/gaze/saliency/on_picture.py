@@ -1,0 +1,87 @@
+"""Where a picture lies on feature maps, and their values at the cells of the picture."""
+
+from collections.abc import Mapping
+from math import ceil, floor
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from semfov.detection import FeatureMaps, Placement
+from semfov.sensor.constants import constant
+
+
+class Side(NamedTuple):
+    """Where the picture is along one side of a map of `length` pixels.
+
+    Attributes:
+        start: its first edge, in pixels of the map.
+        end: its last edge.
+        first: first pixel that its interpolation needs.
+        stop: pixel after the last one.
+        length: number of pixels of the map.
+    """
+
+    start: float
+    end: float
+    first: int
+    stop: int
+    length: int
+
+
+def sides_of(features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]) -> tuple[Side, Side]:
+    """Find the picture along the rows and the columns of maps of a shape `(h, w)`."""
+    if not isinstance(features, FeatureMaps):
+        return Side(0, shape[0], 0, shape[0], shape[0]), Side(0, shape[1], 0, shape[1], shape[1])
+    placement: Placement = features.placement
+    sides = []
+    for axis, length in ((1, shape[0]), (0, shape[1])):
+        pixels = features.canvas[axis] / length
+        start = placement.offset[axis] / pixels
+        end = start + placement.size[axis] * placement.scale[axis] / pixels
+        sides.append(Side(start, end, max(floor(start - 0.5), 0), min(ceil(end + 0.5), length), length))
+    return sides[0], sides[1]
+
+
+def on_picture(
+    values: Tensor, features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int], cells: tuple[int, int]
+) -> Tensor:
+    """Interpolate values of maps of a shape at the cells of the picture.
+
+    Args:
+        values: `(B, U, h, w)`, where the picture is.
+        features: as for `FixationDensity.forward`.
+        shape: `(h, w)` of the whole maps.
+        cells: rows and columns of cells.
+
+    Returns:
+        `(B, U, rows, columns)`.
+    """
+    vertical, horizontal = sides_of(features, shape)
+    if _interpolates(vertical, cells[0]):
+        values = _line(vertical, cells[0], values) @ values
+    if _interpolates(horizontal, cells[1]):
+        values = values @ _line(horizontal, cells[1], values).mT
+    return values
+
+
+def _interpolates(side: Side, cells: int) -> bool:
+    """Tell whether the cells are others than the pixels of the map."""
+    return (side.start, side.end) != (0, side.length) or side.length != cells
+
+
+def _line(side: Side, cells: int, like: Tensor) -> Tensor:
+    """Make the matrix of `_interpolation` for the pixels that it needs."""
+    matrix = _interpolation(cells, side.start, side.end, side.length, like.dtype, like.device)
+    return matrix[:, side.first : side.stop]
+
+
+@constant
+def _interpolation(
+    cells: int, start: float, end: float, length: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Make the matrix `(cells, length)` of bilinear interpolation at centres of cells between two edges of a line."""
+    centres = torch.arange(cells, device=device, dtype=dtype) + 0.5
+    place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
+    pixels = torch.arange(length, device=device, dtype=dtype)
+    return (1 - (place[:, None] - pixels).abs()).clamp(min=0)

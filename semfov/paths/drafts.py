@@ -1,0 +1,148 @@
+"""Two drafts of a picture beside each other: where people look in one, in the other, and what differs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from torch import Tensor
+
+from semfov.paths.areas import AreasLike, percent
+from semfov.paths.gaze import GazePrediction
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class AreaShares(NamedTuple):
+    """Shares of the fixations in an area of two drafts.
+
+    Attributes:
+        first: share in the first draft.
+        second: share in the second one.
+    """
+
+    first: float
+    second: float
+
+    @property
+    def difference(self) -> float:
+        """Share in the second draft less that in the first one."""
+        return self.second - self.first
+
+
+@dataclass(frozen=True, eq=False)
+class Drafts:
+    """Where people look in two drafts.
+
+    Attributes:
+        first: prediction for the first draft.
+        second: prediction for the second one.
+
+    Example::
+
+        drafts = Drafts(agent.gaze("before.png"), agent.gaze("after.png"))
+        drafts.shares({"logo": (10, 20, 200, 80)})["logo"].difference
+        drafts.plot()
+    """
+
+    first: GazePrediction
+    second: GazePrediction
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Names of the drafts; by their paths where the files have one name."""
+        names = self.first.name, self.second.name
+        if names[0] != names[1] or self.first.source is None or self.second.source is None:
+            return names
+        return self.first.source, self.second.source
+
+    @property
+    def difference(self) -> Tensor | None:
+        """Density of the second draft less that of the first, `(rows, columns)`; None if proportions differ."""
+        if self.first.cells.shape != self.second.cells.shape:
+            return None
+        return self.second.cells - self.first.cells
+
+    @property
+    def moved(self) -> float | None:
+        """Share of the fixations that are elsewhere in the second draft; None if proportions differ."""
+        return None if self.difference is None else float(self.difference.clamp(min=0).sum())
+
+    def shares(self, areas: AreasLike) -> dict[str, AreaShares]:
+        """Compute the shares of the fixations in areas of both drafts.
+
+        Args:
+            areas: areas in pixels of each draft, as for `GazePrediction.share`.
+
+        Returns:
+            The shares by the name of the area.
+
+        Raises:
+            InputError: an area has another form or reaches out of a draft.
+            DataError: the file cannot be read.
+        """
+        first = self.first.share(areas)
+        second = self.second.share(areas)
+        return {name: AreaShares(first[name], second[name]) for name in first}
+
+    def describe(self, areas: AreasLike | None = None) -> str:
+        """Describe what differs, in a line for each area.
+
+        Args:
+            areas: as for `shares`.
+
+        Returns:
+            The lines.
+        """
+        first, second = self.names
+        lines = [f"{first} and {second}: {self._moved()}"]
+        shares_of = {} if areas is None else self.shares(areas)
+        for name, shares in shares_of.items():
+            lines.append(f"  {name}: {percent(shares.first)} and {percent(shares.second)} of all fixations")
+        return "\n".join(lines)
+
+    def _moved(self) -> str:
+        """Say how many fixations move."""
+        if self.moved is None:
+            return "their proportions differ, so only areas can be compared"
+        return f"{percent(self.moved)} of the fixations are elsewhere in the second"
+
+    def plot(self, *, areas: AreasLike | None = None) -> Figure:
+        """Draw both maps on one scale, and what differs.
+
+        Args:
+            areas: areas to draw with their shares, as for `shares`.
+
+        Returns:
+            The figure.
+        """
+        from semfov.viz.drafts import plot_drafts
+
+        return plot_drafts(self, areas=areas)
+
+    def report(self, path: str | PathLike[str], *, areas: AreasLike | None = None) -> Path:
+        """Write an HTML page with both maps on one scale, what differs, and the shares of areas.
+
+        Args:
+            path: the file.
+            areas: as for `shares`.
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: the file does not end in `.html` or `.htm`, or an area has another form.
+            DataError: a file cannot be written or read.
+        """
+        from semfov.report.drafts import drafts_section
+        from semfov.report.gaze import gaze_page_html, gaze_part
+        from semfov.report.template import write_html
+
+        parts = [gaze_part(draft, draft.scanpaths(), areas) for draft in (self.first, self.second)]
+        for part, name in zip(parts, self.names, strict=True):
+            part["picture"]["name"] = name
+        title = "semfov: where people look in two drafts"
+        return write_html(Path(path), gaze_page_html(title, parts, drafts_section(self, areas)))

@@ -1,0 +1,74 @@
+"""The part of a page in which two drafts are beside each other."""
+
+from __future__ import annotations
+
+import base64
+import io
+from html import escape
+from typing import TYPE_CHECKING
+
+from semfov.paths.areas import AreasLike, percent
+from semfov.paths.drafts import Drafts
+from semfov.viz.drafts import plot_difference
+from semfov.viz.gaze import BORDERS, plot_gaze
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def drafts_section(drafts: Drafts, areas: AreasLike | None = None) -> str:
+    """Make the part of a page with both maps on one scale, what differs, and the shares of areas.
+
+    Args:
+        drafts: the drafts.
+        areas: areas of interest, as for `GazePrediction.share`.
+
+    Returns:
+        HTML.
+    """
+    panels = [
+        _figure(f"{name}", plot_gaze(prediction, areas=areas, title=False))
+        for name, prediction in zip(drafts.names, (drafts.first, drafts.second), strict=True)
+    ]
+    if drafts.difference is not None:
+        caption = f"More fixations in {drafts.names[1]} are orange, fewer are purple"
+        panels.append(_figure(caption, plot_difference(drafts, title=False)))
+    return (
+        f'<section aria-labelledby="drafts-title"><h2 id="drafts-title">{escape(_headline(drafts))}</h2>'
+        f'{_table(drafts, areas)}<p class="hint">In both pictures, {BORDERS}. 1 to 3 are the first fixations.</p>'
+        f'<div class="pictures">{"".join(panels)}</div></section>'
+    )
+
+
+def _headline(drafts: Drafts) -> str:
+    """Say in a few words how the drafts differ."""
+    if drafts.moved is None:
+        return "The two drafts"
+    return f"{percent(drafts.moved)} of the fixations move between the drafts"
+
+
+def _figure(caption: str, figure: Figure) -> str:
+    """Embed a figure with its caption."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=130, bbox_inches="tight", pad_inches=0.02)
+    encoded = base64.b64encode(content.getvalue()).decode()
+    source = f"data:image/png;base64,{encoded}"
+    return f'<figure><figcaption>{escape(caption)}</figcaption><img src="{source}" alt="{escape(caption)}"></figure>'
+
+
+def _table(drafts: Drafts, areas: AreasLike | None) -> str:
+    """Make the table of the shares of areas; nothing without areas."""
+    if areas is None:
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td>{percent(shares.first)}</td><td>{percent(shares.second)}</td>'
+        f"<td>{100 * shares.difference:+.1f}</td></tr>"
+        for name, shares in drafts.shares(areas).items()
+    )
+    first, second = (escape(name) for name in drafts.names)
+    return (
+        '<div class="wide" tabindex="0" role="region" aria-label="Areas"><table>'
+        "<caption>Share of all fixations in each area</caption>"
+        f'<thead><tr><th scope="col">Area</th><th scope="col">{first}</th><th scope="col">{second}</th>'
+        f'<th scope="col">Difference in percentage points</th></tr></thead><tbody>{rows}</tbody></table></div>'
+    )

@@ -1,0 +1,89 @@
+"""Figures of where people look in two drafts."""
+
+from __future__ import annotations
+
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+from semfov.belief.grid import Grid
+from semfov.errors import check
+from semfov.paths.areas import AreasLike, percent
+from semfov.paths.drafts import Drafts
+from semfov.viz.drawing import draw_image
+from semfov.viz.gaze import BORDERS, draw_areas, draw_first_fixations, draw_gaze
+from semfov.viz.style import make_figure, only, styled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_WIDTH = 5.0  # of a draft in inches
+_DIVERGING = "PuOr_r"  # fewer fixations are purple, more are orange
+
+
+@styled
+def plot_drafts(drafts: Drafts, *, areas: AreasLike | None = None) -> Figure:
+    """Draw where people look in two drafts on one scale, and what differs where proportions are the same.
+
+    Args:
+        drafts: the drafts.
+        areas: areas to draw with their shares, as for `GazePrediction.share`.
+
+    Returns:
+        The figure.
+    """
+    predictions = drafts.first, drafts.second
+    panels = 2 if drafts.difference is None else 3
+    height = max(_WIDTH * each.size[1] / each.size[0] for each in predictions) + 0.9
+    figure, axes = make_figure(1, panels, width=_WIDTH * panels, height=height, layout="compressed")
+    for ax, prediction, name in zip(axes[:2], predictions, drafts.names, strict=True):
+        draw_gaze(ax, prediction, prediction.cells)
+        if areas is not None:
+            draw_areas(ax, prediction, areas)
+        draw_first_fixations(ax, prediction)
+        caution = "" if prediction.caution is None else f"\nCaution: {prediction.caution}"
+        ax.set_title("\n".join(fill(line, 64) for line in (name + caution).split("\n")), parse_math=False)
+    if panels == 3:
+        plot_difference(drafts, ax=axes[2])
+    figure.suptitle(f"Where people look: {BORDERS}; 1 to 3: the first fixations", fontsize=9)
+    return figure
+
+
+@styled
+def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = True) -> Figure:
+    """Draw where the second draft has more and fewer fixations than the first, over the second one in grey.
+
+    Args:
+        drafts: the drafts.
+        ax: axes to draw in; None makes a figure.
+        title: whether a line above the picture says what is drawn.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: the drafts have other proportions.
+    """
+    difference = drafts.difference
+    moved = drafts.moved
+    check(difference is not None and moved is not None, "drafts", "two pictures of the same proportions", drafts.names)
+    assert difference is not None
+    assert moved is not None
+    width, height = drafts.second.size
+    size = {"width": _WIDTH, "height": _WIDTH * height / width + 0.6}
+    figure, (axes,) = make_figure(1, 1, **size, layout="compressed", axes=only(ax))
+    draw_image(axes, drafts.second.image, Grid(1, 1, drafts.second.size), grey=True)
+    most = max(float(difference.abs().max()), 1e-12)  # equal drafts have none
+    axes.imshow(
+        difference.numpy(),
+        extent=(0, width, height, 0),
+        cmap=_DIVERGING,
+        vmin=-most,
+        vmax=most,
+        alpha=(difference.abs() / most).sqrt().numpy() * 0.85,
+        interpolation="bilinear",
+    )
+    if title:
+        words = f"{percent(moved)} of the fixations move: orange has more in {drafts.names[1]}, purple fewer"
+        axes.set_title(fill(words, 64), parse_math=False)
+    return figure
