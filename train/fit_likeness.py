@@ -3,7 +3,7 @@
     python -m train.fit_likeness --fixations [osie/fixations.json,crowd/fixations.json] \
         --pictures [osie/images,crowd/images] --sizes [800x600,640x480] --detector.name yolox-nano
 
-The pictures are those that the model was fitted to. Each passes the detector once, the mean and deviation of each channel
+The pictures are those of the fit of the model. Each passes the detector once, the mean and deviation of each channel
 of the feature maps that the model reads are pooled, and `semfov.gaze.saliency.PictureLikeness` is fitted to them.
 Everything else in the model stays. `python -m train.fit_gaze` and `semfov fit` fit it with the model.
 """

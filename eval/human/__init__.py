@@ -9,6 +9,10 @@ without a centre bias and oculomotor biases, on folds of the pictures that they 
 
     python -m eval.human viewing --fixations "[osie/fixations.json]" --pictures "[osie/images]"
 
+Pictures unlike those of the fit: how well the gaze model tells pages, charts and drawings from photographs:
+
+    python -m eval.human unlike --fitted "[osie/images, crowd/images]" --others photographs
+
 To continue a stopped run, give the same command again.
 """
 
@@ -18,12 +22,14 @@ from typing import Any
 
 from eval.human.search.compare import compare
 from eval.human.search.run import PeopleSearchConfig
+from eval.human.unlike import UnlikeConfig, tell_apart
 from eval.human.viewing import ViewingConfig, compare_viewing
 from semfov.runs.command import run_command
 
 JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
     "search": (compare, PeopleSearchConfig),
     "viewing": (compare_viewing, ViewingConfig),
+    "unlike": (tell_apart, UnlikeConfig),
 }
 
 
@@ -32,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command_line = list(sys.argv[1:] if arguments is None else arguments)
     if not command_line or command_line[0] not in JOBS:
         print(__doc__)
-        print("`python -m eval.human search --help` and `… viewing --help` list the settings.")
+        print("`python -m eval.human search --help`, `… viewing --help` and `… unlike --help` list the settings.")
         if command_line in (["--help"], ["-h"]):
             return 0
         got = repr(command_line[0]) if command_line else "nothing"

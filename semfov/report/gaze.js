@@ -34,8 +34,8 @@ function drawHeat(step) {
 function drawBorders(step) {
   if (!find("borders").checked) return;
   picture.borders[step].forEach((line, order) => {
-    drawn("path", { d: line, class: "border under", "stroke-width": 3 + order });
-    drawn("path", { d: line, class: "border", "stroke-width": 1 + order });
+    drawn("path", { d: line, class: "border under", "stroke-width": 2.5 + 2 * order });
+    drawn("path", { d: line, class: "border", "stroke-width": 1 + 1.5 * order });
   });
 }
 
@@ -89,7 +89,7 @@ function show() {
   const there = picture.paths.filter((points) => points.length >= step).length;
   const words = step
     ? `Where ${there} viewer${there > 1 ? "s" : ""} will look next, after ${step} fixation${step > 1 ? "s" : ""}`
-    : "All fixations. 1 to 3: where people look first";
+    : "All fixations; 1 to 3 are the first";
   find("status").textContent = who ? `Viewer ${who}. ${words}` : words;
   find("drawing").replaceChildren();
   find("drawing").setAttribute("viewBox", `0 0 ${picture.size.join(" ")}`);
@@ -105,6 +105,7 @@ function choose(number) {
   picture = data.pictures[number];
   find("image").src = picture.image;
   find("image").alt = picture.name;
+  find("lead").textContent = picture.lead;
   find("areas").closest("label").hidden = !picture.areas.length;
   data.pictures.forEach((_, each) => (find(`facts-${each}`).hidden = each !== number));
   find("who").replaceChildren(new Option("all viewers", 0), ...picture.paths.map((_, n) => new Option(`viewer ${n + 1}`, n + 1)));

@@ -31,7 +31,8 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
         areas: areas of interest, as for `GazePrediction.share`.
 
     Returns:
-        `picture`, for the script: shares of the fixations as bytes, borders of areas and scanpaths; and `facts`, HTML.
+        `picture`, for the script: its result in words, shares of the fixations as bytes, borders and scanpaths; and
+        `facts`, HTML.
     """
     steps = min(max(map(len, scanpaths)), _MOST_STEPS)
     maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
@@ -39,6 +40,7 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
     shares = {} if areas is None else prediction.share(areas)
     picture = {
         "name": prediction.name,
+        "lead": _lead(prediction, shares),
         "size": list(prediction.size),
         "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
         "cells": list(prediction.cells.shape),
@@ -78,7 +80,12 @@ def gaze_page_html(title: str, parts: Sequence[Data], before: str = "") -> str:
         f"{part['facts']}</section>"
         for number, part in enumerate(parts)
     ]
-    contents = {"title": escape(title), "before": before, "borders": escape(BORDERS), "facts": "".join(facts)}
+    contents = {
+        "title": escape(title),
+        "before": before,
+        "borders": escape(BORDERS.capitalize()),
+        "facts": "".join(facts),
+    }
     return filled("gaze", data, contents)
 
 
@@ -116,11 +123,20 @@ def _svg_path(line: NDArray[np.float64]) -> str:
     return "M" + "L".join(f"{x:.0f},{y:.0f}" for x, y in line.tolist()) + "Z"
 
 
+def _lead(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
+    """Say in one or two sentences where people look."""
+    said = f"{prediction.describe().capitalize()}."
+    if shares:
+        areas = ", ".join(f"{name} {percent(share)}" for name, share in shares.items())
+        said += f" Share of all fixations: {areas}."
+    return said
+
+
 def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
     """Tell what is known of a picture without the script: first fixations, areas, places, and details in bits."""
     caution = "" if prediction.caution is None else f"<p><strong>Caution:</strong> {escape(prediction.caution)}.</p>"
     first = [
-        (str(number), f"{place['x']:.0f}, {place['y']:.0f}", f"{percent(place['share'])}")
+        (str(number), f"{place['x']:.0f}, {place['y']:.0f}", percent(place["share"]))
         for number, place in enumerate(prediction.first_fixations(), 1)
     ]
     places = [
@@ -128,8 +144,8 @@ def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
         for number, place in enumerate(prediction.peaks(), 1)
     ]
     tables = [
-        _table("Where people look first", ("Fixation", "x, y in pixels", "Viewers who look there then"), first),
-        _table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations around it"), places),
+        _table("Where people look first", ("Fixation", "x, y in pixels", "Viewers"), first),
+        _table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations"), places),
     ]
     if shares:
         areas = [(name, percent(share)) for name, share in shares.items()]

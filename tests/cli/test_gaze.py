@@ -1,5 +1,6 @@
 """The command `semfov gaze`: what it prints and writes."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
     table, page = tmp_path / "gaze.csv", tmp_path / "gaze.html"
     code, out, err = run(photos, "--people", 4, "--seconds", 1.5, "--out", table, "--report", page)
     assert (code, err) == (0, "")
-    assert out.count("entropy") == out.count("4 viewers drawn") == 2
+    assert out.count("look first at") == out.count("4 viewers drawn") == 2
     wide, high = out.split(f"{photos / '1.png'}: ")
     assert ("wider than high" in wide, "wider than high" in high) == (False, True)
     assert page.read_text(encoding="utf-8").count("wider than high") == 1
@@ -59,7 +60,7 @@ def test_scanpaths_and_a_page_of_several_pictures(run, photos, tmp_path):
     assert {each.size for each in people["1.png"]} == {(80, 100)}
     html = page.read_text()
     assert "0.png" in html
-    assert "Where most fixations are expected" in html
+    assert "Where people look first" in html
     assert "<script src" not in html
     assert "://" not in html.replace("http://www.w3.org/2000/svg", "")
 
@@ -107,7 +108,7 @@ def test_a_model_of_ones_own(run, photos, tmp_path):
     other.save(tmp_path / "own/gaze.safetensors")
     models = [], ["--model", tmp_path / "own/gaze.safetensors"], ["--model", tmp_path / "own"]
     shipped, own, folder = (run(photos / "0.png", *words)[1] for words in models)
-    assert "entropy" in own
+    assert "look first at" in own
     assert own != shipped
     assert own == folder
     assert "did you mean --model?" in run(photos / "0.png", "--models", tmp_path / "own")[2]
@@ -138,7 +139,9 @@ def test_the_density_of_one_picture(run, photos, tmp_path, name):
 
 def test_a_folder_gets_scanpaths_and_heat_maps(run, photos, tmp_path):
     assert run(photos, "--out", tmp_path / "new")[0] == 0
-    assert sorted(each.name for each in (tmp_path / "new").iterdir()) == ["000-0.png", "001-1.png", "scanpaths.csv"]
+    assert sorted(each.name for each in (tmp_path / "new").iterdir()) == [
+        "000-0.png", "001-1.png", "pictures.csv", "scanpaths.csv"
+    ]  # fmt: skip
 
 
 def test_a_heat_map_that_is_gone_is_written_again(run, photos, tmp_path, monkeypatch):
@@ -154,7 +157,51 @@ def test_a_heat_map_that_is_gone_is_written_again(run, photos, tmp_path, monkeyp
         assert run(photos, "--people", 2, "--seconds", 1, "--out", out)[0] == 130
     (out / "000-0.png").unlink()
     assert run(photos, "--people", 2, "--seconds", 1, "--out", out)[0] == 0
-    assert sorted(each.name for each in out.iterdir()) == ["000-0.png", "001-1.png", "scanpaths.csv"]
+    assert sorted(each.name for each in out.iterdir()) == [
+        "000-0.png", "001-1.png", "pictures.csv", "scanpaths.csv"
+    ]  # fmt: skip
+
+
+def test_areas_are_told_drawn_and_in_the_table(run, photos, tmp_path):
+    """A line for each picture; words after the option are areas as long as they look like one."""
+    areas = "top:0,0,80,45", "left:0,0,40,90"
+    page = tmp_path / "gaze.html"
+    code, out, err = run(photos, "--areas", *areas, "--people", 2, "--out", tmp_path / "a.csv", "--report", page)
+    assert (code, err) == (0, "")
+    with (tmp_path / "a-pictures.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["picture"], row["width"], row["unlike"]) for row in rows] == [
+        ("0.png", "120", "False"), ("1.png", "80", "False")
+    ]  # fmt: skip
+    assert run(photos / "0.png", "--people", 2, "--out", tmp_path / "density.npy")[0] == 0
+    density = np.load(tmp_path / "density.npy")
+    assert float(rows[0]["share of top"]) == pytest.approx(float(density[:45, :80].sum()), abs=1e-4)
+    assert float(rows[0]["share of left"]) == pytest.approx(float(density[:, :40].sum()), abs=1e-4)
+    share = f"left {100 * float(rows[0]['share of left']):.0f} %"
+    assert share in out
+    assert share in page.read_text(encoding="utf-8")
+    (tmp_path / "areas.json").write_text('{"top": [0, 0, 80, 45], "left": [0, 0, 40, 90]}')
+    assert run(photos, "--areas", tmp_path / "areas.json", "--people", 2)[1].count(share) == 1
+    assert run(photos, "--areas", " ".join(areas), "--people", 2)[1].count(share) == 1
+
+
+def test_two_drafts_are_compared(run, photos, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = photos / "0.png", photos / "1.png", "--compare", "--people", 2
+    code, out, err = run(*words)
+    assert (code, err) == (0, "")
+    assert "their proportions differ" in out
+    assert "The two drafts" in (tmp_path / "semfov-compare.html").read_text(encoding="utf-8")
+    Image.new("RGB", (120, 90), "white").save(photos / "1.png")
+    code, out, err = run(*words, "--areas", "top:0,0,120,45", "--out", tmp_path / "map.png", "--report", "x.html")
+    assert (code, err) == (0, "")
+    assert "of the fixations are elsewhere in the second" in out
+    assert "% of all fixations\n" in out
+    with Image.open(tmp_path / "map.png") as figure:
+        assert figure.size[0] > 2 * figure.size[1]  # three panels
+    assert "of the fixations move between the drafts" in (tmp_path / "x.html").read_text(encoding="utf-8")
+    assert run(*words, "--out", tmp_path / "new")[0] == 0
+    assert {"compare.png", "000-0.png", "scanpaths.csv"} <= {each.name for each in (tmp_path / "new").iterdir()}
 
 
 def test_a_damaged_picture_of_several_is_skipped(run, photos, tmp_path):
@@ -163,7 +210,7 @@ def test_a_damaged_picture_of_several_is_skipped(run, photos, tmp_path):
     assert code == 1
     assert "skipped" in err
     assert "2.png" in err
-    assert out.count("entropy") == 2
+    assert out.count("look first at") == 2
 
 
 def test_a_fault_at_one_picture_of_several_is_not_the_end(run, photos, tmp_path, monkeypatch):
@@ -176,7 +223,7 @@ def test_a_fault_at_one_picture_of_several_is_not_the_end(run, photos, tmp_path,
 
     monkeypatch.setattr(GazePrediction, "scanpaths", fails)
     code, out, err = run(photos, "--out", tmp_path / "gaze.csv")
-    assert (code, out.count("entropy")) == (1, 1)
+    assert (code, out.count("look first at")) == (1, 1)
     assert "1.png: cannot be looked at (KeyError: 'a fault of the code')" in err
 
 
@@ -187,13 +234,23 @@ def test_a_fault_at_one_picture_of_several_is_not_the_end(run, photos, tmp_path,
         (["--out", "density.npy"], "a .csv file or a folder for several pictures"),
         (["--report", "gaze.pdf"], ".html"),
         (["--people", "0"], "people"),
+        (["--areas", "logo"], "NAME:LEFT,TOP,RIGHT,BOTTOM"),
+        (["--compare", "--out", "density.npy"], ".csv or .png"),
     ],
 )
 def test_wrong_options_are_told_before_a_look(run, photos, words, told):
     code, out, err = run(photos, *words)
     assert code != 0
     assert told in err
-    assert "entropy" not in out
+    assert "look first at" not in out
+
+
+def test_a_comparison_takes_two_pictures(run, photos):
+    Image.new("RGB", (50, 40)).save(photos / "2.png")
+    for pictures in ((photos / "0.png",), (photos,)):
+        code, _, err = run(*pictures, "--compare")
+        assert code == 1
+        assert "compare: expected two pictures" in err
 
 
 def test_a_detector_without_a_model_is_told(run, photos, monkeypatch):

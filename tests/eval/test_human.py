@@ -7,8 +7,9 @@ import pytest
 from PIL import Image
 
 from eval.human import main
+from eval.human.drawn_pictures import KINDS
 from eval.human.viewing import beside_others, filled
-from semfov import EmbeddedScenes
+from semfov import EmbeddedScenes, example
 from semfov.data.fixations import Fixations, read_table, write_ruarte, write_table
 from semfov.metrics.scanpath import multimatch, time_delay_embedding
 
@@ -91,7 +92,40 @@ def test_searches_of_people_models_random_draws_and_policies_are_compared(pictur
     assert curve == sorted(curve)
 
 
+def test_drawn_pictures_are_told_from_photographs(tmp_path, capsys):
+    """The beach of the package in many crops is the fit, and the rest of its photographs are the others."""
+    for folder, name in (("fit", "beach"), ("others", "market")):
+        (tmp_path / folder).mkdir()
+        pixels = example(name)
+        for number in range(64 if folder == "fit" else 4):
+            corner = 20 * (number % 8), 15 * (number // 8)
+            crop = pixels[:, corner[1] : corner[1] + 180, corner[0] : corner[0] + 240]
+            array = (crop * 255).byte().permute(1, 2, 0).numpy()
+            Image.fromarray(array).save(tmp_path / folder / f"{number:02d}.png")
+    page = tmp_path / "page.md"
+    page.write_text("<!-- table unlike -->\n<!-- end -->\n")
+    words = ["--fitted", f"[{tmp_path / 'fit'}]", "--others", str(tmp_path / "others"), "--detectors", "[yolox-nano]"]
+    more = ["--count", "2", "--out", str(tmp_path / "out"), "--page", str(page)]
+    assert main(["unlike", *words, *more]) == 0, capsys.readouterr().err
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.read_text().splitlines() if "|" in line]
+    by_kind = {row[0]: row[1:] for row in cells[2:]}
+    assert set(KINDS) <= set(by_kind)
+    assert by_kind["flat pictures"][1] == "100 %"
+    assert float(by_kind["flat pictures"][0]) > 0.9
+    assert main(["unlike", "--others", str(tmp_path)]) != 0
+    assert "fitted: expected at least one folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", [*KINDS])
+def test_pictures_are_drawn_from_their_seed(kind):
+    first, again, other = (np.array(KINDS[kind](np.random.default_rng(seed))) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert first.dtype == np.uint8
+    assert first.ndim == 3
+    assert first.shape != other.shape or not np.array_equal(first, other)
+
+
 def test_an_unknown_job_is_refused_with_the_names_of_jobs(capsys):
     assert main(["dance"]) == 2
-    assert "search or viewing" in capsys.readouterr().err
+    assert "search or viewing or unlike" in capsys.readouterr().err
     assert main(["--help"]) == 0

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from torch.nn import functional as F
 
 from semfov import Eye, Foveation, InputError, foveate
 from semfov.data.fixations import Fixations, read_table, write_table
-from semfov.gaze.saliency import FixationDensity
+from semfov.gaze.saliency import FixationDensity, PictureLikeness
+from semfov.gaze.saliency.likeness import pooled
 from semfov.metrics.scanpath import auc, correlation, nss
 from semfov.paths import GazePrediction
 from semfov.sensor import LogPolar
@@ -67,12 +69,68 @@ def test_places_are_the_peaks_in_order(gaze):
     log = (0.001 * rand(39, 52) + bump(30, 20, width=0.4)).log()
     (sharp,) = GazePrediction(gaze.model, {"map": log[None]}, gaze.size, gaze.photograph, gaze.source).peaks(1)
     assert (sharp["x"], sharp["y"]) == (60.5, 40.5)
-    # More fixations are around a broad peak than around a high one, and the description names it.
+    # More fixations are around a broad peak than around a high one.
     log = (0.001 + 6 * bump(10, 8, width=0.3) + 0.5 * bump(40, 30, width=4.0)).log()
     broad = replace(gaze, terms={"map": log[None]})
     assert [round(each["x"]) for each in broad.peaks(2)] == [80, 20]
     assert broad.peaks(1) == broad.peaks(2)[:1]
-    assert broad.describe().startswith(f"{100 * broad.peaks(2)[0]['share']:.0f} % of fixations")
+
+
+def test_first_fixations_are_where_most_viewers_look_in_turn(gaze):
+    """Each is the best place of that fixation's density that no earlier one has taken."""
+    first = gaze.first_fixations(4)
+    assert gaze.first_fixations(2) == first[:2]
+    x, y = torch.arange(52) * 2 + 0.5, torch.arange(39)[:, None] * 2 + 0.5
+    for number, place in enumerate(first, 1):
+        cells = gaze.given(gaze._viewers, number)
+        around = ((x - place["x"]) ** 2 + (y - place["y"]) ** 2) <= 5.2**2
+        assert place["share"] == pytest.approx(float(cells[around].sum()), rel=1e-3)
+    cells = gaze.given(gaze._viewers, 1)
+    taken = ((x - first[0]["x"]) ** 2 + (y - first[0]["y"]) ** 2) <= (2 * 5.2) ** 2
+    assert float(cells[taken].max()) == float(cells.max())  # the most likely cell is at the first place
+    for one, other in combinations(first, 2):
+        assert math.dist((one["x"], one["y"]), (other["x"], other["y"])) > 2 * 0.05 * 104
+    gaze.first_fixations(1)[0].clear()  # a caller's own
+    assert gaze.first_fixations(1) == first[:1]
+    assert replace(gaze).first_fixations(4) == first
+    assert gaze.describe().startswith(f"people look first at ({first[0]['x']:.0f}, {first[0]['y']:.0f}), then (")
+    for wrong in (0, 11):
+        refused("count", gaze.first_fixations, wrong)
+
+
+def test_shares_of_areas_are_sums_of_the_density(gaze):
+    shares = gaze.share("left:0,0,52,78 right:52,0,104,78 corner:3,4,9,11")
+    assert shares["left"] + shares["right"] == pytest.approx(1, abs=1e-5)
+    assert shares["corner"] == pytest.approx(float(gaze.density[4:11, 3:9].sum()), abs=1e-6)
+    refused(r"areas\['logo'\]", gaze.share, {"logo": (0, 0, 105, 10)})
+
+
+def test_a_picture_unlike_those_of_the_fit_has_a_caution():
+    torch.manual_seed(0)
+    detector = Shown("colours", ("none",), (80, 60), stride=4).eval()
+    model = FixationDensity({"backbone8": 3}).eval()
+    photographs = [rand(3, 60, 80).float() * (0.5 + 0.5 * rand(1)) for _ in range(60)]
+    assert GazePrediction.of(detector, photographs[0], model=model).unlikeness is None
+    values = [pooled(detector.features(each[None], ["backbone8"]), ["backbone8"]) for each in photographs]
+    model.likeness = PictureLikeness.fitted(torch.cat(values))
+    alike = GazePrediction.of(detector, photographs[0], model=model)
+    assert (alike.unlike, alike.caution) == (False, None)
+    assert alike.unlikeness == pytest.approx(float(model.likeness(values[0])), rel=1e-3)
+    flat = GazePrediction.of(detector, torch.full((3, 60, 80), 0.5), model=model)
+    assert flat.unlike
+    assert "unlike the photographs" in flat.caution
+    assert "Caution: this picture is unlike" in flat.plot().axes[0].get_title()
+    # What a fovea has shown is not compared with sharp pictures.
+    eye = Eye(Foveation(8.0, growth=1.0), detector, reference=80.0)
+    assert GazePrediction.of(eye, photographs[0], model=model, seen=[[40.0, 30.0]]).unlikeness is None
+
+
+def test_proportions_unlike_those_of_the_shipped_fit_have_a_caution(gaze):
+    for size, said in (((104, 78), None), ((78, 104), "wider than high"), ((300, 100), "this one is 3.0 : 1")):
+        caution = replace(gaze, size=size, is_shipped=True).caution
+        assert (caution is None) == (said is None)
+        assert said is None or said in caution
+        assert replace(gaze, size=size).caution is None
 
 
 def test_scanpaths_last_as_long_as_people_view(gaze):
@@ -155,7 +213,7 @@ def test_what_a_fovea_has_seen_is_known_alone():
 
     def predicted(points):
         gaze = GazePrediction.of(eye, image, model=model, seen=points)
-        assert f"bits, after {len(points)} fixation" in gaze.describe()
+        assert f", after {len(points)} fixation" in gaze.describe()
         return gaze.terms["map"][0]
 
     views = [foveate(image[None], torch.from_numpy(each).float(), sigma=8.0, growth=1.0)[0] for each in points]
@@ -232,7 +290,6 @@ def test_what_cannot_be_drawn_or_compared_is_refused(gaze):
         refused(r"^people: expected fixations, records of an agent, or a file, got a ", gaze.compare, wrong)
     only = Fixations("poster.png", "1", np.array([[5.0, 5.0]]), (104, 78))
     refused("after the first of each person", gaze.compare, [only])
-    assert "entropy" in gaze.describe()
     assert repr(gaze).count("\n") == len(gaze.peaks())
     assert gaze.plot() is not None
 

@@ -175,6 +175,12 @@ COMMANDS = {
         workers=False,
     ),
     "eval.human viewing": Command(refused=((("--fixations", "[nobody.csv]", "--pictures", "[.]"), "nobody.csv"),)),
+    "eval.human unlike": Command(
+        refused=(
+            (("--fitted", "[nowhere]", "--others", "."), "nowhere"),
+            (("--fitted", "[.]", "--others", ".", "--count", "1"), "count: expected a whole number from 2"),
+        ),
+    ),
     "eval.human search": Command(refused=((("--people", "nobody.json"), "nobody.json"),)),
     "train.fit_fom": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "4", "--holdout", "2", "--shard", "1", "--method", "newton"),

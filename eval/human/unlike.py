@@ -1,0 +1,166 @@
+"""How well the gaze model tells photographs from pictures unlike those of its fit: pages, charts, drawings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+from tqdm import tqdm
+
+from eval.human.drawn_pictures import KINDS, web_page_with_photograph
+from eval.human.viewing import filled
+from semfov.data.inputs import as_image
+from semfov.data.reading import read_image
+from semfov.data.sources import picture_files
+from semfov.detection.load import load_detector
+from semfov.errors import check
+from semfov.fit.viewing import MapSource, features_of
+from semfov.gaze.saliency.likeness import PictureLikeness, pooled
+from semfov.io.files import write_text
+from semfov.metrics.episodes import area_under_roc
+from semfov.runs.settings import Range, Seed, Settings
+from semfov.runs.tables import table
+from semfov.runs.workers import prepare_worker
+
+_TINY = (24, 18)
+
+
+@dataclass(frozen=True)
+class UnlikeConfig(Settings):
+    """Photographs and drawn pictures, and the detectors whose feature maps tell them apart.
+
+    Args:
+        fitted: folders of the pictures of the fit; the distance is fitted to every second one, and measured on the
+            others.
+        others: folder of other photographs, on which nothing was fitted or chosen.
+        detectors: names of the detectors.
+        count: number of drawn pictures of each kind.
+        seed: seed of all drawn pictures.
+        page: page with a place for the table (`<!-- table unlike -->` to `<!-- end -->`); none: it is left alone.
+        out: folder for the table.
+    """
+
+    fitted: tuple[Path, ...] = ()
+    others: Path | None = None
+    detectors: tuple[str, ...] = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
+    count: Annotated[int, Range(2, 10_000)] = 40
+    seed: Seed = 1
+    page: Path | None = None
+    out: Path = Path("runs/human_unlike")
+
+
+def tell_apart(config: UnlikeConfig) -> None:
+    """Fit the distance to half of the pictures, measure all others, and write the table."""
+    check(len(config.fitted) > 0, "fitted", "at least one folder of pictures", "none")
+    check(config.others is not None, "others", "a folder of photographs", "none")
+    assert config.others is not None
+    prepare_worker()
+    files = [path for folder in config.fitted for path in picture_files(folder)]
+    others = picture_files(config.others)
+    columns = {name: _measured(name, files, others, config) for name in config.detectors}
+    lines = unlike_table(columns)
+    print("\n".join(lines))
+    written = [config.out / "summary.md"]
+    write_text(written[0], "\n".join([*lines, ""]))
+    if config.page is not None:
+        write_text(config.page, filled(config.page.read_text(encoding="utf-8"), {"unlike": lines}))
+        written.append(config.page)
+    print("written:", *(f"  {path}" for path in written), sep="\n")
+
+
+def _measured(name: str, files: Sequence[Path], others: Sequence[Path], config: UnlikeConfig) -> dict[str, Tensor]:
+    """Compute the distances of all pictures by their kind, with the feature maps of a detector."""
+    source = features_of(load_detector(name))
+    likeness = PictureLikeness.fitted(_pooled(_read(files[::2]), source, f"{name}, fit", len(files[::2])))
+    made: dict[str, tuple[Iterable[Tensor], int]] = {
+        FITTED: (_read(files[1::2]), len(files[1::2])),
+        OTHERS: (_read(others), len(others)),
+    }
+    drawn = {**KINDS, **_changed(others)}
+    for number, (kind, draw) in enumerate(drawn.items()):
+        made[kind] = (_drawn(draw, config.seed, number, config.count), config.count)
+    return {
+        kind: likeness(_pooled(pictures, source, f"{name}, {kind}", count)) for kind, (pictures, count) in made.items()
+    }
+
+
+FITTED = "photographs like those of the fit"
+OTHERS = "other photographs"
+
+
+def _changed(files: Sequence[Path]) -> dict[str, Callable[[np.random.Generator], Image.Image]]:
+    """List what is made of a photograph, by name."""
+
+    def photograph(rng: np.random.Generator) -> Image.Image:
+        """Draw a photograph."""
+        with Image.open(files[int(rng.integers(len(files)))]) as image:
+            return image.convert("RGB")
+
+    return {
+        "web pages with a photograph": lambda rng: web_page_with_photograph(rng, files),
+        "photographs in black and white alone": lambda rng: photograph(rng).convert("1").convert("RGB"),
+        f"photographs of {_TINY[0]} × {_TINY[1]} px": lambda rng: photograph(rng).resize(_TINY),
+        "photographs upside down": lambda rng: photograph(rng).rotate(180),
+    }
+
+
+def _drawn(draw: Callable[[np.random.Generator], Image.Image], seed: int, kind: int, count: int) -> Iterator[Tensor]:
+    """Draw pictures of one kind, each from a seed of its own."""
+    for number in range(count):
+        yield as_image(draw(np.random.default_rng([seed, kind, number])))
+
+
+def _read(files: Iterable[Path]) -> Iterator[Tensor]:
+    """Read photographs, one after the other."""
+    for file in files:
+        yield read_image(file)
+
+
+@torch.no_grad()
+def _pooled(pictures: Iterable[Tensor], source: MapSource, title: str, count: int) -> Tensor:
+    """Compute the pooled values of pictures, `(N, P)`."""
+    bar = tqdm(pictures, desc=title, total=count, unit="picture", leave=False)
+    return torch.cat([pooled(source.maps(picture[None]), source.layers) for picture in bar])
+
+
+def unlike_table(columns: dict[str, dict[str, Tensor]]) -> list[str]:
+    """Make the table: for each kind the area under the ROC curve against all photographs, and the share called unlike.
+
+    Args:
+        columns: distances by kind, by name of the detector.
+
+    Returns:
+        The lines.
+    """
+    head = ["", *(f"{name}: {figure}" for name in columns for figure in ("area", "called unlike"))]
+    kinds = [*next(iter(columns.values()))]
+    body = []
+    for kind in kinds:
+        row = [kind]
+        for distances in columns.values():
+            area = "" if kind in (FITTED, OTHERS) else f"{_area(distances, [kind]):.3f}"
+            row += [area, _share_unlike(distances[kind])]
+        body.append(row)
+    row = [f"all {len(KINDS)} kinds of pages, charts, drawings and flat pictures"]
+    for distances in columns.values():
+        row += [f"{_area(distances, [*KINDS]):.3f}", _share_unlike(torch.cat([distances[kind] for kind in KINDS]))]
+    return table([head, *body, row])
+
+
+def _share_unlike(distances: Tensor) -> str:
+    """Write the share of distances that are called unlike."""
+    return f"{100 * float((distances > 1).float().mean()):.0f} %"
+
+
+def _area(distances: dict[str, Tensor], kinds: Sequence[str]) -> float:
+    """Compute the area under the ROC curve of telling kinds of pictures from all photographs."""
+    alike = torch.cat([distances[FITTED], distances[OTHERS]])
+    unlike = torch.cat([distances[kind] for kind in kinds])
+    is_unlike = torch.cat([torch.zeros(len(alike), dtype=torch.bool), torch.ones(len(unlike), dtype=torch.bool)])
+    return area_under_roc(torch.cat([alike, unlike]), is_unlike)

@@ -1,0 +1,79 @@
+"""Two drafts beside each other: what moves between them, their figure and their page."""
+
+import pytest
+import torch
+
+from semfov.gaze.saliency import FixationDensity
+from semfov.paths import GazePrediction
+from semfov.paths.drafts import Drafts
+from semfov.report.drafts import drafts_section
+from semfov.viz.drafts import plot_difference
+from tests.refusals import refused
+from tests.small import rand
+
+LEFT, RIGHT = (0, 0, 52, 78), (52, 0, 104, 78)
+
+
+def draft(name, right, size=(104, 78), cells=(39, 52)):
+    """A prediction with a share of the fixations in the right half."""
+    torch.manual_seed(0)
+    model = FixationDensity({"backbone8": 3}).eval().requires_grad_(False)
+    log = torch.full((1, *cells), (1 - right) / (cells[0] * cells[1] / 2)).log()
+    log[..., cells[1] // 2 :] += torch.tensor(right / (1 - right)).log()
+    terms = {"map": log, "centre bias": torch.zeros(1, *cells)}
+    return GazePrediction(model, terms, size, (rand(3, size[1], size[0]) * 255).byte(), name)
+
+
+@pytest.fixture
+def drafts():
+    return Drafts(draft("a/before.png", 0.4), draft("b/after.png", 0.75))
+
+
+def test_what_moves_is_half_of_the_absolute_difference(drafts):
+    difference = drafts.second.cells - drafts.first.cells
+    torch.testing.assert_close(drafts.difference, difference)
+    assert drafts.moved == pytest.approx(float(difference.abs().sum()) / 2, abs=1e-6)
+    assert drafts.moved == pytest.approx(0.35, abs=1e-5)
+    assert Drafts(drafts.first, drafts.first).moved == 0
+
+
+def test_shares_of_areas_are_those_of_each_draft(drafts):
+    shares = drafts.shares({"left": LEFT, "right": RIGHT})["right"]
+    assert shares.first == drafts.first.share({"right": RIGHT})["right"] == pytest.approx(0.4, abs=0.01)
+    assert shares.difference == pytest.approx(0.35, abs=0.01)
+    words = drafts.describe({"right": RIGHT})
+    assert words == (
+        "before.png and after.png: 35 % of the fixations are elsewhere in the second\n"
+        f"  right: {100 * shares.first:.0f} % and {100 * shares.second:.0f} % of all fixations"
+    )
+    assert drafts.describe().count("\n") == 0
+
+
+def test_drafts_of_one_name_are_told_apart_by_their_folders():
+    assert Drafts(draft("a/x.png", 0.4), draft("b/x.png", 0.5)).names == ("a/x.png", "b/x.png")
+    assert Drafts(draft("a/x.png", 0.4), draft("b/y.png", 0.5)).names == ("x.png", "y.png")
+
+
+def test_drafts_of_other_proportions_have_shares_alone(drafts):
+    tall = Drafts(drafts.first, draft("tall.png", 0.5, size=(104, 104), cells=(52, 52)))
+    assert tall.difference is tall.moved is None
+    assert "proportions differ" in tall.describe()
+    assert len(tall.plot().axes) == 2
+    assert "The two drafts" in drafts_section(tall)
+    refused("two pictures of the same proportions", plot_difference, tall)
+
+
+def test_the_figure_and_the_page_have_both_maps_and_what_differs(drafts, tmp_path):
+    figure = drafts.plot(areas={"right": RIGHT})
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[:2] == ["before.png", "after.png"]
+    assert titles[2].startswith("35 % of the fixations move")
+    texts = [[text.get_text() for text in axes.texts] for axes in figure.axes[:2]]
+    assert [each[0].rpartition(" %")[0].rpartition(" ")[2] for each in texts] == ["40", "75"]
+    path = drafts.report(tmp_path / "drafts.html", areas={"<right>": RIGHT})
+    page = path.read_text(encoding="utf-8")
+    assert "35 % of the fixations move between the drafts" in page
+    difference = 100 * drafts.shares({"right": RIGHT})["right"].difference
+    assert f'<th scope="row">&lt;right&gt;</th><td>40 %</td><td>75 %</td><td>{difference:+.1f}</td>' in page
+    assert page.count("<figure>") == 3
+    refused("html", drafts.report, tmp_path / "drafts.pdf")
