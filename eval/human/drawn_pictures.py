@@ -132,7 +132,8 @@ def chart(rng: np.random.Generator) -> Picture:
     elif kind == 1:
         axes.bar([*range(8)], rng.uniform(1, 9, 8), color=rng.uniform(size=(8, 3)))
     elif kind == 2:
-        axes.scatter(*rng.normal(size=(2, 150)), s=rng.uniform(5, 90, 150), c=rng.uniform(size=150))
+        x, y = rng.normal(size=(2, 150))
+        axes.scatter(x, y, s=rng.uniform(5, 90, 150), c=rng.uniform(size=150))
     else:
         axes.pie(rng.uniform(1, 5, 6))
     axes.set_title(_words(rng, 4))

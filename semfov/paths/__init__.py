@@ -1,6 +1,7 @@
 """Records of what happened: looks, detections, beliefs and decisions of searches and explorations."""
 
 from semfov.paths.base import Moment, Record
+from semfov.paths.drafts import Drafts
 from semfov.paths.files import Ending
 from semfov.paths.gaze import GazePrediction
 from semfov.paths.head import HeadPath
@@ -10,6 +11,7 @@ from semfov.paths.windows import WindowMoment, ZoomPath
 from semfov.paths.words import Words
 
 __all__ = [
+    "Drafts",
     "Ending",
     "FoveaMoment",
     "GazePrediction",

@@ -70,8 +70,8 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
     assert difference is not None
     assert moved is not None
     width, height = drafts.second.size
-    size = {"width": _WIDTH, "height": _WIDTH * height / width + 0.6}
-    figure, (axes,) = make_figure(1, 1, **size, layout="compressed", axes=only(ax))
+    inches = _WIDTH * height / width + 0.6
+    figure, (axes,) = make_figure(1, 1, width=_WIDTH, height=inches, layout="compressed", axes=only(ax))
     draw_image(axes, drafts.second.image, Grid(1, 1, drafts.second.size), grey=True)
     most = max(float(difference.abs().max()), 1e-12)  # equal drafts have none
     axes.imshow(

@@ -60,8 +60,8 @@ def plot_gaze(
         The figure.
     """
     width, height = prediction.size
-    size = {"width": 6.4, "height": 5.4 * height / width + 0.6}
-    figure, (axes,) = make_figure(1, 1, **size, layout="compressed", axes=only(ax))
+    inches = 5.4 * height / width + 0.6
+    figure, (axes,) = make_figure(1, 1, width=6.4, height=inches, layout="compressed", axes=only(ax))
     draw_gaze(axes, prediction, prediction.cells if cells is None else cells)
     for order, scanpath in enumerate(scanpaths):
         points = scanpath.resized(prediction.size).points + 0.5
