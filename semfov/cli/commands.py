@@ -174,8 +174,8 @@ usage: semfov gaze [PICTURE ...] [options]
                        semfov-compare.html)
 
 If a command with --out of scanpaths or a folder is stopped, the same command continues with the pictures that are left.
-It was fitted to 3 to 5 seconds of free viewing of photographs by adults. It does not know tasks, and was not fitted to
-pages of text, to interfaces or to pictures that are not wider than high. --help-all: all options.
+It learned from adults who looked at photographs for 3 to 5 seconds without a task. Where a picture is unlike these, as
+pages, charts, drawings and upright pictures are, it says so. --help-all: all options.
 """,
     ),
     "live": Subcommand(
