@@ -30,6 +30,9 @@ def fill(folder: Path) -> dict[str, object]:
     for name in ("FLIGHT/1.jpg", "FLIGHT/2.jpg", "drafts/a.png"):
         (folder / name).parent.mkdir(exist_ok=True)
         _save(scenes[3].image, folder / name, (960, 640))
+    for number, name in enumerate(("before.png", "after.png")):
+        _save(scenes[number].image, folder / name, (480, 360))
+    (folder / "areas.json").write_text('{"headline": [0, 0, 300, 120], "logo": [320, 20, 400, 80]}')
     frame = cv2.imread(str(folder / "kitchen.jpg"))
     writer = cv2.VideoWriter(str(folder / "VIDEO.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, frame.shape[1::-1])
     for _ in range(2):

@@ -219,8 +219,9 @@ class GazePrediction(OtherWords):
             InputError: `count` is out of range.
         """
         check_whole(count, "count", 1, _MOST_FIRST)
+        viewers = self._viewers(count) if len(self._first) < count else []
         while len(self._first) < count:
-            cells = self.given(self._viewers, len(self._first) + 1)
+            cells = self.given(viewers, len(self._first) + 1)
             places = places_of(cells, self.size)
             apart = (place for place in places if are_apart(place, self._first, self.size))
             self._first.append(next(apart, places[0]))
@@ -231,12 +232,11 @@ class GazePrediction(OtherWords):
         """The first fixations that were asked for so far."""
         return []
 
-    @cached_property
-    def _viewers(self) -> list[Fixations]:
-        """Viewers whose first fixations stand for those of all people; the same ones at each call."""
+    def _viewers(self, fixations: int) -> list[Fixations]:
+        """Draw viewers whose first fixations stand for those of all people; the same ones at each call."""
         generator = torch.Generator().manual_seed(0)
         start = self._starts(_VIEWERS, generator)
-        paths = self.model.sample(self.terms, self.size[::-1], start, _MOST_FIRST + 1, generator)
+        paths = self.model.sample(self.terms, self.size[::-1], start, fixations, generator)
         return [Fixations(self.name, f"viewer {n}", path.double().numpy(), self.size) for n, path in enumerate(paths)]
 
     def share(self, areas: AreasLike) -> dict[str, float]:

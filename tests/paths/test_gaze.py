@@ -82,10 +82,10 @@ def test_first_fixations_are_where_most_viewers_look_in_turn(gaze):
     assert gaze.first_fixations(2) == first[:2]
     x, y = torch.arange(52) * 2 + 0.5, torch.arange(39)[:, None] * 2 + 0.5
     for number, place in enumerate(first, 1):
-        cells = gaze.given(gaze._viewers, number)
+        cells = gaze.given(gaze._viewers(4), number)
         around = ((x - place["x"]) ** 2 + (y - place["y"]) ** 2) <= 5.2**2
         assert place["share"] == pytest.approx(float(cells[around].sum()), rel=1e-3)
-    cells = gaze.given(gaze._viewers, 1)
+    cells = gaze.given(gaze._viewers(1), 1)
     taken = ((x - first[0]["x"]) ** 2 + (y - first[0]["y"]) ** 2) <= (2 * 5.2) ** 2
     assert float(cells[taken].max()) == float(cells.max())  # the most likely cell is at the first place
     for one, other in combinations(first, 2):
