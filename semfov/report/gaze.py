@@ -124,17 +124,16 @@ def _svg_path(line: NDArray[np.float64]) -> str:
 
 
 def _lead(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
-    """Say in one or two sentences where people look."""
+    """Say in a few sentences where people look, and why that may be wrong."""
     said = f"{prediction.describe().capitalize()}."
     if shares:
         areas = ", ".join(f"{name} {percent(share)}" for name, share in shares.items())
         said += f" Share of all fixations: {areas}."
-    return said
+    return said if prediction.caution is None else f"{said} Caution: {prediction.caution}."
 
 
 def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
     """Tell what is known of a picture without the script: first fixations, areas, places, and details in bits."""
-    caution = "" if prediction.caution is None else f"<p><strong>Caution:</strong> {escape(prediction.caution)}.</p>"
     first = [
         (str(number), f"{place['x']:.0f}, {place['y']:.0f}", percent(place["share"]))
         for number, place in enumerate(prediction.first_fixations(), 1)
@@ -150,7 +149,7 @@ def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
     if shares:
         areas = [(name, percent(share)) for name, share in shares.items()]
         tables.insert(0, _table("Share of all fixations in each area", ("Area", "Fixations"), areas))
-    return f'{caution}<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
+    return f'<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
 
 
 def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
