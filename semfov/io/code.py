@@ -33,7 +33,7 @@ def modules_digest(*modules: str) -> str:
     Returns:
         sha256 in hexadecimal digits.
     """
-    return _digest(_closure(modules, lambda name: name.partition(".")[0] == PACKAGE))
+    return _digest(_closure(modules, lambda name: _topmost(name) == PACKAGE))
 
 
 def class_digest(kind: type) -> str:
@@ -45,12 +45,18 @@ def class_digest(kind: type) -> str:
     Returns:
         sha256 in hexadecimal digits; for a class without a file a text that no other process has.
     """
-    modules = [str(base.__module__) for base in kind.__mro__ if not belongs_to_others(base.__module__) or base is kind]
+    bases = [base for base in kind.__mro__ if base is kind or not belongs_to_others(base.__module__)]
+    modules = [str(base.__module__) for base in bases]
     if any(source_file(module) is None for module in modules):
         return f"{kind.__qualname__}, process {_THIS_PROCESS}"
-    tops = {module.partition(".")[0] for module in modules} - {PACKAGE}
-    files = _closure(modules, lambda name: name.partition(".")[0] in tops or not belongs_to_others(name))
+    packages = {_topmost(module) for module in modules} - {PACKAGE}
+    files = _closure(modules, lambda name: _topmost(name) in packages or not belongs_to_others(name))
     return hashlib.sha256(f"{kind.__qualname__} {_digest(files)}".encode()).hexdigest()
+
+
+def _topmost(name: str) -> str:
+    """Name the package that a module lies in, or the module itself."""
+    return name.partition(".")[0]
 
 
 def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path]:
@@ -72,8 +78,9 @@ def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path
         is_package = file.name == "__init__.py"
         if not is_package:
             single_files.add(name)
+        package = name if is_package else parent
         for statement in read_source(file).imports:
-            todo += [imported for imported in statement.modules(name if is_package else parent) if belongs(imported)]
+            todo += filter(belongs, statement.modules(package))
     return files
 
 

@@ -273,8 +273,9 @@ def read_bytes(path: str | os.PathLike[str], *, most: int | None = None, name: s
         DataError: it cannot be read, or is larger.
     """
     with reading(path, name):
-        size = Path(path).stat().st_size
-        check_data(most is None or size <= most, name or path, f"at most {most or 0:,} bytes", f"{size:,}")
+        if most is not None:
+            size = Path(path).stat().st_size
+            check_data(size <= most, name or path, f"at most {most:,} bytes", f"{size:,}")
         return Path(path).read_bytes()
 
 
@@ -323,10 +324,14 @@ def read_json(path: str | os.PathLike[str], *, most: int | None = None, name: st
 
 
 def _encoding(content: bytes) -> str:
-    """Guess the encoding of a text, by its mark or, of two or four bytes a character, zeros of digits and commas."""
-    marked = json.detect_encoding(content)
-    if marked in ("utf-8-sig", "utf-16", "utf-32") or content.count(0) <= len(content) / 16:
-        return marked
+    """Guess the encoding of a text by its byte order mark; without one, by the places of its zeros."""
+    by_start = json.detect_encoding(content)
+    has_mark = by_start in ("utf-8-sig", "utf-16", "utf-32")
+    has_few_zeros = content.count(0) <= len(content) / 16
+    if has_mark or has_few_zeros:
+        return by_start
+    # Digits, commas and Latin letters fill one byte of a character's two or four; the others are zeros. The most
+    # significant byte is the first one in big-endian order (be), the last one in little-endian order (le).
     first, second, third, fourth = (content[place::4].count(0) for place in range(4))
     all_but_few = 0.9 * (len(content) // 4)
     if min(first, second) > all_but_few:

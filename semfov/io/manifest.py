@@ -99,29 +99,51 @@ class Manifest:
     @classmethod
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
-        path = Path(folder) / FILE
-        if not path.exists():
-            expected = "a folder of models that semfov fit wrote"
-            gaze = path.with_name("gaze.safetensors")
-            if gaze.is_file():
-                expected += f" with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
-            raise DataError(f"{path}: no such file; expected {expected}")
-        record: dict[str, Any] = read_json(path, most=_MOST_BYTES)
-        check_data(isinstance(record, dict), path, "an object", f"{type(record).__name__}; {_AGAIN}")
-        recorded = record.pop("sha256", None)
-        if recorded != checksum({}, record):
-            raise DataError(f"{path}: damaged or changed, its sha256 is not the one it was written with; {_AGAIN}")
-        check_version(path, record)
-        check_content(path, record, Object(_RECORD, Json(), tuple(_RECORD)))
+        record = _read_record(Path(folder) / FILE)
         parts = {name: Part(**part) for name, part in record["parts"].items()}
         for part in parts.values():
-            if part.file is not None:
-                file = inside(Path(folder), part.file)
-                if sha256(file, f"{file}, which {FILE} lists") != part.sha256:
-                    raise DataError(f"{file}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")
+            _check_file(part, Path(folder))
         columns, rows = record["grid"]
-        settings = {name: record[name] for name in ("detector", "sensor", "training")}
-        return cls(classes=tuple(record["classes"]), grid=(columns, rows), parts=parts, **settings)
+        return cls(
+            classes=tuple(record["classes"]),
+            detector=record["detector"],
+            sensor=record["sensor"],
+            grid=(columns, rows),
+            parts=parts,
+            training=record["training"],
+        )
 
 
 _AGAIN = "run semfov fit again, or copy the folder again"
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """Read the record of a folder, and verify its checksum, its version and its values."""
+    if not path.exists():
+        raise DataError(f"{path}: no such file; expected {_expected_folder(path.parent)}")
+    record: dict[str, Any] = read_json(path, most=_MOST_BYTES)
+    check_data(isinstance(record, dict), path, "an object", f"{type(record).__name__}; {_AGAIN}")
+    recorded = record.pop("sha256", None)
+    if recorded != checksum({}, record):
+        raise DataError(f"{path}: damaged or changed, its sha256 is not the one it was written with; {_AGAIN}")
+    check_version(path, record)
+    check_content(path, record, Object(_RECORD, Json(), tuple(_RECORD)))
+    return record
+
+
+def _expected_folder(folder: Path) -> str:
+    """Write which folder is expected, and what another one holds that fits also write."""
+    expected = "a folder of models that semfov fit wrote"
+    gaze = folder / "gaze.safetensors"
+    if not gaze.is_file():
+        return expected
+    return f"{expected} with --data.root, got only a model of where people look (`semfov gaze --model {gaze}`)"
+
+
+def _check_file(part: Part, folder: Path) -> None:
+    """Raise `DataError` unless the file of a part is the one that the record lists."""
+    if part.file is None:
+        return
+    file = inside(folder, part.file)
+    if sha256(file, f"{file}, which {FILE} lists") != part.sha256:
+        raise DataError(f"{file}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")

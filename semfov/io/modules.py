@@ -35,26 +35,38 @@ def source_file(name: str) -> Path | None:
 
 def _origin(name: str) -> tuple[object, Iterable[str]]:
     """Find the source of a module and the folders of its submodules; neither it nor its parents are imported."""
-    # With the functions of `os.path`: a closure asks for a thousand names, and paths as objects take most of the time.
     parent, _, last = name.rpartition(".")
     try:
         if name in sys.modules:
             # Not by `getattr`, which makes a module that loads lazily load.
             attributes = object.__getattribute__(sys.modules[name], "__dict__")
             return attributes.get("__file__"), attributes.get("__path__") or ()
-        if not parent:
-            spec = find_spec(name)
-            return (None, ()) if spec is None else (spec.origin, spec.submodule_search_locations or ())
-        _, parent_folders = _origin(parent)
-        folders = [join(folder, last) for folder in parent_folders]
-        for folder in folders:
-            if isfile(package := join(folder, "__init__.py")):
-                return package, folders
-            if isfile(module := f"{folder}.py"):
-                return module, ()
-        return None, [folder for folder in folders if isdir(folder)]
+        if parent:
+            _, parent_folders = _origin(parent)
+            return _origin_in(parent_folders, last)
+        spec = find_spec(name)
+        if spec is None:
+            return None, ()
+        return spec.origin, spec.submodule_search_locations or ()
     except Exception:  # finders and loaded modules are others' code, and may raise anything
         return None, ()
+
+
+def _origin_in(parent_folders: Iterable[str], name: str) -> tuple[str | None, Iterable[str]]:
+    """Find the source of a submodule in the folders of its package, and the folders of its own submodules.
+
+    A folder without a source is a part of a namespace package, which may have several (PEP 420).
+    """
+    # With the functions of `os.path`: a closure asks for a thousand names, and paths as objects take most of the time.
+    folders = [join(folder, name) for folder in parent_folders]
+    for folder in folders:
+        package = join(folder, "__init__.py")
+        if isfile(package):
+            return package, folders
+        module = f"{folder}.py"
+        if isfile(module):
+            return module, ()
+    return None, [folder for folder in folders if isdir(folder)]
 
 
 def belongs_to_others(name: str) -> bool:
@@ -99,6 +111,7 @@ def _distributed(path: tuple[str, ...]) -> dict[str, set[Path]]:
 
 def _topmost_modules(distribution: metadata.Distribution) -> set[str]:
     """List the topmost modules of a distribution, by its files, its list of them, and its own name."""
-    named = {*(distribution.read_text("top_level.txt") or "").split(), distribution.name.replace("-", "_")}
+    listed = (distribution.read_text("top_level.txt") or "").split()
+    name_as_module = distribution.name.replace("-", "_")
     entries = {file.parts[0] for file in distribution.files or ()}
-    return named | {getmodulename(entry) or entry for entry in entries}
+    return {*listed, name_as_module} | {getmodulename(entry) or entry for entry in entries}

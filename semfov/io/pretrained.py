@@ -81,21 +81,28 @@ class Pretrained(StatedModule):
             DataError: the file is missing, damaged or of another kind.
         """
         path = Path(name_or_path)
-        if path.suffix != ".safetensors" and len(path.parts) < 2:
+        is_name = path.suffix != ".safetensors" and len(path.parts) < 2
+        if is_name:
             names = sorted(file.stem for file in cls.shipped.glob("*.safetensors"))
-            path = cls.shipped / f"{lookup(str(name_or_path), names, cls.title)}.safetensors"
+            name = lookup(str(name_or_path), names, cls.title)
+            path = cls.shipped / f"{name}.safetensors"
         tensors, record = read(path, cls.kind)
         try:
-            values = {name: value for name, value in record.items() if name not in _COMMON}
-            _ENVELOPE.check({}, record)
-            cls.schema.check(tensors, values)
-            unknown = values.keys() - cls.schema.record.keys()
-            check(not unknown, "record", f"no other values than {', '.join(cls.schema.record)}", sorted(unknown))
+            cls._check_content(tensors, record)
             model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
             reason = " ".join(str(error).split())
             raise DataError(f"{path}: not a complete {cls.title} ({reason})") from None
         return model.eval()
+
+    @classmethod
+    def _check_content(cls, tensors: Mapping[str, Tensor], record: Mapping[str, object]) -> None:
+        """Raise `InputError` unless tensors and record meet the requirements of this kind of file."""
+        values = {name: value for name, value in record.items() if name not in _COMMON}
+        _ENVELOPE.check({}, record)
+        cls.schema.check(tensors, values)
+        unknown = values.keys() - cls.schema.record.keys()
+        check(not unknown, "record", f"no other values than {', '.join(cls.schema.record)}", sorted(unknown))
 
     @classmethod
     def if_shipped(cls, name: str) -> Self | None:

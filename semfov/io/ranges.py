@@ -35,7 +35,8 @@ class Range:
         """Write the range in words, such as `from 1 to 100`."""
         if self.above is not None and self.below is not None:
             return f"above {self.above:g} and below {self.below:g}"
-        return interval(self.low, self.high, -math.inf if self.above is None else self.above).removeprefix("numbers ")
+        above = -math.inf if self.above is None else self.above
+        return interval(self.low, self.high, above).removeprefix("numbers ")
 
     def holds(self, value: object, *, whole: bool) -> bool:
         """Tell whether a value is a number in this range.
@@ -47,18 +48,19 @@ class Range:
         Returns:
             Whether it lies in the range, which NaN never does.
         """
-        if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
+        kind = Integral if whole else Real
+        if isinstance(value, bool) or not isinstance(value, kind):
             return False
         try:
             # A whole number stays one: 10**400 is out of any range, and no float.
             number = int(value) if isinstance(value, Integral) else float(value)
         except (OverflowError, ValueError):
             return False
-        return (
-            self.low <= number <= self.high
-            and (self.above is None or number > self.above)
-            and (self.below is None or number < self.below)
-        )
+        if self.above is not None and not number > self.above:
+            return False
+        if self.below is not None and not number < self.below:
+            return False
+        return self.low <= number <= self.high
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,10 @@ def _check_value(hint: object, value: object, name: str) -> None:
         _check_ranges(hint, value, name)
     elif kind is tuple and isinstance(value, list | tuple):
         item_hints = get_args(hint)
+        is_open_ended = item_hints[-1] is Ellipsis  # `tuple[int, ...]`
         for place, item in enumerate(value):
-            _check_value(item_hints[0 if item_hints[-1] is Ellipsis else place], item, f"{name}[{place}]")
+            item_hint = item_hints[0] if is_open_ended else item_hints[place]
+            _check_value(item_hint, item, f"{name}[{place}]")
     else:
         _check_alternatives(get_args(hint), value, name)
 
@@ -162,8 +166,9 @@ def _check_alternatives(alternatives: Iterable[object], value: object, name: str
     """Raise `InputError` if a value is out of the range of the alternative that it is meant to be."""
     # Where a setting is a number or a word, its words are checked where the setting is used.
     is_word = isinstance(value, str) and any(map(_takes_text, alternatives))
+    is_namespace = hasattr(value, "__dict__") and not is_dataclass(value)  # settings that a parser has not made yet
     for alternative in alternatives:
-        if is_dataclass(alternative) and not is_dataclass(value) and hasattr(value, "__dict__"):
+        if is_dataclass(alternative) and is_namespace:
             check_settings(alternative, vars(value), f"{name}.")  # type: ignore[arg-type]
         elif get_origin(alternative) is Annotated and _takes_text(alternative) == is_word:
             _check_ranges(alternative, value, name)

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ _Size = int | str
 _Sizes = dict[str, int]  # the numbers that names of sizes stand for, as far as they are known
 
 _FLOATS = (torch.float32, torch.float64)
+_SIMPLEX_ERROR = 1e-2  # the sum of many numbers of 32 bits differs from 1 by their rounding
 
 
 @dataclass(frozen=True)
@@ -49,17 +50,24 @@ class Field:
 
     def check(self, name: str, tensor: Tensor, sizes: _Sizes) -> None:
         """Raise `InputError` unless a tensor meets the requirements; add the sizes that it determines to `sizes`."""
+        self._check_shape(name, tensor, sizes)
+        types = _FLOATS if self.dtype is None else (self.dtype,)
+        expected = " or ".join(map(str, types))
+        check(tensor.dtype in types, name, expected, tensor.dtype)
+        if tensor.numel() and self.finite:
+            self._check_values(name, tensor.to(torch.float64))
+
+    def _check_shape(self, name: str, tensor: Tensor, sizes: _Sizes) -> None:
+        """Raise `InputError` unless a tensor has the shape; add the sizes that it determines to `sizes`."""
         has_shape = tensor.ndim == len(self.shape) and all(
             _agrees(size, number, sizes) for size, number in zip(self.shape, tensor.shape, strict=True)
         )
-        shape = f"shape ({', '.join(str(size) for size in self.shape)})"
+        symbols = ", ".join(map(str, self.shape))
+        expected = f"shape ({symbols})"
         if sizes:
-            shape += " with " + ", ".join(f"{name} = {number}" for name, number in sizes.items())
-        check(has_shape, name, shape, tuple(tensor.shape))
-        types = _FLOATS if self.dtype is None else (self.dtype,)
-        check(tensor.dtype in types, name, " or ".join(map(str, types)), tensor.dtype)
-        if tensor.numel() and self.finite:
-            self._check_values(name, tensor.to(torch.float64))
+            meanings = ", ".join(f"{symbol} = {number}" for symbol, number in sizes.items())
+            expected += f" with {meanings}"
+        check(has_shape, name, expected, tuple(tensor.shape))
 
     def _check_values(self, name: str, values: Tensor) -> None:
         """Raise `InputError` unless values meet the requirements."""
@@ -68,13 +76,15 @@ class Field:
         least = float(values.min())
         most = float(values.max())
         is_inside = self.low <= least and most <= self.high and least > self.above
-        check(is_inside, name, interval(self.low, self.high, self.above), least if most <= self.high else most)
-        is_ascending = not self.ascending or bool((values.diff() > 0).all())
-        check(is_ascending, name, "ascending numbers", "unsorted ones")
+        outlier = most if most > self.high else least
+        check(is_inside, name, interval(self.low, self.high, self.above), outlier)
+        if self.ascending:
+            is_ascending = bool((values.diff() > 0).all())
+            check(is_ascending, name, "ascending numbers", "unsorted ones")
         if self.simplex:
             error = float((values.sum(-1) - 1).abs().max())
             expected = "numbers that sum to 1 along the last dimension"
-            check(error <= 1e-2, name, expected, f"sums that differ from 1 by {error:.2g}")
+            check(error <= _SIMPLEX_ERROR, name, expected, f"sums that differ from 1 by {error:.2g}")
 
 
 class Json:
@@ -141,18 +151,26 @@ class Array(Json):
 
     def check(self, name: str, value: object, sizes: _Sizes) -> None:
         check(isinstance(value, list | tuple), name, "a list", excerpt(value))
-        items = cast(Sequence[Any], value)
-        size = len(self.of) if isinstance(self.of, tuple) else self.size
-        has_size = size is None or _agrees(size, len(items), sizes)
-        check(has_size, name, f"{size} items", f"{len(items)}" + (f" with {sizes}" if sizes else ""))
-        check(len(items) >= self.least, name, f"at least {self.least} items", len(items))
+        items = cast(Sequence[object], value)
+        self._check_length(name, len(items), sizes)
         kinds = self.of if isinstance(self.of, tuple) else [self.of] * len(items)
         for place, (item, kind) in enumerate(zip(items, kinds, strict=True)):
             kind.check(f"{name}[{place}]", item, sizes)
-        is_ascending = not self.ascending or all(a < b for a, b in pairwise(items))
-        check(is_ascending, name, "ascending numbers", excerpt(value))
-        is_distinct = not self.distinct or len(set(items)) == len(items)
-        check(is_distinct, name, "items that differ", "repeated items")
+        if self.ascending:
+            numbers = cast(Sequence[float], items)
+            is_ascending = all(first < second for first, second in pairwise(numbers))
+            check(is_ascending, name, "ascending numbers", excerpt(value))
+        if self.distinct:
+            check(len(set(items)) == len(items), name, "items that differ", "repeated items")
+
+    def _check_length(self, name: str, length: int, sizes: _Sizes) -> None:
+        """Raise `InputError` unless a list has the number of items; add the sizes that it determines to `sizes`."""
+        size = len(self.of) if isinstance(self.of, tuple) else self.size
+        if size is not None:
+            has_size = _agrees(size, length, sizes)
+            got = f"{length} with {sizes}" if sizes else f"{length}"
+            check(has_size, name, f"{size} items", got)
+        check(length >= self.least, name, f"at least {self.least} items", length)
 
 
 @dataclass(frozen=True)
@@ -166,12 +184,17 @@ class Text(Json):
     options: tuple[str, ...] | None = None
 
     def check(self, name: str, value: object, sizes: _Sizes) -> None:
-        expected = "text"
-        if self.options is not None:
-            expected = f"one of {', '.join(self.options)}" if self.options else "no text"
         is_option = isinstance(value, str) and (self.options is None or value in self.options)
-        check(is_option, name, expected, excerpt(value))
+        check(is_option, name, self._expected(), excerpt(value))
         check(is_plain(cast(str, value)), name, "text without control characters", excerpt(value))
+
+    def _expected(self) -> str:
+        """Write in words which text is allowed."""
+        if self.options is None:
+            return "text"
+        if not self.options:
+            return "no text"
+        return f"one of {', '.join(self.options)}"
 
 
 @dataclass(frozen=True)
@@ -240,6 +263,7 @@ class Schema:
         Raises:
             InputError: one does not, is missing, or is not required.
         """
+        # The record first: it determines sizes, such as the number of classes, that tensors are compared with.
         sizes: _Sizes = {}
         values = record or {}
         for name, kind in self.record.items():
@@ -247,16 +271,20 @@ class Schema:
             kind.check(name, values.get(name), sizes)
         for name in tensors:
             check(name in self.tensors, "tensors", f"no others than {', '.join(self.tensors)}", excerpt(name))
-        for name, field_ in self.tensors.items():
-            check(name in tensors or field_.optional, name, "a tensor", "nothing")
+        for name, requirement in self.tensors.items():
+            check(name in tensors or requirement.optional, name, "a tensor", "nothing")
             if name in tensors:
-                field_.check(name, tensors[name], sizes)
-        types = {
-            tensors[name].dtype
-            for name, field_ in self.tensors.items()
-            if name in tensors and field_.dtype is None and not field_.mixed
-        }
-        check(len(types) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(map(str, types))))
+                requirement.check(name, tensors[name], sizes)
+        self._check_one_type(tensors)
+
+    def _check_one_type(self, tensors: Mapping[str, Tensor]) -> None:
+        """Raise `InputError` if tensors that must have the same floating-point type have several."""
+        types: set[str] = set()
+        for name, tensor in tensors.items():
+            requirement = self.tensors[name]
+            if requirement.dtype is None and not requirement.mixed:
+                types.add(str(tensor.dtype))
+        check(len(types) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(types)))
 
 
 def check_content(where: object, value: object, kind: Json) -> None:
@@ -289,11 +317,12 @@ def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, large
     Returns:
         The requirements by name.
     """
-    layers: Sequence[tuple[_Size, _Size]] = ((hidden, inputs), (hidden, hidden), (outputs, hidden))
+    shapes_of_weights: Sequence[tuple[_Size, _Size]] = ((hidden, inputs), (hidden, hidden), (outputs, hidden))
     tensors = {}
-    for number, (out, into) in enumerate(layers):
-        tensors[f"{name}.{2 * number}.weight"] = Field((out, into), low=-largest, high=largest)
-        tensors[f"{name}.{2 * number}.bias"] = Field((out,), low=-largest, high=largest)
+    for number, shape in enumerate(shapes_of_weights):
+        layer = f"{name}.{2 * number}"  # an activation, which has no tensors, follows each layer
+        tensors[f"{layer}.weight"] = Field(shape, low=-largest, high=largest)
+        tensors[f"{layer}.bias"] = Field(shape[:1], low=-largest, high=largest)
     return tensors
 
 
@@ -308,16 +337,17 @@ def interval(low: float, high: float, above: float = -math.inf) -> str:
     Returns:
         The words.
     """
-    least, most = (f"{bound:,}" if isinstance(bound, int) else f"{bound:g}" for bound in (low, high))
-    has_least = low > -math.inf
-    has_most = high < math.inf
+    most = f" to {_bound(high)}" if high < math.inf else ""
     if above > -math.inf:
-        return f"numbers above {above:g}" + (f", up to {most}" if has_most else "")
-    if has_least and has_most:
-        return f"numbers from {least} to {most}"
-    if has_least:
-        return f"numbers from {least}"
-    return f"numbers up to {most}" if has_most else "numbers"
+        return f"numbers above {above:g}, up{most}" if most else f"numbers above {above:g}"
+    if low > -math.inf:
+        return f"numbers from {_bound(low)}{most}"
+    return f"numbers up{most}" if most else "numbers"
+
+
+def _bound(number: float) -> str:
+    """Write a bound of a range; thousands of whole numbers have commas."""
+    return f"{number:,}" if isinstance(number, int) else f"{number:g}"
 
 
 def is_number(value: object, *, whole: bool = False) -> bool:
@@ -330,7 +360,9 @@ def is_number(value: object, *, whole: bool = False) -> bool:
     Returns:
         Whether it is.
     """
-    if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
+    kind = int if whole else int | float
+    # To Python, `True` is a whole number; to JSON, it is none.
+    if isinstance(value, bool) or not isinstance(value, kind):
         return False
     try:
         return math.isfinite(value)

@@ -48,10 +48,16 @@ class ImportStatement(NamedTuple):
         if not self.is_from:
             yield from self.names
             return
-        parents = package.split(".")
-        parts = parents[: len(parents) - self.level + 1] if self.level else []
-        base = ".".join([*parts, *([self.module] if self.module else [])])
-        yield from (f"{base}.{name}" for name in self.names)
+        parts: list[str] = []
+        if self.level:
+            # One dot is the package itself, and each further one a parent.
+            parents = package.split(".")
+            parts = parents[: len(parents) - self.level + 1]
+        if self.module:
+            parts = [*parts, self.module]
+        base = ".".join(parts)
+        for name in self.names:
+            yield f"{base}.{name}"
         yield base
 
 
@@ -75,23 +81,32 @@ class _Spelling:
         self.imports: list[ImportStatement] = []
 
     def spell(self, part: object) -> None:
-        """Append a part of a syntax tree."""
+        """Append a part of a syntax tree: a node, a list of nodes, or a name or a constant."""
         if isinstance(part, ast.AST):
-            self.words.append(type(part).__name__)
-            for name in part._fields:
-                self.spell(getattr(part, name, None))
-            if isinstance(part, ast.Import):
-                self.imports.append(ImportStatement([alias.name for alias in part.names]))
-            elif isinstance(part, ast.ImportFrom):
-                names = [alias.name for alias in part.names]
-                self.imports.append(ImportStatement(names, part.module, part.level, is_from=True))
+            self._spell_node(part)
         elif isinstance(part, list):
-            lines = [line for line in part if not _is_text(line)]
-            self.words.append(str(len(lines)))
-            for line in lines:
-                self.spell(line)
+            self._spell_list(part)
         else:
             self.words.append(repr(part))
+
+    def _spell_node(self, node: ast.AST) -> None:
+        """Append a node with all its fields, and its imports."""
+        self.words.append(type(node).__name__)
+        for name in node._fields:
+            self.spell(getattr(node, name, None))
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+            self.imports.append(ImportStatement(names))
+        elif isinstance(node, ast.ImportFrom):
+            names = [alias.name for alias in node.names]
+            self.imports.append(ImportStatement(names, node.module, node.level, is_from=True))
+
+    def _spell_list(self, nodes: list[object]) -> None:
+        """Append a list without its docstrings, after its length: else `[[a], b]` and `[[a, b]]` would read alike."""
+        lines = [node for node in nodes if not _is_text(node)]
+        self.words.append(str(len(lines)))
+        for line in lines:
+            self.spell(line)
 
 
 def _is_text(line: object) -> bool:

@@ -37,14 +37,26 @@ class StatedModule(nn.Module):
                 )
 
     def _load_from_state_dict(
-        self, state_dict: Any, prefix: str, local_metadata: Any, strict: Any, missing_keys: Any, *others: Any
+        self,
+        state_dict: Mapping[str, Tensor],
+        prefix: str,
+        local_metadata: Mapping[str, object],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
     ) -> None:
         """Load after a look at the settings, which may be missing."""
-        if prefix + _KEY in state_dict:
-            self.set_extra_state(state_dict[prefix + _KEY])
-        super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing_keys, *others)
-        if prefix + _KEY in missing_keys:
-            missing_keys.remove(prefix + _KEY)
+        key = prefix + _KEY
+        # Before the tensors, so that the message names the setting and not the shapes that follow from it.
+        if key in state_dict:
+            self.set_extra_state(state_dict[key])
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
+        # Files that were saved without settings are loaded, too.
+        if key in missing_keys:
+            missing_keys.remove(key)
 
 
 def without_settings(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

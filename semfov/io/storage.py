@@ -55,20 +55,7 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     Raises:
         DataError: it is missing, damaged, of another kind or of a later version.
     """
-    from safetensors import SafetensorError, safe_open
-
-    check_regular(path)
-    try:
-        with safe_open(path, framework="pt") as file:
-            record = json.loads((file.metadata() or {})[_KEY], parse_constant=int)  # refuses NaN
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file; check the path") from None
-    except (OSError, SafetensorError, ValueError, RecursionError, TypeError, AttributeError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
-        raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
-    except KeyError:
-        raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None
+    tensors, record = _read_unverified(path)
     if not isinstance(record, dict) or record.get("kind") != kind:
         got = record.get("kind") if isinstance(record, dict) else type(record).__name__
         raise DataError(f"{path}: expected a file of kind {kind}, got {got}; check the path")
@@ -78,6 +65,26 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     if recorded != checksum(tensors, record):
         raise DataError(f"{path}: damaged, its sha256 is not the one it was written with; fetch it again")
     check_version(path, record)
+    return tensors, record
+
+
+def _read_unverified(path: str | PathLike[str]) -> tuple[dict[str, Tensor], object]:
+    """Read the tensors of a safetensors file, and the JSON value of its record."""
+    from safetensors import SafetensorError, safe_open
+
+    check_regular(path)
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            record = json.loads(header[_KEY], parse_constant=int)  # refuses NaN
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file; check the path") from None
+    except (OSError, SafetensorError, ValueError, RecursionError, TypeError, AttributeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
+    except KeyError:
+        raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None
     return tensors, record
 
 
@@ -115,7 +122,8 @@ def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, object] | None 
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
-        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+        content = tensor.reshape(-1).view(torch.uint8)  # NumPy does not have all types of torch, such as bfloat16
+        digest.update(content.numpy().tobytes())
     return digest.hexdigest()
 
 

@@ -56,7 +56,9 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     "picture,x\n'=1+1.jpg,-3.5\n"
     """
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([_plain(value) for value in row] for row in rows)
+    writer = csv.writer(text, lineterminator="\n")
+    for row in rows:
+        writer.writerow([_plain(value) for value in row])
     return text.getvalue()
 
 
