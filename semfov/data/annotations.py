@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 
@@ -71,12 +71,7 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
     data = read_json(path, name=name)
     expected = "an object with images, annotations and categories"
     check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
-    images = _by_id(data, "images", name, {"width": _SIDE, "height": _SIDE, ABSENT: _IDS, PARTIAL: _IDS})
-    for image in images.values():
-        # LVIS names images by their addresses alone.
-        if image.get("file_name") is None and isinstance(image.get("coco_url"), str):
-            image["file_name"] = PurePosixPath(image["coco_url"]).name
-    _checked(data, "images", name, {"file_name": _NAME})
+    images = _images(data, name)
     categories = _by_id(data, "categories", name, {"name": _NAME})
     _check_one_kind(images, f"{name}: images")
     _check_one_kind(categories, f"{name}: categories")
@@ -94,10 +89,21 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
     return Annotations(images, categories, objects, sha256(path))
 
 
+def _images(data: Entry, name: str) -> dict[Id, Entry]:
+    """Index the checked entries of images by their ids, each with its `file_name`."""
+    images = _by_id(data, "images", name, {"width": _SIDE, "height": _SIDE, ABSENT: _IDS, PARTIAL: _IDS})
+    for image in images.values():
+        # LVIS names images by their addresses alone.
+        if image.get("file_name") is None and isinstance(image.get("coco_url"), str):
+            image["file_name"] = PurePosixPath(image["coco_url"]).name
+    _checked(data, "images", name, {"file_name": _NAME})
+    return images
+
+
 class _Field(NamedTuple):
     """What the value of a field has to be: a test of it, and the same in words."""
 
-    accepts: Callable[[Any], object]
+    accepts: Callable[[object], object]
     expected: str
 
 
@@ -113,12 +119,16 @@ def _is_name(value: object) -> bool:
     return isinstance(value, str) and bool(value) and is_plain(value)
 
 
-def _is_side(value: Any) -> bool:
-    return value is None or (is_number(value) and 1 <= value <= _LARGEST and value == int(value))
+def _is_side(value: object) -> bool:
+    if value is None:
+        return True
+    return _is_whole(value) and 1 <= cast(float, value) <= _LARGEST
 
 
-def _is_box(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 4 and all(map(is_number, value)) and min(value[2:]) >= 0
+def _is_box(value: object) -> bool:
+    if not isinstance(value, list) or len(value) != 4:
+        return False
+    return all(map(is_number, value)) and min(value[2:]) >= 0
 
 
 _ID = _Field(_is_id, "an integer or a string without control characters")
@@ -167,7 +177,7 @@ def _is_whole(value: object) -> bool:
     return type(value) is int or (type(value) is float and value.is_integer())
 
 
-def _plain_id(value: Any) -> Id:
+def _plain_id(value: float | str) -> Id:
     """Convert an id that is a number to an integer, so that 7.0 is 7."""
     return int(value) if isinstance(value, float) else value
 

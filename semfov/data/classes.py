@@ -182,25 +182,24 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         return list(classes).index(name) + 1
     wanted = _plain_key(name)
     keys = [_plain_key(known) for known in classes]
-    spellings = [[key] for key in keys]
-    inflections = [_inflections(key) for key in keys]
+    matches = [place for place, key in enumerate(keys) if wanted == key]
     # A name in another number is looked for only where none has this spelling: `glass` is no plural of `glas`.
-    for forms_of_classes in (spellings, inflections):
-        indices = [index for index, forms in enumerate(forms_of_classes, 1) if wanted in forms]
-        if len(indices) == 1:
-            return indices[0]
-        if indices:
-            raise InputError(_unknown(argument, name, [classes[index - 1] for index in indices], classes))
-    similar = [classes[keys.index(key)] for key in _similar_keys(wanted, keys)]
-    raise InputError(_unknown(argument, name, similar, classes))
+    if not matches:
+        matches = [place for place, key in enumerate(keys) if wanted in _inflections(key)]
+    if len(matches) == 1:
+        return matches[0] + 1
+    if not matches:
+        matches = [keys.index(key) for key in _similar_keys(wanted, keys)]
+    suggestions = [classes[place] for place in matches]
+    raise InputError(_unknown(argument, name, suggestions, classes))
 
 
 def _checked_index(value: object, count: int, argument: str) -> int:
     """Check an index of one of `count` classes, which may be a number of NumPy or of a tensor."""
     number = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value
-    if not isinstance(number, Integral) or isinstance(number, bool) or not 1 <= int(number) <= count:
-        raise InputError(f"{argument}: expected a name, or a whole number from 1 to {count}, got {number!r}")
-    return int(number)
+    if isinstance(number, Integral) and not isinstance(number, bool) and 1 <= int(number) <= count:
+        return int(number)
+    raise InputError(f"{argument}: expected a name, or a whole number from 1 to {count}, got {number!r}")
 
 
 def _inflections(key: str) -> set[str]:
@@ -244,16 +243,21 @@ def class_numbers(
     if names is None:
         return ()
     if isinstance(names, str) or not isinstance(names, Sequence):
-        # One name; a text with commas is often meant as several.
-        try:
-            return (class_index(names, classes, argument),)
-        except InputError as error:
-            words = [name.strip() for name in str(names).split(",")]
-            if len(words) == 1:
-                raise
-            raise InputError(f"{error}; several classes are a list: {words}") from None
+        return (_index_of_one(names, classes, argument),)
     check(len(names) > 0, argument, "a class, several, or None for all", names)
-    return tuple(dict.fromkeys(class_index(name, classes, argument) for name in names))
+    indices = [class_index(name, classes, argument) for name in names]
+    return tuple(dict.fromkeys(indices))
+
+
+def _index_of_one(name: str | int, classes: Sequence[str], argument: str) -> int:
+    """Look up the index of one class; a text with commas is often meant as several, which the error then says."""
+    try:
+        return class_index(name, classes, argument)
+    except InputError as error:
+        words = [word.strip() for word in str(name).split(",")]
+        if len(words) == 1:
+            raise
+        raise InputError(f"{error}; several classes are a list: {words}") from None
 
 
 def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> str:

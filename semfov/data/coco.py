@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from semfov.data.annotations import Annotations, Id, read_annotations, warn_of_form
+from semfov.data.annotations import Annotations, Entry, Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name, class_indices
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Coverage, Scene, Scenes, legal_targets
@@ -232,6 +232,9 @@ class _Packed:
 
     Private attributes: `_boxes`, `_labels` and `_crowd` have the objects of the detector's classes, row after row, and
     `_ends` where the objects of each row end.
+
+    Invariant: the objects of row r are those from `_ends[r - 1]` (0 for the first row) to before `_ends[r]`; all lists
+    have an entry for each row, and `instances[r]` is at least the number of these objects.
     """
 
     def __init__(self, file: Annotations, labels: dict[Id, int], path: object, *, drop_crowds: bool) -> None:
@@ -240,32 +243,32 @@ class _Packed:
         self.sizes = [_size_of(file, image, path) for image in self.ids]
         self.repairs: Counter[str] = Counter()
 
-        entries = [(row, entry) for row, image in enumerate(self.ids) for entry in file.objects[image]]
-        rows = torch.tensor([row for row, _ in entries], dtype=torch.int64)
-        label = torch.tensor([labels[entry["category_id"]] for _, entry in entries], dtype=torch.int64)
-        crowd = torch.tensor([bool(entry["iscrowd"]) for _, entry in entries], dtype=torch.bool)
-        numbers = [list(map(float, entry["bbox"])) for _, entry in entries]
-        bboxes = torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
-        limits = torch.tensor([self.sizes[row] * 2 for row, _ in entries], dtype=torch.float64).reshape(-1, 4)
-
+        entries: list[Entry] = []
+        rows_of_entries: list[int] = []
+        for row, image in enumerate(self.ids):
+            objects = file.objects[image]
+            entries += objects
+            rows_of_entries += [row] * len(objects)
+        rows = torch.tensor(rows_of_entries, dtype=torch.int64)
+        label = torch.tensor([labels[entry["category_id"]] for entry in entries], dtype=torch.int64)
+        crowd = torch.tensor([bool(entry["iscrowd"]) for entry in entries], dtype=torch.bool)
         # In float64, in which a box that ends at the border of its image is not beyond it.
+        numbers = [list(map(float, entry["bbox"])) for entry in entries]
+        bboxes = torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
+        sides = torch.tensor(self.sizes, dtype=torch.float64).reshape(-1, 2)[rows]
+        limits = torch.cat([sides, sides], -1)
+
         warn_of_form(bboxes, limits, path, stacklevel=5)
-        corner, extent = bboxes.split(2, -1)
-        edges = torch.cat([corner, corner + extent], -1)
-        cut = edges.clamp(min=0).minimum(limits)
-        boxes = cut.float()
+        boxes, is_cut = _cut_to_image(bboxes, limits)
         has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
         is_dropped_crowd = has_area & crowd & drop_crowds
         valid = has_area & ~is_dropped_crowd
         labelled = valid & (label > 0)
-        # official files have two decimals, so a difference of up to 0.01 is rounding
-        is_cut = valid & ((edges - cut).abs() > 0.01).any(-1)
         self._count("boxes without area in the image, dropped", ~has_area)
         self._count("boxes of crowds, dropped", is_dropped_crowd)
-        self._count("boxes cut to the image", is_cut)
+        self._count("boxes cut to the image", valid & is_cut)
         for number in (valid & ~labelled).nonzero()[:, 0].tolist():
-            _, entry = entries[number]
-            name = file.categories[entry["category_id"]]["name"]
+            name = file.categories[entries[number]["category_id"]]["name"]
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
 
         # Boxes of all categories count for the number of boxes of an image; those of the detector's are its objects.
@@ -282,7 +285,8 @@ class _Packed:
 
     def annotation(self, row: int) -> Annotation:
         """Return the objects of an image, of the detector's classes."""
-        objects = slice(self._ends[row - 1] if row else 0, self._ends[row])
+        start = self._ends[row - 1] if row else 0
+        objects = slice(start, self._ends[row])
         boxes = self._boxes[objects].clone()
         labels = self._labels[objects].clone()
         crowd = self._crowd[objects].clone()
@@ -297,11 +301,30 @@ def _size_of(file: Annotations, image: Id, path: object) -> tuple[int, int]:
     return size
 
 
+def _cut_to_image(bboxes: Tensor, limits: Tensor) -> tuple[Tensor, Tensor]:
+    """Cut boxes to their images.
+
+    Args:
+        bboxes: `(N, 4)`, `[x, y, width, height]`.
+        limits: `(N, 4)`, width and height of the image of each box, twice.
+
+    Returns:
+        Corners `(N, 4)` in float32, and whether the cut moved one, `(N,)`.
+    """
+    corner, extent = bboxes.split(2, -1)
+    edges = torch.cat([corner, corner + extent], -1)
+    cut = edges.clamp(min=0).minimum(limits)
+    # Official files have two decimals, so a difference of up to 0.01 is rounding.
+    is_cut = ((edges - cut).abs() > 0.01).any(-1)
+    return cut.float(), is_cut
+
+
 def _labels_of(file: Annotations, classes: tuple[str, ...], name: str) -> dict[Id, int]:
     """Find the index of the class by category id, 0 for categories that the detector does not have."""
     indices = class_indices(classes)
-    labels = {category: indices.get(canonical_name(entry["name"]), 0) for category, entry in file.categories.items()}
-    first = ", ".join(ascii(entry["name"]) for entry in list(file.categories.values())[:5]) or "none"
+    names = {category: entry["name"] for category, entry in file.categories.items()}
+    labels = {category: indices.get(canonical_name(label), 0) for category, label in names.items()}
     expected = f"some of the detector's {len(classes)} classes ({', '.join(classes[:5])}, ...) among the categories"
-    check_data(any(labels.values()), name, expected, first)
+    first_names = list(names.values())[:5]
+    check_data(any(labels.values()), name, expected, ", ".join(map(ascii, first_names)) or "none")
     return labels

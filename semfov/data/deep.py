@@ -1,10 +1,14 @@
 """Colours of 16 bits a channel in PNG and PPM files, of which Pillow gives the upper eight bits alone."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import IO, TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from PIL.ImageFile import ImageFile
 
 _LOWER_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L"}
 """Pillow's ways to unpack the upper byte of each channel, and those that take the other byte for the upper one."""
@@ -13,17 +17,22 @@ _GREY_AND_ALPHA = "LA;16B"  # four bytes a pixel, which Pillow also unpacks as t
 _CHANNELS = {"L": 1, "RGB": 3}  # of a PPM
 
 
-def is_deep(image: Any) -> bool:
+def is_deep(image: "ImageFile") -> bool:
     """Tell whether a Pillow image that is not decoded yet has more than 8 bits a channel that decoding would cut."""
     if not image.tile:
         return False
     tile = image.tile[0]
     if tile.codec_name == "zip":
         return tile.args in (*_LOWER_BYTES, _GREY_AND_ALPHA)
-    return tile.codec_name == "ppm" and tile.args[1] > 255
+    if tile.codec_name != "ppm":
+        return False
+    _, white = cast(tuple[str, int], tile.args)
+    return white > 255
 
 
-def deep_values(copies: tuple[Any, Any], load: Callable[[Any], Any]) -> tuple[NDArray[np.uint16], int]:
+def deep_values(
+    copies: tuple["ImageFile", "ImageFile"], load: Callable[["Image"], "Image"]
+) -> tuple[NDArray[np.uint16], int]:
     """Read the values of a file that `is_deep`.
 
     Args:
@@ -41,17 +50,19 @@ def deep_values(copies: tuple[Any, Any], load: Callable[[Any], Any]) -> tuple[ND
         image.tile = [tile._replace(args="RGBA")]
         halves = np.asarray(load(image))
         return halves[..., 0::2] * np.uint16(256) + halves[..., 1::2], 65535
-    again.tile = [tile._replace(args=_LOWER_BYTES[tile.args])]
+    again.tile = [tile._replace(args=_LOWER_BYTES[cast(str, tile.args)])]
     upper = np.asarray(load(image))
     lower = np.asarray(load(again))
     return upper * np.uint16(256) + lower, 65535
 
 
-def _ppm_values(image: Any) -> tuple[NDArray[np.uint16], int]:
+def _ppm_values(image: "ImageFile") -> tuple[NDArray[np.uint16], int]:
     """Read the values of a PPM, which are not packed, and the value that it says is white."""
     tile = image.tile[0]
-    mode, white = tile.args
+    mode, white = cast(tuple[str, int], tile.args)
     shape = image.height, image.width, _CHANNELS[mode]
-    image.fp.seek(tile.offset)
-    values = np.frombuffer(image.fp.read(2 * int(np.prod(shape))), ">u2")
+    file = cast(IO[bytes], image.fp)
+    file.seek(tile.offset)
+    content = file.read(2 * int(np.prod(shape)))
+    values = np.frombuffer(content, ">u2")  # two bytes a sample, the most significant first (netpbm, ppm(5))
     return values.reshape(shape).astype(np.uint16), white

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -116,13 +117,13 @@ class Description:
     def _sample_boxes(self) -> list[Box]:
         """Find windows that are spread evenly over the picture."""
         width, height = self.size
-        lefts = [width * (1 + 2 * number) // (2 * _SAMPLES) for number in range(_SAMPLES)]
-        tops = [height * (1 + 2 * number) // (2 * _SAMPLES) for number in range(_SAMPLES)]
-        return [
-            (left, top, min(left + _SAMPLE_SIDE, width), min(top + _SAMPLE_SIDE, height))
-            for top in tops
-            for left in lefts
-        ]
+        boxes = []
+        for row, column in product(range(_SAMPLES), repeat=2):
+            # In the middle of a cell, of which `_SAMPLES` fill a side.
+            left = width * (1 + 2 * column) // (2 * _SAMPLES)
+            top = height * (1 + 2 * row) // (2 * _SAMPLES)
+            boxes.append((left, top, min(left + _SAMPLE_SIDE, width), min(top + _SAMPLE_SIDE, height)))
+        return boxes
 
 
 @dataclass(frozen=True)

@@ -60,23 +60,34 @@ def sheet(classes: Sequence[str]) -> Scene:
     scenes = EmbeddedScenes(classes, count=len(PHOTOGRAPHS))
     prints = [_single(scenes, index) for index in range(len(scenes))]
     rows = [prints[0::2], prints[1::2]]
-    widths = [sum(scene.size[0] for scene in row) for row in rows]
-    heights = [max(scene.size[1] for scene in row) for row in rows]
-    width = max(total + _MARGIN * len(row) for total, row in zip(widths, rows, strict=True)) + _MARGIN
-    paper = torch.full((3, sum(heights) + _MARGIN * 3, width), _PAPER)
+    width = max(_width(row) + _MARGIN * (len(row) + 1) for row in rows)
+    height = sum(_height(row) for row in rows) + _MARGIN * (len(rows) + 1)
+    paper = torch.full((3, height, width), _PAPER)
     boxes: list[Tensor] = []
+    labels: list[Tensor] = []
     top = _MARGIN
-    for row, row_width, height in zip(rows, widths, heights, strict=True):
-        gap = (width - row_width) // (len(row) + 1)
+    for row in rows:
+        gap = (width - _width(row)) // (len(row) + 1)
         left = gap
         for scene in row:
             right = left + scene.size[0]
-            paper[:, top : top + scene.size[1], left:right] = scene.image
+            bottom = top + scene.size[1]
+            paper[:, top:bottom, left:right] = scene.image
             boxes.append(scene.boxes + torch.tensor([left, top, left, top]))
+            labels.append(scene.labels)
             left = right + gap
-        top += height + _MARGIN
-    labels = torch.cat([scene.labels for row in rows for scene in row])
-    return Scene("sheet", "sheet", paper, torch.cat(boxes), labels)
+        top += _height(row) + _MARGIN
+    return Scene("sheet", "sheet", paper, torch.cat(boxes), torch.cat(labels))
+
+
+def _width(row: Sequence[Scene]) -> int:
+    """Sum the widths of pictures."""
+    return sum(scene.size[0] for scene in row)
+
+
+def _height(row: Sequence[Scene]) -> int:
+    """Find the height of the highest picture."""
+    return max(scene.size[1] for scene in row)
 
 
 def _single(scenes: EmbeddedScenes, index: int) -> Scene:

@@ -5,10 +5,11 @@ GDAL would choose a driver by the content of a file, and some of its drivers sen
 
 import math
 import re
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Self, TypedDict, Unpack
+from typing import TYPE_CHECKING, Protocol, Self, TypedDict, Unpack
 
 import numpy as np
 
@@ -18,7 +19,10 @@ from semfov.errors import DataError, check_data
 from semfov.io.files import reading
 
 if TYPE_CHECKING:
-    from rasterio.enums import Resampling
+    from rasterio.control import GroundControlPoint
+    from rasterio.crs import CRS
+    from rasterio.enums import ColorInterp, MaskFlags, Resampling
+    from rasterio.transform import Affine
     from rasterio.windows import Window
 
 MOST_SIDE = 2**20  # longest side in pixels of a picture that is read by windows
@@ -41,6 +45,10 @@ _SIGNATURES = {
     b"\xff\xd8\xff": "JPEG",
 }
 """Drivers by the first bytes of the files that they read."""
+
+
+Bands = int | Sequence[int]
+"""The number of a band from 1, which is read as `(h, w)`, or several, as `(C, h, w)`."""
 
 
 class WindowOptions(TypedDict):
@@ -69,11 +77,11 @@ class Raster(Protocol):
     count: int
     dtypes: tuple[str, ...]
     nodatavals: tuple[float | None, ...]
-    colorinterp: tuple[Any, ...]
-    mask_flag_enums: tuple[Any, ...]
-    crs: Any
-    transform: Any
-    gcps: Any
+    colorinterp: tuple["ColorInterp", ...]
+    mask_flag_enums: tuple[Sequence["MaskFlags"], ...]
+    crs: "CRS | None"
+    transform: "Affine"
+    gcps: tuple[Sequence["GroundControlPoint"], "CRS | None"]
 
     def __enter__(self) -> Self: ...
 
@@ -83,9 +91,9 @@ class Raster(Protocol):
 
     def overviews(self, band: int) -> list[int]: ...
 
-    def read(self, bands: Any, **options: Unpack[WindowOptions]) -> Values: ...
+    def read(self, bands: Sequence[int], **options: Unpack[WindowOptions]) -> Values: ...
 
-    def read_masks(self, bands: Any, **options: Unpack[WindowOptions]) -> Values: ...
+    def read_masks(self, bands: Sequence[int], **options: Unpack[WindowOptions]) -> Values: ...
 
 
 class Dataset(Raster, Protocol):
@@ -93,6 +101,10 @@ class Dataset(Raster, Protocol):
 
     driver: str
     block_shapes: list[tuple[int, int]]
+
+    def read(self, bands: Bands, **options: Unpack[WindowOptions]) -> Values: ...
+
+    def read_masks(self, bands: Bands, **options: Unpack[WindowOptions]) -> Values: ...
 
     def colormap(self, band: int) -> dict[int, tuple[int, int, int, int]]: ...
 

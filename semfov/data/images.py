@@ -25,6 +25,7 @@ from semfov.io.files import check_regular
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+    from PIL.ImageFile import ImageFile
 
 MAX_PIXELS = 89_478_485
 """Largest number of pixels of a picture that is read (1 GiB as float32 RGB): Pillow's limit on decompression bombs."""
@@ -92,11 +93,12 @@ def _deep_pixels(
     samples = values.shape[-1]
     has_alpha = samples in (2, 4)
     shades = values[..., :-1] if has_alpha else values
-    limits = (0.0, float(most))
-    colours = between(shades, limits if white is None else black_and_white(white, shades))
+    full_range = (0.0, float(most))
+    limits = full_range if white is None else black_and_white(white, shades)
+    colours = between(shades, limits)
     pixels = colours if colours.shape[-1] == 3 else np.repeat(colours, 3, -1)
     if has_alpha:
-        alpha = between(values[..., -1:], limits)
+        alpha = between(values[..., -1:], full_range)
         pixels = pixels * alpha + (1 - alpha)
     return pixels, colours
 
@@ -189,7 +191,7 @@ def _fault(error: Exception, source: Path | str, action: str) -> str:
 
 
 @contextmanager
-def open_pillow(path: str | PathLike[str]) -> Iterator["Image"]:
+def open_pillow(path: str | PathLike[str]) -> Iterator["ImageFile"]:
     """Open a file in one of `_FORMATS` as a Pillow image that is not decoded yet.
 
     Raises:
@@ -205,7 +207,7 @@ def open_pillow(path: str | PathLike[str]) -> Iterator["Image"]:
         yield image
 
 
-def _open_in_formats(file: BinaryIO) -> "Image":
+def _open_in_formats(file: BinaryIO) -> "ImageFile":
     """Open a file in one of `_FORMATS`, first in those that Pillow always knows: importing all others takes longer."""
     from PIL import Image, UnidentifiedImageError
 
@@ -266,11 +268,12 @@ def check_tile(size: int, stored: int, name: str) -> None:
         stored: bytes of it in the file, 0 for one that is not there.
         name: of the picture, for the message.
     """
-    got = f"one that is stored in {stored:,}, out of proportion; replace it"
     is_larger = stored > 2 * size + 2**16
     # A small tile may be blank, which takes next to nothing.
     is_smaller = 0 < stored * _MOST_A_BYTE < size and size > 3 * _SMALL
-    check_data(not is_larger and not is_smaller, name, f"tiles of {size:,} bytes", got)
+    in_proportion = not is_larger and not is_smaller
+    got = f"one that is stored in {stored:,}, out of proportion; replace it"
+    check_data(in_proportion, name, f"tiles of {size:,} bytes", got)
 
 
 def check_area(size: tuple[int, int], name: str) -> None:
@@ -328,7 +331,9 @@ def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) ->
     is_inverted = sixteen_bits and TiffTags.of_image(image).photometric == WHITE_IS_ZERO
     image = _loaded(image, upright=upright)
     is_grey = image.mode in SIXTEEN_BITS or image.mode == "F"
-    values = np.asarray(image if is_grey else _over_white(image).convert("RGB"))
+    if not is_grey:
+        image = _over_white(image).convert("RGB")
+    values = np.asarray(image)
     if white is not None:
         pixels = between(values, black_and_white(white, values))
     elif is_grey:

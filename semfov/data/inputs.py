@@ -109,21 +109,26 @@ def as_images(
         DataError: the file cannot be read.
     """
     pixels = as_pixels(images, argument=argument, color=color, white=white)
-    device = pixels.device if like is None else like.device
+    device = pixels.device
+    dtype = pixels.dtype if pixels.is_floating_point() else torch.float32
+    if like is not None:
+        device = like.device
+        dtype = like.dtype
     if pixels.is_floating_point():
-        pixels = pixels.to(device, pixels.dtype if like is None else like.dtype)
+        pixels = pixels.to(device, dtype)
         check_pixels(pixels, argument)
         return pixels
     got = f"a tensor of {pixels.dtype}; convert it to bytes, image.to(torch.uint8), or to floats in [0, 1]"
     check(pixels.dtype in _WHITE, argument, "bytes, 16-bit numbers or floats", got)
-    return _scaled(pixels, _WHITE[pixels.dtype], device, torch.float32 if like is None else like.dtype)
+    return _scaled(pixels, _WHITE[pixels.dtype], device, dtype)
 
 
 def _scaled(pixels: Tensor, white: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Divide whole numbers by that of white, on a device and in a dtype."""
     if dtype == torch.float32 and device.type == "cpu" and values_known(pixels):
         # Other than torch, NumPy converts and divides in one pass over memory.
-        return torch.from_numpy(np.divide(pixels.cpu().numpy(), white, dtype=np.float32))
+        numbers = pixels.cpu().numpy()
+        return torch.from_numpy(np.divide(numbers, white, dtype=np.float32))
     return pixels.to(device, dtype).div_(white)
 
 
@@ -143,10 +148,12 @@ def as_pixels(
     """
     check_white(white)
     is_array = isinstance(images, np.ndarray)
-    pixels = _channels_first(_pixels_of(images, argument, white), argument, choose=not is_array)
+    pixels = _pixels_of(images, argument, white)
+    pixels = _channels_first(pixels, argument, choose=not is_array)
     is_bgr = lookup(color, get_args(Color), "order of channels") == "bgr"
     # Files and Pillow images are RGB already.
-    return pixels.flip(1) if is_bgr and isinstance(images, Tensor | np.ndarray) else pixels
+    has_order = is_array or isinstance(images, Tensor)
+    return pixels.flip(1) if is_bgr and has_order else pixels
 
 
 def as_batch(images: ImageLike) -> Tensor:
@@ -159,9 +166,7 @@ def as_batch(images: ImageLike) -> Tensor:
 def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
     """Convert a picture to a tensor; arrays and tensors keep their layout, without `white` also their dtype."""
     if white is not None and isinstance(image, Tensor | np.ndarray):
-        values = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
-        check(values.dtype.kind in "buif" and values.size > 0, argument, "numbers", f"{values.dtype} {values.shape}")
-        return torch.from_numpy(between(values, black_and_white(white, values)))
+        return _between_limits(image, argument, white)
     if isinstance(image, Tensor):
         check(image.layout == torch.strided, argument, "a dense tensor", "a sparse one; use image.to_dense()")
         return image
@@ -176,6 +181,15 @@ def _pixels_of(image: ImageLike, argument: str, white: White | None) -> Tensor:
         return from_pillow(image, argument, white)
     expected = "a path, a Pillow image, a NumPy array or a tensor"
     raise InputError(f"{argument}: expected {expected}, got {_other_kind(image)}")
+
+
+def _between_limits(image: Tensor | Values, argument: str, white: White) -> Tensor:
+    """Convert an array or a tensor of numbers to [0, 1] by the values that are black and white."""
+    values = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
+    are_numbers = values.dtype.kind in "buif" and values.size > 0
+    check(are_numbers, argument, "numbers", f"{values.dtype} {values.shape}")
+    limits = black_and_white(white, values)
+    return torch.from_numpy(between(values, limits))
 
 
 def _native(array: Values, argument: str) -> Tensor:
@@ -217,12 +231,16 @@ def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
     for channels in (3, 1):
         is_first = batch.shape[1] == channels
         is_last = batch.shape[-1] == channels
-        got = f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
-        check(choose or not (is_first and is_last), argument, _SHAPES, got)
-        if is_first or is_last:
-            batch = batch if is_first else batch.movedim(-1, 1)
-            return batch.expand(-1, 3, -1, -1)
-    remedy = "; drop the fourth channel, or give the Pillow image" if 4 in (shape[-1], shape[-3]) else ""
+        if is_first and is_last and not choose:
+            raise InputError(
+                f"{argument}: expected {_SHAPES}, got shape {shape}, which is ambiguous; give a tensor (3, H, W)"
+            )
+        if is_first:
+            return batch.expand(-1, 3, -1, -1)  # grey becomes three equal channels
+        if is_last:
+            return batch.movedim(-1, 1).expand(-1, 3, -1, -1)
+    has_alpha = 4 in (shape[-1], shape[-3])
+    remedy = "; drop the fourth channel, or give the Pillow image" if has_alpha else ""
     raise InputError(f"{argument}: expected {_SHAPES}, with 3 channels or 1, got shape {shape}{remedy}")
 
 

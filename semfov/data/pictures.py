@@ -8,7 +8,7 @@ import torch
 
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Scene, Scenes
-from semfov.errors import check_data
+from semfov.errors import DataError
 from semfov.io.files import inside, json_sha256, sha256
 
 
@@ -31,8 +31,12 @@ class Pictures(Scenes):
         self.ids = sorted(set(names))
         self._sizes: dict[int, tuple[int, int]] = {}
         missing = [name for name in self.ids if not self._path(name).is_file()]
-        got = f"{len(self.ids) - len(missing)}: {', '.join(missing[:1])} is missing; check the folder and the names"
-        check_data(not missing, self.root, f"{len(self.ids)} pictures", got)
+        if missing:
+            found = len(self.ids) - len(missing)
+            raise DataError(
+                f"{self.root}: expected {len(self.ids)} pictures, got {found}: {missing[0]} is missing; "
+                "check the folder and the names"
+            )
 
     @property
     def fingerprint(self) -> str:  # type: ignore[override]

@@ -249,5 +249,5 @@ def _tags_of(path: str | PathLike[str]) -> TiffTags:
             import tifffile
 
             with tifffile.TiffFile(path) as file:
-                return TiffTags.of_page(file.pages[0])
+                return TiffTags.of_page(file.pages.first)
     return TiffTags({})

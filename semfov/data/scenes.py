@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from semfov.data.annotations import Entry, Id
 from semfov.data.classes import class_indices
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, ComposedScenes, Scene, legal_targets
@@ -41,17 +42,25 @@ class _Photograph(NamedTuple):
 def _photographs() -> tuple[tuple[str, ...], tuple[_Photograph, ...]]:
     """Read the names of all classes in the photographs, and the photographs, from their file in COCO's format."""
     record = read_json(FOLDER / "photographs.json", name="photographs.json")
+    classes = tuple(category["name"] for category in record["categories"])
     labels_by_id = {category["id"]: label for label, category in enumerate(record["categories"], 1)}
     photographs = []
     for image in record["images"]:
         entries = [entry for entry in record["annotations"] if entry["image_id"] == image["id"]]
-        x, y, width, height = torch.tensor([entry["bbox"] for entry in entries], dtype=torch.float32).unbind(-1)
-        boxes = torch.stack([x, y, x + width, y + height], -1)
-        labels = torch.tensor([labels_by_id[entry["category_id"]] for entry in entries])
-        crowd = torch.tensor([entry["iscrowd"] == 1 for entry in entries])
-        objects = Annotation(boxes, labels, crowd, (image["width"], image["height"]))
+        size = image["width"], image["height"]
+        objects = _objects(entries, labels_by_id, size)
         photographs.append(_Photograph(image["file_name"].removesuffix(".jpg"), objects))
-    return tuple(category["name"] for category in record["categories"]), tuple(photographs)
+    return classes, tuple(photographs)
+
+
+def _objects(entries: Sequence[Entry], labels_by_id: dict[Id, int], size: tuple[int, int]) -> Annotation:
+    """Convert the entries of a picture's objects in COCO's format, whose boxes are `[x, y, width, height]`."""
+    numbers = torch.tensor([entry["bbox"] for entry in entries], dtype=torch.float32)
+    x, y, width, height = numbers.unbind(-1)
+    boxes = torch.stack([x, y, x + width, y + height], -1)
+    labels = torch.tensor([labels_by_id[entry["category_id"]] for entry in entries])
+    crowd = torch.tensor([entry["iscrowd"] == 1 for entry in entries])
+    return Annotation(boxes, labels, crowd, size)
 
 
 CLASSES, PHOTOGRAPHS = _photographs()

@@ -85,16 +85,12 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
         files = _of_others(files, source)
     photographs(visible, str(source))
     _warn_of_mosaics(source)
-    if not files and frames:
+    if files:
+        return files
+    if frames:
         raise DataError(f"source: expected frames (.jpg, .png, .tif, …) in {source}, got none")
-    if not files:
-        place = (
-            f"{source}, or in a folder in it"
-            if recursive
-            else f"{source}, and recursive=True also searches the folders in it"
-        )
-        raise DataError(f"picture: expected photographs (.jpg, .png, .tif, …) in {place}, got none")
-    return files
+    hint = "or in a folder in it" if recursive else "and recursive=True also searches the folders in it"
+    raise DataError(f"picture: expected photographs (.jpg, .png, .tif, …) in {source}, {hint}, got none")
 
 
 def _visible_files(folder: Path, *, recursive: bool) -> list[Path]:
@@ -144,16 +140,17 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
         The others, among them folders, mosaics and files without a suffix.
     """
     kinds = {"", ".vrt", *PHOTOGRAPHS}
-    others = dict.fromkeys(path for path in paths if path.suffix.lower() not in kinds and path.is_file())
-    if others:
-        name = printable(min(others).name)
-        if len(others) == 1:
-            text = f"1 file is no photograph and is left out, {name}"
-        else:
-            text = f"{len(others)} files are no photographs and are left out, such as {name}"
-        if any(path.suffix.lower() in VIDEOS for path in others):
-            text += "; `semfov live` takes videos"
-        warnings.warn(f"{where}: {text}", stacklevel=3)
+    others = {path for path in paths if path.suffix.lower() not in kinds and path.is_file()}
+    if not others:
+        return list(paths)
+    name = printable(min(others).name)
+    if len(others) == 1:
+        text = f"1 file is no photograph and is left out, {name}"
+    else:
+        text = f"{len(others)} files are no photographs and are left out, such as {name}"
+    if any(path.suffix.lower() in VIDEOS for path in others):
+        text += "; `semfov live` takes videos"
+    warnings.warn(f"{where}: {text}", stacklevel=3)
     return [path for path in paths if path not in others]
 
 

@@ -13,10 +13,11 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum
 from functools import cached_property
+from itertools import product
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ from semfov.data.windowed import Box, ChosenBands, LargePicture
 from semfov.errors import DataError, check_data, needing
 
 if TYPE_CHECKING:
-    from tifffile import TiffFile
+    from tifffile import TiffFile, TiffTags
 
 _NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
 """How GDAL writes the name of a band, counted from 0, into its tag."""
@@ -50,7 +51,15 @@ _MOST_PAGES = 64  # that are looked through for the first that is no thumbnail
 _MOST_LAYERS = 64  # pages that are channels of one picture
 _ROWS = 64  # of a picture that is stored in one strip, which are read at once
 _INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
-_INFLATERS: dict[int, Callable[[], Any]] = {
+
+
+class _Inflater(Protocol):
+    """A decoder that stops after a number of bytes."""
+
+    def decompress(self, data: bytes, max_length: int, /) -> bytes: ...
+
+
+_INFLATERS: dict[int, Callable[[], _Inflater]] = {
     8: zlib.decompressobj,
     32946: zlib.decompressobj,
     34925: lzma.LZMADecompressor,
@@ -72,8 +81,9 @@ class _Layer(Protocol):
 class _Page(_Layer, Protocol):
     """What is read of the page of a picture; sizes in pixels, kinds by the numbers of TIFF."""
 
-    tags: Any
+    tags: "TiffTags"
     dtype: np.dtype[Any]
+    is_reduced: bool
     imagewidth: int
     imagelength: int
     is_tiled: bool
@@ -91,7 +101,7 @@ class _Page(_Layer, Protocol):
     jpegtables: bytes | None
     subifds: Sequence[int] | None
 
-    def decode(self, data: bytes, number: int, *, jpegtables: bytes | None) -> Any: ...
+    def decode(self, data: bytes, number: int, *, jpegtables: bytes | None) -> tuple[Values, object, object]: ...
 
 
 class TiffPicture(LargePicture):
@@ -261,20 +271,19 @@ class _Tiles:
             Rows and columns in the window, and their values `(h, w, samples)`.
         """
         x1, y1, x2, y2 = box
-        for row in range(y1 // self.height, -(-y2 // self.height)):
-            for column in range(x1 // self.width, -(-x2 // self.width)):
-                tile = self._tile(row, column, channel)
-                if tile is None:
-                    continue
-                left = column * self.width
-                top = row * self.height
-                # The last tiles reach beyond the picture.
-                tile = tile[: self._size[1] - top, : self._size[0] - left]
-                rows = slice(max(y1 - top, 0), min(y2 - top, tile.shape[0]))
-                columns = slice(max(x1 - left, 0), min(x2 - left, tile.shape[1]))
-                rows_in_window = slice(top + rows.start - y1, top + rows.stop - y1)
-                columns_in_window = slice(left + columns.start - x1, left + columns.stop - x1)
-                yield rows_in_window, columns_in_window, tile[rows, columns]
+        tile_rows = range(y1 // self.height, -(-y2 // self.height))
+        tile_columns = range(x1 // self.width, -(-x2 // self.width))
+        for row, column in product(tile_rows, tile_columns):
+            tile = self._tile(row, column, channel)
+            if tile is None:
+                continue
+            left = column * self.width
+            top = row * self.height
+            # The last tiles reach beyond the picture.
+            tile = tile[: self._size[1] - top, : self._size[0] - left]
+            rows, rows_in_window = _overlap(top, tile.shape[0], y1, y2)
+            columns, columns_in_window = _overlap(left, tile.shape[1], x1, x2)
+            yield rows_in_window, columns_in_window, tile[rows, columns]
 
     def _tile(self, row: int, column: int, channel: int) -> Values | None:
         """Read a tile, `(h, w, samples)`; None for one that is not stored in the file."""
@@ -330,39 +339,65 @@ class _Tiles:
             return bytes(self._file.filehandle.read(count))
 
 
+def _overlap(place: int, length: int, start: int, stop: int) -> tuple[slice, slice]:
+    """Find what a window shows of a tile, along one side.
+
+    Args:
+        place: of the tile in the picture, in pixels.
+        length: of the tile.
+        start: of the window.
+        stop: end of the window.
+
+    Returns:
+        The pixels of the tile, and those of the window.
+    """
+    first = max(start, place)
+    end = min(stop, place + length)
+    return slice(first - place, end - place), slice(first - start, end - start)
+
+
 def _first_page(file: "TiffFile") -> _Page:
     """Find the first page that is no reduced copy, such as a thumbnail, of another one."""
-    pages: Any = file.pages
-    first = next((number for number in range(min(len(pages), _MOST_PAGES)) if not pages[number].is_reduced), 0)
-    page: _Page = pages[first]
-    return page
+    pages = cast(Sequence[_Page], file.pages)
+    for number in range(min(len(pages), _MOST_PAGES)):
+        if not pages[number].is_reduced:
+            return pages[number]
+    return pages[0]
 
 
 def _layers_of(file: "TiffFile", page: _Page) -> Sequence[_Layer]:
     """List the pages that are the channels of one picture (OME, ImageJ's composites), else the page alone."""
-    for series in file.series[:1]:
-        pages: list[Any] = list(series.pages)
-        are_channels = series.axes == "CYX" and 2 <= len(pages) <= _MOST_LAYERS and page.samplesperpixel == 1
-        if are_channels and all(layer is not None and layer.shape == page.shape for layer in pages):
-            return pages
-    return [page]
+    if not file.series:
+        return [page]
+    series = file.series[0]
+    pages = cast(Sequence[_Layer | None], series.pages)
+    # Each page is a channel (C) of rows (Y) and columns (X).
+    are_channels = series.axes == "CYX" and page.samplesperpixel == 1
+    if not are_channels or not 2 <= len(pages) <= _MOST_LAYERS:
+        return [page]
+    layers = [layer for layer in pages if layer is not None and layer.shape == page.shape]
+    return layers if len(layers) == len(pages) else [page]
 
 
 def _check_kind(page: _Page, path: Path, *, has_white: bool) -> None:
     """Raise `DataError` for a page that is left to other readers; `has_white` if its black and white are stated."""
     import tifffile
 
-    kind = "" if page.dtype is None else page.dtype.kind
-    dimensions = 2 + (page.samplesperpixel > 1)
-    # Numbers of 12 bits, and volumes, are none of these.
-    is_image = kind in "uif" and len(page.shape) == dimensions and page.bitspersample == 8 * page.dtype.itemsize
-    remedy = "give white='auto', or the values that are black and white" if is_image else "convert it"
+    remedy = "give white='auto', or the values that are black and white" if _is_image(page) else "convert it"
     has_tone = has_white or page.dtype in (np.uint8, np.uint16)
-    check_data(is_image and has_tone, path, "8 or 16 bits", f"{page.dtype} {page.shape}; {remedy}")
+    check_data(_is_image(page) and has_tone, path, "8 or 16 bits", f"{page.dtype} {page.shape}; {remedy}")
     check_data(page.photometric != PALETTE, path, "grey, RGB or bands", "a palette; convert it")
     if page.compression not in tifffile.TIFF.DECOMPRESSORS or page.predictor not in tifffile.TIFF.UNPREDICTORS:
         packing = f"{page.compression.name} compression with predictor {int(page.predictor)}"
         raise DataError(f"{path}: expected imagecodecs for {packing}; pip install imagecodecs")
+
+
+def _is_image(page: _Page) -> bool:
+    """Tell whether a page has numbers in two dimensions that NumPy has a type for, which those of 12 bits lack."""
+    if page.dtype is None or page.dtype.kind not in "uif":
+        return False
+    dimensions = 2 if page.samplesperpixel == 1 else 3
+    return len(page.shape) == dimensions and page.bitspersample == 8 * page.dtype.itemsize
 
 
 def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
@@ -378,7 +413,8 @@ def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
     # The first of the further channels that is an alpha, unless GDAL names that band otherwise.
     alphas = [first_extra + place for place, kind in enumerate(extra) if kind in (PREMULTIPLIED, UNASSOCIATED)]
     alpha = alphas[0] if alphas else None
-    if alpha in numbers.values() and "alpha" not in numbers:
+    is_named_otherwise = alpha in numbers.values() and "alpha" not in numbers
+    if is_named_otherwise:
         alpha = None
     return Description(
         path=path,

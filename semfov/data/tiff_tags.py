@@ -3,9 +3,13 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from tifffile import TiffPage
 
 SUBFILE = 254
 WIDTH = 256
@@ -54,12 +58,12 @@ class TiffTags:
     values: Mapping[int, Any]
 
     @classmethod
-    def of_image(cls, image: Any) -> "TiffTags":
+    def of_image(cls, image: "Image") -> "TiffTags":
         """Take the tags of the current page of a Pillow image; none where it is no TIFF."""
         return cls(getattr(image, "tag_v2", {}))
 
     @classmethod
-    def of_page(cls, page: Any) -> "TiffTags":
+    def of_page(cls, page: "TiffPage") -> "TiffTags":
         """Take the tags of a page of tifffile."""
         return cls({tag.code: tag.value for tag in page.tags.values()})
 
@@ -111,4 +115,5 @@ class TiffTags:
     @property
     def stored_bytes(self) -> tuple[int, ...]:
         """Bytes in the file of each tile, or strip."""
-        return self.values.get(TILE_BYTES if TILE_WIDTH in self.values else STRIP_BYTES, ())
+        counts = TILE_BYTES if TILE_WIDTH in self.values else STRIP_BYTES
+        return self.values.get(counts, ())

@@ -10,7 +10,7 @@ from functools import lru_cache
 from math import ceil, floor
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +90,8 @@ class Mosaic:
     """
 
     def __init__(self, path: Path) -> None:
+        from rasterio.control import GroundControlPoint
+        from rasterio.crs import CRS
         from rasterio.enums import ColorInterp, MaskFlags
         from rasterio.transform import Affine
 
@@ -106,10 +108,14 @@ class Mosaic:
         meanings = ColorInterp.__members__
         self.colorinterp = tuple(meanings.get(band.meaning, ColorInterp.undefined) for band in text.bands)
         is_masked = self._mask is not None or ColorInterp.alpha in self.colorinterp
-        self.mask_flag_enums = ([MaskFlags.per_dataset if is_masked else MaskFlags.all_valid],) * self.count
+        flag = MaskFlags.per_dataset if is_masked else MaskFlags.all_valid
+        self.mask_flag_enums: tuple[Sequence[MaskFlags], ...] = ([flag],) * self.count
         self.crs = text.system
-        self.transform = Affine.identity() if text.transform is None else Affine.from_gdal(*text.transform)
-        self.gcps: tuple[list[Any], None] = [], None  # a mosaic has no ground control points here
+        self.transform = Affine.identity()
+        if text.transform is not None:
+            self.transform = Affine.from_gdal(*text.transform)
+        # A mosaic has no ground control points here.
+        self.gcps: tuple[Sequence[GroundControlPoint], CRS | None] = (), None
 
     def __enter__(self) -> "Mosaic":
         return self
@@ -167,16 +173,18 @@ class Mosaic:
         x_scale = width / window.width
         y_scale = height / window.height
         is_reduced = max(x_scale, y_scale) < 1
+        resampling = options["resampling"] if is_reduced else None
         for number in _touching(band.places, box):
             source = band.sources[number]
             columns = _Side.of(source, 0, box[0], x_scale, width)
             rows = _Side.of(source, 1, box[1], y_scale, height)
             if not columns.covered or not rows.covered:
                 continue
-            values, present = self._values(source, columns, rows, options["resampling"] if is_reduced else None)
+            values, present = self._values(source, columns, rows, resampling)
             values = _as_kind(values, band.kind)
-            part = slice(rows.covered.start, rows.covered.stop), slice(columns.covered.start, columns.covered.stop)
-            canvas[part] = values if present is None else np.where(present, values, canvas[part])
+            # A view, so that what is assigned to it is written to the canvas.
+            part = canvas[rows.covered.start : rows.covered.stop, columns.covered.start : columns.covered.stop]
+            part[:] = values if present is None else np.where(present, values, part)
         return canvas
 
     def _values(
@@ -196,7 +204,9 @@ class Mosaic:
         from rasterio.enums import Resampling
         from rasterio.windows import Window
 
-        resampling = Resampling.nearest if source.discrete else (reduction or Resampling[source.resampling])
+        resampling = reduction or Resampling[source.resampling]
+        if source.discrete:
+            resampling = Resampling.nearest  # the average of two numbers of a table of colours is another colour
         options: WindowOptions = {
             "window": Window(columns.start, rows.start, columns.length, rows.length),
             "out_shape": (len(rows.inner), len(columns.inner)),
@@ -210,7 +220,8 @@ class Mosaic:
         borders = rows.border, columns.border
         if borders == ((0, 0), (0, 0)):
             return values, present
-        return np.pad(values, borders, "edge"), None if present is None else np.pad(present, borders, "edge")
+        padded_present = None if present is None else np.pad(present, borders, "edge")
+        return np.pad(values, borders, "edge"), padded_present
 
 
 def _presence(source: Source, file: Dataset, stored: Values, options: WindowOptions) -> NDArray[np.bool_] | None:
@@ -219,7 +230,9 @@ def _presence(source: Source, file: Dataset, stored: Values, options: WindowOpti
         return np.asarray(file.read_masks(source.band, **options) > 0)
     if source.nodata is None:
         return None
-    return ~np.isnan(stored) if np.isnan(source.nodata) else np.asarray(stored != source.nodata)
+    if np.isnan(source.nodata):  # which equals no number, itself included
+        return ~np.isnan(stored)
+    return np.asarray(stored != source.nodata)
 
 
 def _converted(source: Source, file: Dataset, values: Values) -> Values:
@@ -254,8 +267,10 @@ def _open_source(file: Path) -> Dataset:
 def _touching(places: NDArray[np.float64], box: tuple[float, float, float, float]) -> NDArray[np.intp]:
     """List the numbers of the places that meet a window."""
     x1, y1, x2, y2 = box
-    meets = (places[:, 0] < x2) & (places[:, 2] > x1) & (places[:, 1] < y2) & (places[:, 3] > y1)
-    return np.flatnonzero(meets)
+    left, top, right, bottom = places.T
+    meets_columns = (left < x2) & (right > x1)
+    meets_rows = (top < y2) & (bottom > y1)
+    return np.flatnonzero(meets_columns & meets_rows)
 
 
 def _as_kind(values: Values, kind: str) -> Values:

@@ -1,10 +1,10 @@
 """The text of a mosaic of files, GDAL's VRT: what it may say is listed here, and all else is refused."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree as XML
 
 import numpy as np
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from semfov.data.gdal import Dataset, check_size, check_system, driver_of
 from semfov.errors import DataError, check_data
 from semfov.io.files import inside, read_bytes
+
+if TYPE_CHECKING:
+    from rasterio.crs import CRS
 
 Rect = tuple[float, float, float, float]
 """`(x, y, width, height)` in pixels."""
@@ -121,7 +124,7 @@ class MosaicText:
     size: tuple[int, int]
     bands: tuple[Band, ...]
     mask: Band | None
-    system: Any
+    system: "CRS | None"
     transform: tuple[float, ...] | None
     has_overviews: dict[Path, bool]
 
@@ -148,21 +151,26 @@ def read_mosaic(path: Path, open_source: Callable[[Path], Dataset]) -> MosaicTex
     check_data(min(width, height) > 0, path, "a width and a height", f"{width} × {height}")
     reader = _Reader(path, (width, height), open_source)
     bands = tuple(reader.band(part) for part in parts if part.tag == "VRTRasterBand")
-    masks = [part for part in parts if part.tag == "MaskBand"]
-    mask_bands = [band for mask in masks for band in _known_parts(mask, ("VRTRasterBand",), path)]
-    mask = reader.band(mask_bands[0]) if mask_bands else None
+    mask = _mask_of(parts, reader, path)
     check_data(bool(bands), path, "at least one band", "none")
     # In proportion to all files of the mosaic, as its own text is short.
     held = path.stat().st_size + sum(file.stat().st_size for file in reader.has_overviews)
     check_size((width, height), held, path)
+    system = _first(parts, "SRS")
+    transform = _first(parts, "GeoTransform")
     return MosaicText(
         size=(width, height),
         bands=bands,
         mask=mask,
-        system=next((_system(part, path) for part in parts if part.tag == "SRS"), None),
-        transform=next((_numbers(part.text, 6, path) for part in parts if part.tag == "GeoTransform"), None),
+        system=None if system is None else _system(system, path),
+        transform=None if transform is None else _numbers(transform.text, 6, path),
         has_overviews=reader.has_overviews,
     )
+
+
+def _first(parts: Sequence[XML.Element], tag: str) -> XML.Element | None:
+    """Find the first part with a tag."""
+    return next((part for part in parts if part.tag == tag), None)
 
 
 class _Reader:
@@ -204,7 +212,8 @@ class _Reader:
     def _check_layers(self, places: NDArray[np.float64]) -> None:
         """Raise `DataError` for sources that lie over each other so often that a window would take minutes."""
         width, height = self._size
-        layers = float(np.prod(places[:, 2:] - places[:, :2], 1).sum()) / (width * height)
+        areas = np.prod(places[:, 2:] - places[:, :2], 1)
+        layers = float(areas.sum()) / (width * height)
         expected = f"sources that cover it at most {_MOST_LAYERS} times"
         check_data(layers <= _MOST_LAYERS, self._path, expected, f"as much as {layers:,.0f} times")
 
@@ -257,7 +266,8 @@ class _Reader:
         """Read the number of a source's band, and whether its mask is taken: `2`, or `mask,2`."""
         word, _, number = text.rpartition(",")
         is_band = word in ("", "mask") and number.isdecimal() and 1 <= int(number) <= raster.count
-        check_data(is_band, self._path, f"a band of {file.name} from 1 to {raster.count}", f"{text!r:.40}")
+        expected = f"a band of {file.name} from 1 to {raster.count}"
+        check_data(is_band, self._path, expected, f"{text!r:.40}")
         return int(number), word == "mask"
 
     def _rects(self, parts: dict[str, XML.Element], raster: Dataset) -> tuple[Rect, Rect]:
@@ -295,6 +305,15 @@ class _Reader:
     def _number(self, text: str) -> float:
         (number,) = _numbers(text, 1, self._path)
         return number
+
+
+def _mask_of(parts: Sequence[XML.Element], reader: _Reader, path: Path) -> Band | None:
+    """Read the mask of a mosaic: the first band in its parts of this kind, all of which are checked."""
+    bands: list[XML.Element] = []
+    for part in parts:
+        if part.tag == "MaskBand":
+            bands += _known_parts(part, ("VRTRasterBand",), path)
+    return reader.band(bands[0]) if bands else None
 
 
 def _root(path: Path) -> XML.Element:
@@ -335,7 +354,7 @@ def _picture(path: Path, name: str) -> Path:
     return file
 
 
-def _system(element: XML.Element, path: Path) -> Any:
+def _system(element: XML.Element, path: Path) -> "CRS":
     """Read the reference system of a mosaic; other words than a number or WKT may be files and addresses."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
@@ -390,5 +409,7 @@ def _cut_side(start: float, length: float, place: float, reach: float, most: int
     """
     first = min(max(start, 0.0), float(most))
     end = min(max(start + length, 0.0), float(most))
+    cut_length = end - first
     scale = reach / length
-    return first, end - first, place + (first - start) * scale, (end - first) * scale
+    cut_place = place + (first - start) * scale
+    return first, cut_length, cut_place, cut_length * scale

@@ -121,6 +121,9 @@ class LargePicture(ABC):
     Private attributes: `_has_overviews` tells whether coarse windows are read from reduced copies in the file.
     `_copies` has the copies in memory that were made so far, by their reduction: that by `_of_largest_copy`, the
     largest, is made of the picture, and each other one of the copy that is twice as large.
+
+    Invariant: the copy by r has `max(1, width // r)` × `max(1, height // r)` pixels, and once it is there, so are all
+    larger ones. What the picture shows does not change while it is open, so that no copy is made twice.
     """
 
     size: tuple[int, int]
@@ -220,14 +223,16 @@ class LargePicture(ABC):
 
     def _copy(self, reduction: int) -> Tensor:
         """Find or make a copy, without the rest of sides that are no multiples of the reduction."""
-        if reduction not in self._copies:
-            if reduction == self._of_largest_copy:
-                self._copies[reduction] = self._reduced_in_strips((0, 0, *self._size_reduced(reduction)), reduction)
-            else:
-                larger = self._copy(reduction // 2)
-                height, width = (max(1, length // 2) for length in larger.shape[1:])
-                self._copies[reduction] = resized(larger[:, : 2 * height, : 2 * width], (height, width))[0]
-        return self._copies[reduction]
+        if reduction in self._copies:
+            return self._copies[reduction]
+        if reduction == self._of_largest_copy:
+            copy = self._reduced_in_strips((0, 0, *self._size_reduced(reduction)), reduction)
+        else:
+            larger = self._copy(reduction // 2)
+            height, width = (max(1, length // 2) for length in larger.shape[1:])
+            copy = resized(larger[:, : 2 * height, : 2 * width], (height, width))[0]
+        self._copies[reduction] = copy
+        return copy
 
     def _reduced_in_strips(self, box: Box, reduction: int) -> Tensor:
         """Read and reduce a window, `(3, h, w)`, strip by strip; what is not stored is not read.
@@ -286,5 +291,6 @@ class LargePicture(ABC):
         x1, y1, x2, y2 = box
         left, top, right, bottom = self._with_border(box, reduction)
         pixels = _bytes_of(self._checked_pixels(self._around(box, reduction)))
-        part = resized(pixels, (bottom - top, right - left))[0, :, y1 - top : y2 - top, x1 - left : x2 - left]
+        with_border = resized(pixels, (bottom - top, right - left))[0]
+        part = with_border[:, y1 - top : y2 - top, x1 - left : x2 - left]
         return part.permute(1, 2, 0)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.classes import canonical_name
-from semfov.errors import DataError, check, check_number
+from semfov.errors import check, check_data, check_number
 from semfov.io.files import reading, sha256
 
 _LONGEST = 1 << 20  # characters of a line that are read at once
@@ -60,11 +60,15 @@ class WordVectors:
             DataError: the file is missing, or the line of a wanted word does not hold a vector of the common length.
             InputError: the file has none of the words.
         """
-        words = sorted({word for name in names for word in _words_of(name)})
+        wanted: set[str] = set()
+        for name in names:
+            wanted.update(_words_of(name))
+        words = sorted(wanted)
         vectors = _read_vectors(Path(path), frozenset(words))
         expected = f"a file with vectors of some of the words {', '.join(words)}"
         check(bool(vectors), "embeddings", expected, f"{path}, which has none of them")
-        return cls(vectors, [word for word in words if word not in vectors], sha256(Path(path)))
+        missing = [word for word in words if word not in vectors]
+        return cls(vectors, missing, sha256(Path(path)))
 
     def vector(self, name: str) -> Tensor:
         """Compute the mean vector of a name's words.
@@ -120,18 +124,21 @@ def _read_vectors(path: Path, wanted: frozenset[str]) -> dict[str, Tensor]:
     with reading(path), path.open(encoding="utf-8", errors="replace", newline="\n") as file:
         for number, line in enumerate(_lines(file), 1):
             word, _, rest = line.strip().partition(" ")
-            if number == 1 and word.isdigit() and rest.isdigit():
+            is_header = number == 1 and word.isdigit() and rest.isdigit()  # number of words and size, by word2vec
+            if is_header:
                 size = int(rest)
                 continue
             key = word.lower()
             # A word in lower case takes precedence; in upper case it may be a proper name.
-            if key not in wanted or (key in vectors and word != key):
+            is_less_common = key in vectors and word != key
+            if key not in wanted or is_less_common:
                 continue
             values = _numbers(rest)
-            size = len(values) if size is None else size
-            if not values or len(values) != size or not all(map(math.isfinite, values)):
-                expected = f"a word and {size or 'some'} numbers"
-                raise DataError(f"{path}, line {number}: expected {expected}, got {line[:60]!r}")
+            if size is None:
+                size = len(values)
+            is_vector = len(values) == size > 0 and all(map(math.isfinite, values))
+            expected = f"a word and {size or 'some'} numbers"
+            check_data(is_vector, f"{path}, line {number}", expected, f"{line[:60]!r}")
             vectors[key] = torch.tensor(values)
     return vectors
 
