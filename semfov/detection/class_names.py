@@ -1,8 +1,9 @@
 """Names of a detector's classes: COCO's, and outputs that do not stand for a class."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -27,6 +28,9 @@ _PLACEHOLDERS = ("", "n/a", "none", "null", "background", "__background__", "no 
 """Names of outputs that do not stand for a class, in lower case: gaps in COCO's category ids, and background."""
 
 
+_Name = TypeVar("_Name")
+
+
 class UnnamedClasses(InputError):
     """The error of a model with scores of some classes, and no names for them; `count` is the number of the classes."""
 
@@ -37,6 +41,25 @@ class UnnamedClasses(InputError):
             "beside it"
         )
         self.count = count
+
+
+def names_in_order(names: Mapping[object, _Name]) -> list[_Name] | None:
+    """List names in the order of their numbers.
+
+    Args:
+        names: by numbers from 0, which may be text, as in JSON.
+
+    Returns:
+        The names; None where their keys are other ones.
+
+    >>> names_in_order({"1": "dog", "0": "cat"})
+    ['cat', 'dog']
+    """
+    by_number = {str(number): name for number, name in names.items()}
+    numbers = [str(number) for number in range(len(by_number))]
+    if by_number.keys() != set(numbers):
+        return None
+    return [by_number[number] for number in numbers]
 
 
 def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:
@@ -52,12 +75,13 @@ def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, .
         InputError: they are no names, or two classes have one.
     """
     wrong = [name for name in classes if isinstance(name, bool) or not isinstance(name, str | int | None)]
-    remedy = "; YAML reads no, off, yes and on so: put names in quotes, or give classes="
-    check(not wrong, "classes", "names", f"{wrong[:3]}{remedy}")
+    remedy = "YAML reads no, off, yes and on so: put names in quotes, or give classes="
+    check(not wrong, "classes", "names", f"{wrong[:3]}; {remedy}")
     names = [str(name).strip() for name in classes]
     places = tuple(index for index, name in enumerate(names) if name.lower() not in _PLACEHOLDERS)
     named = tuple(names[index] for index in places)
-    check(len(set(named)) == len(named) > 0, "classes", "at least one name, all different", named)
+    are_distinct = len(set(named)) == len(named)
+    check(are_distinct and bool(named), "classes", "at least one name, all different", named)
     return named, places
 
 

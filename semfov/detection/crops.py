@@ -70,4 +70,6 @@ def _shown_in_full(boxes: Tensor, windows: Tensor, picture: Tensor, side: int) -
     border = _BORDER * (upper - lower) / side
     lowest = torch.where(lower > 0, lower + border, -torch.inf)
     highest = torch.where(upper < picture, upper - border, torch.inf)
-    return ((boxes[:, None, :2] > lowest) & (boxes[:, None, 2:] < highest)).all(-1)
+    begins_inside = boxes[:, None, :2] > lowest
+    ends_inside = boxes[:, None, 2:] < highest
+    return (begins_inside & ends_inside).all(-1)

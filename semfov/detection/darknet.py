@@ -357,6 +357,14 @@ class Darknet(nn.Module):
         # The maps of the first layers are so large that a CPU computes a batch faster one image at a time.
         self._stem = next((index for index, step in enumerate(self.steps) if step >= 8), 0)
 
+    def _run_one_by_one(self, images: Tensor, stop: int) -> dict[int, Tensor]:
+        """Run the layers before `stop` for each image of a batch by itself."""
+        runs = [self.run({-1: image}, 0, stop) for image in images.split(1)]
+        outputs = {}
+        for index in runs[0]:
+            outputs[index] = torch.cat([run[index] for run in runs])
+        return outputs
+
     def _find_last_readers(self) -> dict[int, int]:
         """Find the last layer that reads the output of each layer; itself, if none does."""
         last_reader = {index: index for index in range(-1, len(self.layers))}
@@ -376,11 +384,11 @@ class Darknet(nn.Module):
         self.check_image(image)
         image = image.contiguous(memory_format=torch.channels_last)
         outputs = {-1: image}
-        stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
-        if stem:
-            runs = [self.run({-1: single}, 0, stem) for single in image.split(1)]
-            outputs = {index: torch.cat([run[index] for run in runs]) for index in runs[0]}
-        outputs = self.run(outputs, stem, len(self.layers))
+        start = 0
+        if image.device.type == "cpu" and image.shape[0] > 1:
+            start = self._stem
+            outputs = self._run_one_by_one(image, start)
+        outputs = self.run(outputs, start, len(self.layers))
         return [outputs[index] for index in self._head_numbers()]
 
     def features(self, image: Tensor) -> Tensor:
@@ -393,9 +401,11 @@ class Darknet(nn.Module):
             `(B, C', H', W')`.
         """
         self.check_image(image)
-        head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
-        last = self.sources[self.sources[head][0]][0]
-        return self.run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, last + 1)[last]
+        image = image.contiguous(memory_format=torch.channels_last)
+        first_head = self._head_numbers()[0]
+        last_convolution = self.sources[first_head][0]
+        its_input = self.sources[last_convolution][0]
+        return self.run({-1: image}, 0, its_input + 1)[its_input]
 
     def landmarks(self) -> dict[str, int]:
         """Name maps by their place (`semfov.detection.feature_maps`).
@@ -407,11 +417,11 @@ class Darknet(nn.Module):
         origins: dict[int, int] = {}  # of layers that hand on the map of another one
         for index, (layer, sources) in enumerate(zip(self.layers, self.sources, strict=True)):
             reads = [origins.get(source, source) for source in sources]
-            hands_on = isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)
-            if hands_on and len(reads) == 1:
+            takes_all = isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)
+            if takes_all and len(reads) == 1:
                 origins[index] = reads[0]
                 continue
-            names = tuple(str(read) for read in reads if read >= 0)
+            names = tuple(str(read) for read in reads if read >= 0)  # without the image, -1
             stride = round(float(self.steps[index]))
             steps.append(NetworkStep(str(index), stride, names, isinstance(layer, Convolution)))
         return {name: int(layer) for name, layer in landmarks(steps).items()}
@@ -425,8 +435,8 @@ class Darknet(nn.Module):
         """Raise `InputError` unless the network takes images of this shape."""
         check_shape(image, "image", None, self.channels, None, None)
         height, width = image.shape[-2:]
-        multiples = all(side > 0 and side % self.stride == 0 for side in (width, height))
-        check(multiples, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
+        are_multiples = all(side > 0 and side % self.stride == 0 for side in (width, height))
+        check(are_multiples, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
 
     def run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
         """Run some layers.

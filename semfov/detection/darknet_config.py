@@ -47,8 +47,10 @@ class Section(NamedTuple):
     def integer(self, key: str, default: int | None = None, *, minimum: int = 1) -> int:
         """Read the value of `key` as one whole number, at least `minimum`."""
         expected = f"one whole number of at least {minimum}"
-        values = self._values(int, key, None if default is None else str(default), expected)
-        self.check(len(values) == 1 and values[0] >= minimum, expected, excerpt(self.options.get(key)), key)
+        text = None if default is None else str(default)
+        values = self._values(int, key, text, expected)
+        is_valid = len(values) == 1 and values[0] >= minimum
+        self.check(is_valid, expected, excerpt(self.options.get(key)), key)
         return values[0]
 
     def _values(self, kind: Callable[[str], _T], key: str, default: str | None, expected: str) -> tuple[_T, ...]:
@@ -72,16 +74,16 @@ def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
     for number, raw in enumerate(text.splitlines(), start=1):
         line = "".join(raw.split())
         where = f"{source}:{number}"
-        if not line or line[0] in "#;":
+        if not line or line.startswith(("#", ";")):
             continue
-        if line[0] == "[" and line[-1] == "]":
+        if line.startswith("[") and line.endswith("]"):
             options = {}
             sections.append(Section(line[1:-1], options, where))
-        elif "=" in line and sections:
-            key, _, value = line.partition("=")
-            options.setdefault(key, value)
-        else:
+            continue
+        key, is_option, value = line.partition("=")
+        if not is_option or not sections:
             raise DataError(f"{where}: expected [section] or key=value, got {raw.strip()[:60]!r}")
+        options.setdefault(key, value)
     return sections
 
 

@@ -32,6 +32,8 @@ _IR_VERSION = 8  # IR version from the time of opset 17; some runtimes that coul
 
 _OUTPUTS = ("boxes", "objectness", "classes")
 
+_Attribute = int | float | str | Sequence[int] | Sequence[float]
+
 
 class Graph:
     """A graph under construction. Methods that add a node return the name of its output.
@@ -45,7 +47,7 @@ class Graph:
         self.nodes: list[NodeProto] = []
         self.constants: dict[str, TensorProto] = {}
 
-    def add(self, op: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
+    def add(self, op: str, *inputs: str, output: str | None = None, **attributes: _Attribute) -> str:
         """Add a node with one output.
 
         Args:
@@ -61,7 +63,7 @@ class Graph:
         self._append(op, inputs, [name], attributes)
         return name
 
-    def add_several(self, op: str, *inputs: str, outputs: int, **attributes: Any) -> list[str]:
+    def add_several(self, op: str, *inputs: str, outputs: int, **attributes: _Attribute) -> list[str]:
         """Add a node with several outputs.
 
         Args:
@@ -181,21 +183,34 @@ class _NetworkGraph(Graph):
 
     def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
         """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""
+        # Nodes and constants are named by their order, which is a part of the bytes of a model (`_VERSION`).
         # A 0 keeps the size of the batch. Cells are last, as their number is open.
         shape = self.constant([0, len(head.anchors), 5 + head.classes, -1])
-        cells = self.add("Transpose", self.add("Reshape", source, shape), perm=[0, 3, 1, 2])
+        parts = self.add("Reshape", source, shape)
+        cells = self.add("Transpose", parts, perm=[0, 3, 1, 2])
         lengths = self.constant([2, 2, 1, head.classes])
         shift, size, objectness, classes = self.add_several("Split", cells, lengths, outputs=4, axis=3)
-        centre = self.add("Mul", self.add("Sigmoid", shift), self.constant(float(head.scale)))
-        corner = self.add("Sub", self._corners(source), self.constant((head.scale - 1) / 2))
-        centre = self.add("Mul", self.add("Add", centre, corner), self.constant(step))
-        half = self.add("Mul", self.add("Exp", size), self.constant((torch.tensor(head.anchors) / 2).float()))
-        boxes = self.add("Concat", self.add("Sub", centre, half), self.add("Add", centre, half), axis=3)
-        return (
-            self.add("Reshape", boxes, self.constant([0, -1, 4])),
-            self.add("Reshape", self.add("Sigmoid", objectness), self.constant([0, -1])),
-            self.add("Reshape", self.add("Sigmoid", classes), self.constant([0, -1, head.classes])),
-        )
+
+        share = self.add("Sigmoid", shift)
+        place_in_cell = self.add("Mul", share, self.constant(float(head.scale)))
+        cell = self._corners(source)
+        corner = self.add("Sub", cell, self.constant((head.scale - 1) / 2))
+        place = self.add("Add", place_in_cell, corner)
+        centre = self.add("Mul", place, self.constant(step))
+
+        half_anchors = (torch.tensor(head.anchors) / 2).float()
+        growth = self.add("Exp", size)
+        half = self.add("Mul", growth, self.constant(half_anchors))
+        lower = self.add("Sub", centre, half)
+        upper = self.add("Add", centre, half)
+        boxes = self.add("Concat", lower, upper, axis=3)
+
+        all_boxes = self.add("Reshape", boxes, self.constant([0, -1, 4]))
+        objectness = self.add("Sigmoid", objectness)
+        all_objectness = self.add("Reshape", objectness, self.constant([0, -1]))
+        classes = self.add("Sigmoid", classes)
+        all_classes = self.add("Reshape", classes, self.constant([0, -1, head.classes]))
+        return all_boxes, all_objectness, all_classes
 
     def _corners(self, source: str) -> str:
         """Add the column and row of every cell of a map, `(h w, 1, 2)`, for maps of any size."""
@@ -235,10 +250,12 @@ def network_model(
         names[index] = graph.layer(layer, *(names[source] for source in sources))
         if isinstance(layer, Head):
             heads.append(graph.decode(layer, names[index], float(network.steps[index])))
-    for output, parts in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
-        graph.add("Concat", *parts, output=output, axis=1)
+    for output, levels in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
+        graph.add("Concat", *levels, output=output, axis=1)
     for number in layers:
         graph.add("Identity", names[number], output=f"layer_{number}")
+
+    # Words are names of sizes that are open.
     batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
     boxes = "boxes" if size is None else None
     classes = network.heads[0].classes
@@ -246,12 +263,19 @@ def network_model(
     outputs = [helper.make_tensor_value_info(output, TensorProto.FLOAT, shapes[output]) for output in _OUTPUTS]
     outputs += [helper.make_tensor_value_info(f"layer_{number}", TensorProto.FLOAT, None) for number in layers]
     images = helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])
+    constants = list(graph.constants.values())
     return helper.make_model(
-        helper.make_graph(graph.nodes, name, [images], outputs, list(graph.constants.values())),
+        helper.make_graph(graph.nodes, name, [images], outputs, constants),
         producer_name="semfov",
         opset_imports=[helper.make_opsetid("", _OPSET)],
         ir_version=_IR_VERSION,
     )
+
+
+def _has_gradients(tensors: Sequence[Tensor]) -> bool:
+    """Tell whether derivatives of tensors are followed, backwards or forwards."""
+    follows_backwards = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return follows_backwards or any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
 class _OpenSession(NamedTuple):
@@ -265,8 +289,11 @@ class OnnxTwin:
     """A Darknet network with decoded boxes, computed by onnxruntime on a CPU.
 
     A twin computes the network of one digest. Private attributes: `_versions` are those of the parameters when their
-    digest was last compared, and `_same` is what the comparison gave; parameters of the same versions have not changed
-    since. `_opened` has the sessions of this process by the layers whose maps they return.
+    digest was last compared, and `_same` is what the comparison gave. `_opened` has the sessions of this process by the
+    layers whose maps they return.
+
+    Invariant: torch raises the version of a parameter whenever it is written to, so that parameters of `_versions` have
+    not changed since, and `_same` still holds. Sessions are of the twin's digest, never of the parameters' present one.
     """
 
     def __init__(self, digest: str, versions: tuple[object, ...] | None = None) -> None:
@@ -317,8 +344,7 @@ class OnnxTwin:
             return "graphs that are traced, and function transforms"
         if any(type(tensor) not in (Tensor, nn.Parameter) for tensor in tensors):
             return "subclasses of tensors"
-        reverse = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-        if reverse or any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors):
+        if _has_gradients(tensors):
             return "gradients"
         if canvas.device.type != "cpu":
             return f"a canvas on {canvas.device}"
@@ -338,7 +364,9 @@ class OnnxTwin:
             The boxes in canvas pixels, with their scores, and the maps by name.
         """
         network.check_image(canvas)
-        outputs = self._session(network, tuple(sorted(set(layers.values()))))(canvas.float())
+        numbers = tuple(sorted(set(layers.values())))
+        run = self._session(network, numbers)
+        outputs = run(canvas.float())
         candidates = Candidates(outputs["boxes"], outputs["classes"], outputs["objectness"])
         return candidates, {name: outputs[f"layer_{layer}"] for name, layer in layers.items()}
 

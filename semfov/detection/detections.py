@@ -152,8 +152,10 @@ class Detections:
             Detections with L = 0.
         """
         like = torch.empty(0) if like is None else like
+        boxes = like.new_zeros(batch, 0, 4)
+        scores = like.new_zeros(batch, 0, classes + 1)
         mask = torch.zeros(batch, 0, dtype=torch.bool, device=like.device)
-        return cls(like.new_zeros(batch, 0, 4), like.new_zeros(batch, 0, classes + 1), mask)
+        return cls(boxes, scores, mask)
 
     @classmethod
     def stack(cls, images: list[Self]) -> Self:

@@ -204,7 +204,8 @@ class Detector(StatedModule, ABC):
         """
         candidates, maps = self.propose_with_features(canvas, layers)
         detections = select(candidates.precise(), placement, self.selection, self.background)
-        return FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, detections)
+        height, width = canvas.shape[-2:]
+        return FeatureMaps(maps, (width, height), placement, detections)
 
     def propose_with_features(
         self, canvas: Tensor, layers: Sequence[str] | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from operator import index
-from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict
+from typing import TYPE_CHECKING, SupportsIndex, TypedDict, cast
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import supervision
 
 
-Category = Mapping[str, Any]
+Category = Mapping[str, object]
 """A category of a COCO file, with `id` and `name`."""
 
 
@@ -98,11 +98,15 @@ def category_ids(
     named = [category for category in categories if isinstance(category, Mapping)]
     if not named:
         ids = [category for category in categories if not isinstance(category, Mapping)]
-        check(all(map(_is_id, ids)), "categories", "whole numbers or texts, or categories of a file", categories[:3])
+        expected = "whole numbers or texts, or categories of a file"
+        check(all(map(_is_id, ids)), "categories", expected, categories[:3])
         return [_plain_id(value) for value in ids]
     if classes is None:
         raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
-    by_name = {canonical_name(str(category["name"])): _plain_id(category["id"]) for category in reversed(named)}
+    by_name: dict[str, int | str] = {}
+    for category in named:
+        identifier = _plain_id(cast(int | str, category["id"]))
+        by_name.setdefault(canonical_name(str(category["name"])), identifier)
     names = class_indices(classes)
     missing = [name for name in names if name not in by_name]
     check(not missing, "categories", "a category for each class", f"none for {', '.join(missing[:3])}")

@@ -104,13 +104,9 @@ def _head_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict
     if not strides:
         return {}
     order = {step.name: place for place, step in enumerate(steps)}
-    readers = Counter(read for step in steps if step.convolution for read in step.reads[:1])
-    # The backbone ends with the first map of the coarsest stride, or with the first that is finer than one it reads.
-    coarsest = max(strides.values())
-    end = min(order[name] for name, stride in strides.items() if stride == coarsest)
-    for step, read in _changes(steps, strides):
-        if strides[step.name] < strides[read]:
-            end = min(end, order[step.name])
+    end = _backbone_end(steps, strides, order)
+    # The first tensor that a convolution reads is its map; the others are weights.
+    readers = Counter(step.reads[0] for step in steps if step.convolution and step.reads)
     maps: dict[int, str] = {}
     for name, stride in strides.items():
         if not readers[name] or order[name] < end:
@@ -119,6 +115,23 @@ def _head_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict
         if readers[name] > 1 or readers[maps.get(stride, name)] == 1:
             maps[stride] = name
     return maps
+
+
+def _backbone_end(steps: Sequence[NetworkStep], strides: Mapping[str, int], order: Mapping[str, int]) -> int:
+    """Find where the backbone ends: at the first map of the coarsest stride, or at the first finer than one it reads.
+
+    Args:
+        steps: of the network.
+        strides: of its maps, by name.
+        order: places of the maps in `steps`, by name.
+
+    Returns:
+        The place.
+    """
+    coarsest = max(strides.values())
+    ends = [order[name] for name, stride in strides.items() if stride == coarsest]
+    ends += [order[step.name] for step, read in _changes(steps, strides) if strides[step.name] < strides[read]]
+    return min(ends)
 
 
 def stride_of(canvas: int, side: int) -> int:

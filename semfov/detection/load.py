@@ -11,7 +11,7 @@ from typing import Any, cast
 import torch
 from torch import nn
 
-from semfov.detection.class_names import COCO_CLASSES
+from semfov.detection.class_names import COCO_CLASSES, names_in_order
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import ARCHITECTURES, read_cfg
 from semfov.detection.detector import Detector
@@ -130,21 +130,22 @@ def _load(load: _Loader, model: str | nn.Module, description: str, options: dict
         description: what messages call the model.
         options: options of the loader, and of all detectors.
     """
-    of_loader = _options_of(load)
-    check_options(options, [*of_loader, *_COMMON], f"semfov.load_detector for {description}")
+    names_of_loader = _options_of(load)
+    check_options(options, [*names_of_loader, *_COMMON], f"semfov.load_detector for {description}")
     if options.get("classes") is not None:
         options = {**options, "classes": given_names(options["classes"])}
     if "device" in options:
         _check_is_device(options["device"])
-    selecting = {name: value for name, value in options.items() if name in _SELECTING}
-    Selection(**selecting)  # what is wrong is told before a network is loaded
-    detector = load(model, **{name: value for name, value in options.items() if name in of_loader})
+    selection = {name: value for name, value in options.items() if name in _SELECTING}
+    Selection(**selection)  # what is wrong is told before a network is loaded
+    loader_options = {name: value for name, value in options.items() if name in names_of_loader}
+    detector = load(model, **loader_options)
     # What is not given stays as the loader has set it, such as `per_class` in the settings of an ONNX file.
-    detector.selection = replace(detector.selection, **selecting)
+    detector.selection = replace(detector.selection, **selection)
     if options.get("background") is not None:
         detector.background = options["background"]
     device = options.get("device")
-    if device is None or "device" in of_loader:
+    if device is None or "device" in names_of_loader:
         return detector
     # Tensors on `meta` have no values, so a device cannot be tried out there.
     if torch.device(device).type != "meta":
@@ -270,14 +271,18 @@ def load_yolo(
         name = lookup(name_or_cfg, ARCHITECTURES, "detector")
         sections = ARCHITECTURES[name]()
     network = Darknet(sections).to(dtype).requires_grad_(False)
-    digest = network.read_weights(fetch(name) if weights is None else weights)
+    weights_file = fetch(name) if weights is None else weights
+    digest = network.read_weights(weights_file)
     # Convolutions on a CPU are faster in this order of memory.
     network.to(memory_format=torch.channels_last)
+    names = COCO_CLASSES if classes is None else tuple(classes)
+    if isinstance(input_size, int):
+        input_size = input_size, input_size
     detector = YoloV3(
         network,
-        COCO_CLASSES if classes is None else tuple(classes),
+        names,
         name=name,
-        input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
+        input_size=input_size,
         stride=stride,
         digest=digest,
         runtime=runtime,
@@ -301,15 +306,22 @@ def given_names(classes: object) -> tuple[str, ...]:
     """
     expected = "names in the order of the scores, in a list"
     if isinstance(classes, str | PathLike):
-        text = fspath(classes)
-        if isinstance(classes, PathLike) or Path(text).suffix in (".txt", ".names") or Path(text).is_file():
-            return tuple(line.strip() for line in read_text(text).splitlines() if line.strip())
-        return tuple(name.strip() for name in text.split(","))
+        return _names_in_text(classes)
     if isinstance(classes, Mapping):
-        by_number = {str(number): name for number, name in classes.items()}
-        numbers = [str(number) for number in range(len(by_number))]
-        from_zero = {*numbers} == {*by_number}
-        check(from_zero, "classes", f"{expected}, or by numbers from 0", f"numbers {[*by_number][:5]}")
-        return tuple(by_number[number] for number in numbers)
+        names: list[str] | None = names_in_order(classes)
+        if names is None:
+            numbers = [str(number) for number in classes]
+            raise InputError(f"classes: expected {expected}, or by numbers from 0, got numbers {numbers[:5]}")
+        return tuple(names)
     check(not isinstance(classes, Set), "classes", expected, f"a {type(classes).__name__}, which has no order")
     return tuple(cast(Iterable[str], classes))
+
+
+def _names_in_text(text: str | PathLike[str]) -> tuple[str, ...]:
+    """Read class names in a text with commas, or in a file with a name a line."""
+    words = fspath(text)
+    is_path = isinstance(text, PathLike) or Path(words).suffix in (".txt", ".names")
+    if is_path or Path(words).is_file():
+        lines = [line.strip() for line in read_text(words).splitlines()]
+        return tuple(line for line in lines if line)
+    return tuple(name.strip() for name in words.split(","))

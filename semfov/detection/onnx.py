@@ -15,7 +15,7 @@ from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_clas
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import choose_layers, landmarks
 from semfov.detection.onnx_cells import Canvas
-from semfov.detection.onnx_check import check_file
+from semfov.detection.onnx_check import check_file, places_of_weights
 from semfov.detection.onnx_file import OnnxSettings, check_canvas, names_beside, read_settings, with_input_size
 from semfov.detection.onnx_heads import HEADS, explain_misplacement, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
@@ -434,10 +434,11 @@ def _model_digest(path: Path) -> str:
     import onnx
 
     tensors = onnx.load(path, load_external_data=False).graph.initializer
-    places = {entry.value for tensor in tensors for entry in tensor.external_data if entry.key == "location"}
+    places = places_of_weights(tensors)
     if not places:
         return sha256(path)
-    return json_sha256([sha256(path), *(sha256(inside(path.parent, place)) for place in sorted(places))])
+    files = [inside(path.parent, place) for place in sorted(places)]
+    return json_sha256([sha256(path), *map(sha256, files)])
 
 
 def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -> Canvas:
@@ -458,9 +459,10 @@ def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -
 def _sides(input_size: int | Sequence[int]) -> Canvas:
     """Complete one side, or two, to `(width, height)`."""
     size = (input_size, input_size) if isinstance(input_size, int) else tuple(input_size)
-    valid = len(size) == 2 and all(isinstance(side, int) and side > 0 for side in size)
-    check(valid, "input_size", "(width, height) in pixels", excerpt(size))
-    return size[0], size[1]
+    are_sides = len(size) == 2 and all(isinstance(side, int) and side > 0 for side in size)
+    check(are_sides, "input_size", "(width, height) in pixels", excerpt(size))
+    width, height = size
+    return width, height
 
 
 def _unstated_names(nearby: Sequence[str] | None, count: int, file: Path) -> Sequence[str]:

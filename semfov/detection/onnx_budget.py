@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
 from semfov.errors import check_data
 from semfov.io.schema import excerpt
@@ -33,6 +34,7 @@ _OF_SHAPES = frozenset(
 _LENGTHS = {"Shape": 8, "Constant": _SMALL, "Range": math.inf}  # of what such operations make
 
 _Sizes = tuple[int, ...]
+_Value = TypeVar("_Value")
 
 
 class _Limit(NamedTuple):
@@ -82,24 +84,24 @@ class Budget:
         slim = without_weights(model)
         _forget_stated_sizes(slim.graph, canvas)
         # Inference follows the values of shapes one by one, also where a model lets them grow without an end.
-        short = _longest_shape(slim.graph, {}) <= _MOST_LENGTH
-        inferred = onnx.shape_inference.infer_shapes(slim, data_prop=short).graph
+        is_short = _longest_shape(slim.graph, {}) <= _MOST_LENGTH
+        inferred = onnx.shape_inference.infer_shapes(slim, data_prop=is_short).graph
         sizes: dict[str, _Sizes] = {}
-        kinds: dict[str, int] = {}
+        widths: dict[str, int] = {}
         for value in (*inferred.value_info, *inferred.input, *inferred.output):
-            kind = value.type.tensor_type
             stated = dims(value)
             check_elements(f"{name}: tensor {excerpt(value.name)}", stated)
-            if kind.HasField("shape") and all(side.HasField("dim_value") for side in kind.shape.dim):
+            if _has_known_sizes(value):
                 sizes[value.name] = tuple(stated)
-                kinds[value.name] = kind.elem_type
+                widths[value.name] = _width(value.type.tensor_type.elem_type)
         for tensor in inferred.initializer:
             sizes[tensor.name] = tuple(tensor.dims)
-            kinds[tensor.name] = tensor.data_type
+            widths[tensor.name] = _width(tensor.data_type)
         for sparse in model.graph.sparse_initializer:
+            # Its values are those that are not 0; a node that reads it reads them all.
             sizes[sparse.values.name] = tuple(sparse.dims)
-            kinds[sparse.values.name] = sparse.values.data_type
-        return Budget(name, model.graph, sizes, {key: _width(kind) for key, kind in kinds.items()})
+            widths[sparse.values.name] = _width(sparse.values.data_type)
+        return Budget(name, model.graph, sizes, widths)
 
     def check(self, stored: int) -> None:
         """Check what a pass takes.
@@ -111,13 +113,15 @@ class Budget:
             DataError: it takes more bytes or more work than a model with such files may.
         """
         self._check_limit(self.bytes(), _MOST_BYTES, "bytes of tensors together", stored)
-        self._check_limit(sum(map(self._work, self.graph.node)), _MOST_WORK, "multiplications of a pass", stored)
+        work = sum(map(self._work, self.graph.node))
+        self._check_limit(work, _MOST_WORK, "multiplications of a pass", stored)
 
     def _check_limit(self, got: int, limit: _Limit, unit: str, stored: int) -> None:
         """Raise `DataError` where a model takes more than its files allow."""
         most = limit.base + limit.per_byte * stored
+        expected = f"at most {most:,} {unit}, for {stored:,} stored"
         remedy = "give a smaller input_size, or replace the file"
-        check_data(got <= most, self.name, f"at most {most:,} {unit}, for {stored:,} stored", f"{got:,}; {remedy}")
+        check_data(got <= most, self.name, expected, f"{got:,}; {remedy}")
 
     def is_open(self) -> bool:
         """Tell whether sizes or work depend on values, or on operations that only onnxruntime knows."""
@@ -133,29 +137,36 @@ class Budget:
 
         onnxruntime computes the former once, and keeps them all until it has done so.
         """
-        nodes = self.graph.node
-        last_reader = {name: place for place, node in enumerate(nodes) for name in _read(node)}
-        last_reader |= {output.name: len(nodes) for output in self.graph.output}
+        last_readers = self._last_readers()
         stored = {tensor.name for tensor in self.graph.initializer}
         sparse = {tensor.values.name for tensor in self.graph.sparse_initializer}
         of_image = {value.name for value in self.graph.input} - stored - sparse
         constant = sum(map(self._bytes, sparse))
         now = sum(map(self._bytes, of_image))
         most = now
-        released: dict[int, int] = {}  # bytes by the place of the node after which nothing reads them
-        for place, node in enumerate(nodes):
+        released: Counter[int] = Counter()  # bytes by the place of the node after which nothing reads them
+        for place, node in enumerate(self.graph.node):
             new = sum(map(self._bytes, node.output))
             if of_image.isdisjoint(_read(node)):
                 constant += new
                 continue
             of_image.update(node.output)
             for output in node.output:
-                end = last_reader.get(output, place)
-                released[end] = released.get(end, 0) + self._bytes(output)
+                end = last_readers.get(output, place)
+                released[end] += self._bytes(output)
             now += new
             most = max(most, now + self._workspace(node))
-            now -= released.pop(place, 0)
+            now -= released[place]
         return constant + most
+
+    def _last_readers(self) -> dict[str, int]:
+        """Find the place of the last node that reads each tensor; outputs of the model are read after all nodes."""
+        nodes = self.graph.node
+        last_readers: dict[str, int] = {}
+        for place, node in enumerate(nodes):
+            last_readers.update(dict.fromkeys(_read(node), place))
+        last_readers.update({output.name: len(nodes) for output in self.graph.output})
+        return last_readers
 
     def _bytes(self, name: str) -> int:
         """Compute the bytes of a tensor; 0 where its sizes are unknown."""
@@ -163,10 +174,15 @@ class Budget:
 
     def _workspace(self, node: NodeProto) -> int:
         """Compute the bytes that a transposed convolution makes of its input before it sums: all weights a place."""
-        if node.op_type != "ConvTranspose" or not self.sizes.keys() >= {*node.input[:2]}:
+        inputs = node.input[:2]
+        are_known = self.sizes.keys() >= {*inputs}
+        if node.op_type != "ConvTranspose" or not are_known:
             return 0
-        image, weights = (self.sizes[name] for name in node.input[:2])
-        return math.prod(image[2:]) * math.prod(weights[1:]) * self.widths[node.input[0]]
+        # Image `(B, C, H, W)`, weights `(C, M, h, w)`.
+        image, weights = (self.sizes[name] for name in inputs)
+        places = math.prod(image[2:])
+        numbers_a_place = math.prod(weights[1:])
+        return places * numbers_a_place * self.widths[inputs[0]]
 
     def _work(self, node: NodeProto) -> int:
         """Count the multiplications of a node, or the numbers that it reads and writes where these are more."""
@@ -266,13 +282,13 @@ _PRODUCTS: dict[str, _Products] = {
 """Multiplications of the operations that read their inputs more than once."""
 
 
-def _attribute(node: NodeProto, name: str, otherwise: Any) -> Any:
-    """Read an attribute of a node, or a value for nodes without it."""
+def _attribute(node: NodeProto, name: str, otherwise: _Value) -> _Value:
+    """Read an attribute of a node, or a value of the same type for nodes without it."""
     import onnx
 
     for attribute in node.attribute:
         if attribute.name == name:
-            return onnx.helper.get_attribute_value(attribute)
+            return cast(_Value, onnx.helper.get_attribute_value(attribute))
     return otherwise
 
 
@@ -339,6 +355,12 @@ def dims(value: ValueInfoProto) -> list[int]:
         The sizes; unknown ones count as 1.
     """
     return [side.dim_value if side.HasField("dim_value") else 1 for side in value.type.tensor_type.shape.dim]
+
+
+def _has_known_sizes(value: ValueInfoProto) -> bool:
+    """Tell whether a tensor has a shape, and all its sizes are numbers."""
+    kind = value.type.tensor_type
+    return kind.HasField("shape") and all(side.HasField("dim_value") for side in kind.shape.dim)
 
 
 def _width(kind: int) -> int:

@@ -73,16 +73,32 @@ def _tensors(message: Message) -> Iterator[TensorProto]:
     if isinstance(message, onnx.SparseTensorProto):
         yield onnx.TensorProto(name=message.values.name, dims=message.dims)
     for field, value in message.ListFields():
-        if field.message_type is not None and field.message_type.name in _HOLDERS:
-            repeated = not hasattr(value, "ListFields")
-            for part in value if repeated else [value]:
-                yield from _tensors(part)
+        if field.message_type is None or field.message_type.name not in _HOLDERS:
+            continue
+        is_repeated = not hasattr(value, "ListFields")
+        for part in value if is_repeated else [value]:
+            yield from _tensors(part)
+
+
+def places_of_weights(tensors: Iterable[TensorProto]) -> set[str]:
+    """Name the files, relative to that of the model, which hold weights that are not in the model's own.
+
+    Args:
+        tensors: the stored tensors of the model.
+
+    Returns:
+        The names.
+    """
+    places: set[str] = set()
+    for tensor in tensors:
+        # Where, at which offset and how long: entries by key (ONNX IR, external tensor data).
+        places.update(entry.value for entry in tensor.external_data if entry.key == "location")
+    return places
 
 
 def _files_of_weights(folder: Path, stored: Iterable[TensorProto]) -> Iterator[Path]:
     """List the files of weights beside a model, which must lie in its folder."""
-    places = {entry.value for tensor in stored for entry in tensor.external_data if entry.key == "location"}
-    for place in places:
+    for place in places_of_weights(stored):
         file = inside(folder, place)
         with reading(file):
             file.stat()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import yaml
 
+from semfov.detection.class_names import names_in_order
 from semfov.detection.onnx_cells import STRIDES, Canvas, cells
 from semfov.detection.onnx_check import check_file
 from semfov.detection.scores import BackgroundPolicy
@@ -131,7 +132,9 @@ def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
         The file of the settings.
     """
     settings_file = path.with_suffix(".json")
-    stored: dict[str, Any] = json.loads(read_text(settings_file, most=_MOST_BYTES)) if settings_file.exists() else {}
+    stored: dict[str, Any] = {}
+    if settings_file.exists():
+        stored = json.loads(read_text(settings_file, most=_MOST_BYTES))
     chosen = {name: value for name, value in options.items() if name in _SETTINGS.keys}
     settings = {**stored, **chosen}
     _state_both_sides(settings)
@@ -151,11 +154,11 @@ def names_beside(path: Path) -> list[str] | None:
     Returns:
         The names; None where there is no such file.
     """
-    for name in ("data.yaml", "classes.txt"):
+    for name, read_names in _NAMES_BESIDE.items():
         names_file = path.with_name(name)
         if names_file.is_file():
             text = read_text(names_file, most=_MOST_BYTES)
-            names = _texts(_data_names(text) if name == "data.yaml" else text.splitlines())
+            names = _texts(read_names(text))
             if names and all(map(is_plain, names)):
                 return names
     return None
@@ -167,18 +170,24 @@ def _data_names(text: str) -> list[str | int]:
         content = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError):
         return []
-    return _listed(content.get("names") if isinstance(content, Mapping) else None)
+    return _listed(content.get("names")) if isinstance(content, Mapping) else []
+
+
+_NAMES_BESIDE: dict[str, Callable[[str], list[str | int] | list[str]]] = {
+    "data.yaml": _data_names,
+    "classes.txt": str.splitlines,
+}
+"""Files beside a model with the names of classes, in the order in which they are looked for, and how they are read."""
 
 
 def _listed(names: object) -> list[str | int]:
     """List names that are in a list, or by numbers from 0; none where they are neither."""
     if isinstance(names, Mapping):
-        by_number = {str(number): name for number, name in names.items()}
-        numbers = [str(number) for number in range(len(by_number))]
-        names = [by_number[number] for number in numbers] if {*numbers} == {*by_number} else []
-    if isinstance(names, list | tuple) and all(isinstance(name, str | int) for name in names):
-        return list(names)
-    return []
+        names = names_in_order(names)
+    if not isinstance(names, list | tuple):
+        return []
+    are_names = all(isinstance(name, str | int) for name in names)
+    return list(names) if are_names else []
 
 
 def _texts(names: list[str | int] | list[str]) -> list[str]:
@@ -195,7 +204,8 @@ def _names_of_exporter(metadata: Mapping[str, str]) -> OnnxSettings:
         try:
             names = _listed(ast.literal_eval(text))
         except (ValueError, SyntaxError, RecursionError, MemoryError):
-            names = text.split("\n" if "\n" in text.strip() else ",")
+            separator = "\n" if "\n" in text.strip() else ","
+            names = text.split(separator)
         names = _texts(names)
         if len(names) > 1 and all(map(is_plain, names)):
             return {"classes": names}
@@ -265,13 +275,21 @@ def _resize_shapes(graph: onnx.GraphProto, size: Canvas, canvas: Canvas) -> None
     """Replace the sizes of maps of one canvas by those of another in the constants that `Reshape` nodes read."""
     from onnx import numpy_helper
 
-    maps = {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
-    shape_names = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
+    new_sizes = {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
     constants = {tensor.name: tensor for tensor in graph.initializer}
-    constants |= {node.output[0]: node.attribute[0].t for node in graph.node if node.op_type == "Constant"}
+    shape_names: set[str] = set()
+    for node in graph.node:
+        if node.op_type == "Reshape":
+            shape_names.add(node.input[1])
+        elif node.op_type == "Constant":
+            constants[node.output[0]] = node.attribute[0].t
     for name in shape_names & constants.keys():
-        shape = numpy_helper.to_array(constants[name]).copy()
-        if len(shape) > 2 and (int(shape[-1]), int(shape[-2])) in maps:
-            columns, rows = maps[int(shape[-1]), int(shape[-2])]
+        tensor = constants[name]
+        shape = numpy_helper.to_array(tensor).copy()
+        if len(shape) <= 2:
+            continue
+        old_size = int(shape[-1]), int(shape[-2])
+        if old_size in new_sizes:
+            columns, rows = new_sizes[old_size]
             shape[-2:] = rows, columns
-            constants[name].CopyFrom(numpy_helper.from_array(shape, constants[name].name))
+            tensor.CopyFrom(numpy_helper.from_array(shape, tensor.name))

@@ -8,8 +8,8 @@ between pixels (0 is the left edge of the canvas).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -70,7 +70,7 @@ class Head(ABC):
     least: ClassVar[float] = LEAST
     selects: ClassVar[bool] = False
 
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if "name" in vars(cls):
             HEADS[cls.name] = cls()
@@ -132,11 +132,16 @@ def recognise(signature: Signature, run: Callable[[], _Outputs] | None = None) -
     # Outputs with YOLOX's own names are YOLOX's, even where the values do not tell which form they have.
     if len(names) == 1 or names == ["yolox", "yolox-decoded"]:
         return names[0]
+    raise InputError(_unrecognised(signature, names))
+
+
+def _unrecognised(signature: Signature, names: Sequence[str]) -> str:
+    """Write that no head fits a signature for certain, or that several do, and what to do."""
     shapes = ", ".join(f"{name} {shape}" for name, shape in signature.outputs)
     width, height = signature.canvas
     count = "" if signature.classes is None else f" with {signature.classes} classes"
     candidates = f"{' and '.join(names)} fit" if names else "no head fits with certainty"
-    raise InputError(
+    return (
         f"outputs {shapes} on a {width} x {height} canvas{count}: {candidates}; "
         f"name the head with head=, one of {', '.join(sorted(HEADS))}"
     )

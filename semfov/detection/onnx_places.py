@@ -30,23 +30,33 @@ def misplacement(boxes: Tensor, canvas: Canvas) -> str | None:
         return None
     if not bool(rows.isfinite().all()):
         return "boxes that are not finite"
+    return _misreading(rows, canvas)
+
+
+def _misreading(rows: Tensor, canvas: Canvas) -> str | None:
+    """Describe which other form boxes `(N, 4)` seem to have that were read as corners in canvas pixels."""
     lower = rows[:, :2]
     upper = rows[:, 2:]
     size = rows.new_tensor(canvas)
     middle = (lower + upper) / 2
-    crossed = (upper < lower).any(-1).double().mean()
-    outside = ((middle - size / 2).abs() > size).any(-1).double().mean()
-    reason = None
     if float(rows.abs().max()) <= _LARGEST_FRACTION < min(canvas):
-        reason = "fractions of the canvas instead of pixels"
-    elif float(crossed) >= _MISPLACED_SHARE:
-        reason = "boxes whose right or lower edge comes first"
-    elif _spread_out(middle, size) and bool((upper >= 3 * lower).all()):
-        reason = "corners of boxes that were read as their centres and sizes"
-    elif float(outside) >= _MISPLACED_SHARE:
+        return "fractions of the canvas instead of pixels"
+    if _share((upper < lower).any(-1)) >= _MISPLACED_SHARE:
+        return "boxes whose right or lower edge comes first"
+    # Corners `(x1, y1, x2, y2)` read as centre and size give the corners `x1 ± x2 / 2`, of which the upper one is at
+    # least three times the lower one, as x2 is at least x1.
+    if _spread_out(middle, size) and bool((upper >= 3 * lower).all()):
+        return "corners of boxes that were read as their centres and sizes"
+    is_outside = ((middle - size / 2).abs() > size).any(-1)
+    if _share(is_outside) >= _MISPLACED_SHARE:
         place = middle.median(0).values.round().long().tolist()
-        reason = f"boxes around {place}, outside the canvas"
-    return reason
+        return f"boxes around {place}, outside the canvas"
+    return None
+
+
+def _share(condition: Tensor) -> float:
+    """Find the share of boxes that meet a condition, `(N,)`."""
+    return float(condition.double().mean())
 
 
 def axes_exchanged(boxes: Tensor, canvas: Canvas) -> bool:

@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from functools import cache, partial
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ _LAST_SECONDS = 5.0  # for which the end of the process waits for an operation t
 _MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 _MOST_BATCH = 1024  # largest fixed batch size of a model
 
-Provider = str | tuple[str, Mapping[str, Any]]
+Provider = str | tuple[str, Mapping[str, object]]
 """An execution provider of onnxruntime: its name, alone or with its options."""
 
 _Sizes = tuple[int | None, ...]
@@ -204,21 +204,26 @@ class OnnxSession:
             DataError: the model fails.
         """
         batch = image.shape[0]
-        fixed = self.shape[0]
         check(batch > 0, "image", "at least one image", batch)
-        size = batch if fixed is None else fixed
         source = image.detach().to(device="cpu", dtype=self._inputs.dtype)
+        size = self._images_a_run(batch)
         missing = -batch % size
-        if missing:
+        if missing:  # a fixed batch is filled up with the last image
             source = torch.cat([source, source[-1:].expand(missing, -1, -1, -1)])
-        if self.open_ended and fixed is None:
-            size = 1  # so that an image has all the memory
         runs = [self._run(part.contiguous()) for part in source.split(size)]
         outputs = {}
         for name, _ in self.outputs:
-            rows = runs[0][name] if len(runs) == 1 else torch.cat([run[name] for run in runs])
+            parts = [run[name] for run in runs]
+            rows = parts[0] if len(parts) == 1 else torch.cat(parts)  # one part needs no copy
             outputs[name] = rows[:batch].to(image)
         return outputs
+
+    def _images_a_run(self, batch: int) -> int:
+        """Choose how many images of a batch run at once."""
+        fixed = self.shape[0]
+        if fixed is not None:
+            return fixed
+        return 1 if self.open_ended else batch  # of an open-ended model, an image has all the memory
 
     def _run(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model once, on images `(B, 3, H, W)` on the CPU in the dtype of its input."""
@@ -274,13 +279,15 @@ class OnnxSession:
         Returns:
             Outputs by name: zeros where the model states all shapes, else the outputs of a run.
         """
-        stated = {name: [size for size in shape[1:] if size is not None] for name, shape in self.outputs}
-        for name, sizes in stated.items():
-            check_elements(f"{self.path.name}: output {name!r}", sizes)
-        # The first size is that of the batch.
-        all_stated = all(shape and None not in shape[1:] for _, shape in self.outputs)
-        if all_stated and not self.open_ended:
-            return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
+        shapes: dict[str, list[int]] = {}
+        are_stated = True
+        for name, shape in self.outputs:
+            sizes = shape[1:]  # the first one is that of the batch
+            shapes[name] = [size for size in sizes if size is not None]
+            check_elements(f"{self.path.name}: output {name!r}", shapes[name])
+            are_stated = are_stated and bool(shape) and None not in sizes
+        if are_stated and not self.open_ended:
+            return {name: torch.zeros(1, *sizes) for name, sizes in shapes.items()}
         width, height = size
         return self(torch.zeros(1, 3, height, width))
 
@@ -305,13 +312,14 @@ class OnnxSession:
         steps = []
         of_image = {self.image}  # tensors that are computed from the image; others are stored weights, and no maps
         for node in graph.node:
-            if of_image.intersection(node.input):
+            reads = tuple(node.input)
+            if not of_image.isdisjoint(reads):
                 of_image.update(node.output)
             for output in node.output:
                 shape = shapes.get(output, [])
                 is_map = output in of_image and len(shape) == 4 and min(shape[2:]) > 1
                 stride = stride_of(canvas[0], shape[3]) if is_map else None
-                steps.append(NetworkStep(output, stride, tuple(node.input), node.op_type == "Conv"))
+                steps.append(NetworkStep(output, stride, reads, node.op_type == "Conv"))
         return steps
 
 
@@ -359,17 +367,22 @@ def _chosen_providers(device: torch.device, providers: Sequence[Provider] | None
 
     available = ort.get_available_providers()
     if providers is not None:
-        names = [provider if isinstance(provider, str) else provider[0] for provider in providers]
-        missing = [name for name in names if name not in available]
-        got = ", ".join(missing) or "none"
-        check(bool(names) and not missing, "providers", f"some of {', '.join(available)}", got)
+        _check_providers(providers, available)
         return list(providers)
     if device.type == "cpu":
         return ["CPUExecutionProvider"]
-    provider = f"{device.type.upper()}ExecutionProvider"
+    provider = f"{device.type.upper()}ExecutionProvider"  # as onnxruntime names them: CUDAExecutionProvider
     got = f"{device} (its providers: {', '.join(available)})"
     check(provider in available, "device", "a device that onnxruntime can use", got)
     return [(provider, {"device_id": device.index or 0}), "CPUExecutionProvider"]
+
+
+def _check_providers(providers: Sequence[Provider], available: Sequence[str]) -> None:
+    """Raise `InputError` for providers that onnxruntime does not have here."""
+    names = [provider if isinstance(provider, str) else provider[0] for provider in providers]
+    missing = [name for name in names if name not in available]
+    got = ", ".join(missing) or "none"
+    check(bool(names) and not missing, "providers", f"some of {', '.join(available)}", got)
 
 
 def _sizes(shape: Sequence[int | str | None]) -> _Sizes:

@@ -177,7 +177,10 @@ def _overlaps(boxes: NDArray[np.floating], others: NDArray[np.floating], iou: fl
     """Tell whether the intersection over union of each two boxes is above a limit; boxes `(M, 4)`, others `(N, 4)`."""
     x1, y1, x2, y2 = boxes.T[:, :, None]
     left, top, right, bottom = others.T[:, None]
-    intersection = (np.minimum(x2, right) - np.maximum(x1, left)).clip(0)
-    intersection *= (np.minimum(y2, bottom) - np.maximum(y1, top)).clip(0)
-    union = (x2 - x1) * (y2 - y1) + (right - left) * (bottom - top) - intersection
-    return intersection > iou * union
+    width = np.minimum(x2, right) - np.maximum(x1, left)
+    height = np.minimum(y2, bottom) - np.maximum(y1, top)
+    intersection = width.clip(0) * height.clip(0)
+    area = (x2 - x1) * (y2 - y1)
+    other_area = (right - left) * (bottom - top)
+    union = area + other_area - intersection
+    return intersection > iou * union  # without a division, which an empty union would not allow

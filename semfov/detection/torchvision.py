@@ -65,14 +65,15 @@ class TorchvisionDetector(ModuleDetector):
         decoder, softmax = _decoder_of(model)
         check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
         transform: _Model = model.transform
-        fixed = transform.fixed_size
+        has_fixed_size = transform.fixed_size is not None
+        canvas = tuple(transform.fixed_size) if has_fixed_size else (transform.max_size, transform.max_size)
         super().__init__(
             model,
             classes,
             name,
-            (transform.max_size, transform.max_size) if fixed is None else tuple(fixed),
+            canvas,
             background="own" if softmax else "residual",
-            stretch=fixed is not None,
+            stretch=has_fixed_size,
             digest=module_digest(model) if digest is None else digest,
         )
         self.first = first

@@ -26,6 +26,7 @@ _IMAGENET = ("detr", "table-transformer", "yolos", "conditional_detr", "deformab
 _EDGES = {"shortest_edge": 800, "longest_edge": 1333}
 _MOST = ("max_height", "max_width")
 _SQUARE = {"height": 640, "width": 640}
+_FORMS_OF_SIZE = ({"height", "width"}, {*_MOST}, {*_EDGES}, {"shortest_edge"}, {"longest_edge"})
 _LARGEST = 65_536  # side of a canvas in pixels
 _MOST_REASON = 300  # largest number of characters of a reason that a message has
 
@@ -56,11 +57,12 @@ class TransformersDetector(ModuleDetector):
         if classes is None:
             classes = [config.id2label[index] for index in sorted(config.id2label)]
         # A model of another kind that is trained without focal loss would have a softmax, too.
-        softmax = config.model_type in _SOFTMAX
-        focal = getattr(config, "use_focal_loss", True)
+        has_softmax = config.model_type in _SOFTMAX
+        has_focal_loss = getattr(config, "use_focal_loss", True)
         settings = _with_usual_settings(processor or {}, config.model_type)
         size = _processor_size(settings)
-        check(bool(focal) or softmax, "model", "scores trained with focal loss", f"use_focal_loss={focal}")
+        is_known = bool(has_focal_loss) or has_softmax
+        check(is_known, "model", "scores trained with focal loss", f"use_focal_loss={has_focal_loss}")
         resizes = bool(settings.get("do_resize", True))
         stretches = resizes and "height" in size
         super().__init__(
@@ -68,13 +70,13 @@ class TransformersDetector(ModuleDetector):
             classes,
             config.model_type if name is None else name,
             _largest_canvas(size),
-            background="own" if softmax else "residual",
+            background="own" if has_softmax else "residual",
             stretch=stretches,
             digest=module_digest(model),
         )
         self.resizes = resizes
         self.limits = None if stretches else size
-        self.softmax = softmax
+        self.softmax = has_softmax
         self.preprocessing = _preprocessing_of(settings, stretch=stretches)
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
@@ -187,17 +189,18 @@ def _preprocessing_of(settings: ProcessorSettings, *, stretch: bool) -> Preproce
 def _processor_size(settings: ProcessorSettings) -> dict[str, int]:
     """Read the size of an image processor as a mapping; older settings give it as a number or `(height, width)`."""
     stated = settings["size"]
-    if isinstance(stated, int):
-        stated = {"shortest_edge": stated, "longest_edge": settings.get("max_size")}
+    sides: Mapping[str, int | None] = {}
+    if isinstance(stated, Mapping):
+        sides = stated
+    elif isinstance(stated, int):
+        sides = {"shortest_edge": stated, "longest_edge": settings.get("max_size")}
     elif isinstance(stated, list | tuple) and len(stated) == 2:
         height, width = stated
-        stated = {"height": height, "width": width}
-    sides = stated if isinstance(stated, Mapping) else {}
+        sides = {"height": height, "width": width}
     size = {name: value for name, value in sides.items() if value is not None}
     in_pixels = all(type(value) is int and 0 < value <= _LARGEST for value in size.values())
-    forms = [{"height", "width"}, {*_MOST}, {*_EDGES}, *({name} for name in _EDGES)]
     expected = "height and width, max_height and max_width, shortest_edge or longest_edge, in whole pixels"
-    check(in_pixels and set(size) in forms, "processor size", expected, excerpt(settings["size"]))
+    check(in_pixels and set(size) in _FORMS_OF_SIZE, "processor size", expected, excerpt(stated))
     return size
 
 

@@ -1,7 +1,7 @@
 """Models of Ultralytics as detectors, with the full score vector of every box."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import cast
 
 from torch import Tensor, nn
 
@@ -29,14 +29,16 @@ class UltralyticsDetector(ModuleDetector):
         if not isinstance(network, nn.Module) or not hasattr(network, "names"):
             raise InputError(f"detector: expected a network of Ultralytics with names, got {type(model).__name__}")
         if classes is None:
-            labels: Any = network.names
+            labels = cast(dict[int, str] | list[str], network.names)
             classes = [labels[index] for index in sorted(labels)] if isinstance(labels, dict) else list(labels)
+        if isinstance(input_size, int):
+            input_size = input_size, input_size
         super().__init__(
             network,
             classes,
             name,
-            (input_size, input_size) if isinstance(input_size, int) else input_size,
-            fill=114 / 255,
+            input_size,
+            fill=114 / 255,  # the grey around pictures that Ultralytics' models are trained with
             stride=32,
             digest=module_digest(network),
         )

@@ -19,6 +19,11 @@ Runtime = Literal["auto", "torch", "onnxruntime"]
 _RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
 
+def _is_multiple(side: int, step: int) -> bool:
+    """Tell whether a side in pixels is a multiple of a step, and not 0."""
+    return side > 0 and side % step == 0
+
+
 @constant
 def _cells(
     size: tuple[int, int],
@@ -114,10 +119,10 @@ class YoloV3(Detector):
         check(runtime in _RUNTIMES, "runtime", " or ".join(map(repr, _RUNTIMES)), repr(runtime))
         size = network.input_size if input_size is None else input_size
         multiple = f"a multiple of {network.stride}"
-        divisible = all(side > 0 and side % network.stride == 0 for side in size)
-        check(divisible, "input_size", f"{multiple} along both axes", size)
-        pads = stride is None or (isinstance(stride, int) and stride > 0 and stride % network.stride == 0)
-        check(pads, "stride", f"None or {multiple}", repr(stride))
+        are_multiples = all(_is_multiple(side, network.stride) for side in size)
+        check(are_multiples, "input_size", f"{multiple} along both axes", size)
+        can_pad = stride is None or (isinstance(stride, int) and _is_multiple(stride, network.stride))
+        check(can_pad, "stride", f"None or {multiple}", repr(stride))
         for head in network.heads:
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
         super().__init__(name, classes, size, stride=stride, digest=digest)
