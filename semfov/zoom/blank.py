@@ -58,7 +58,9 @@ def _corner_colours(picture: LargePicture, size: tuple[int, int]) -> set[_Colour
 def _border_of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across: _Spans) -> NDArray[np.bool_]:
     """Find cells of a colour that reach the border over cells of it; `down` and `across` are the pixels of cells."""
     # A pixel of each cell first: most cells have another colour, and the others are few strips.
-    sample = pixels[:, [first for first, _ in down]][:, :, [first for first, _ in across]]
+    first_rows = [first for first, _ in down]
+    first_columns = [first for first, _ in across]
+    sample = pixels[:, first_rows][:, :, first_columns]
     single_rows = [(row, row + 1) for row in range(len(down))]
     single_columns = [(column, column + 1) for column in range(len(across))]
     candidates = _reaching_border(_of_colour(sample, colour, single_rows, single_columns))
@@ -78,11 +80,12 @@ def _of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across:
     right = across[-1][1]
     width = right - left
     part = pixels[:, top:bottom, left:right].transpose(1, 2, 0).reshape(bottom - top, -1)
-    # Bytes below the lowest wrap round to large ones.
+    # One comparison for both limits: bytes below the lowest wrap round to large ones.
     differs = part - np.tile(lowest, width) > np.tile(highest - lowest, width)
-    differs = np.stack([differs[first - top : end - top].any(0) for first, end in down])
-    differs = np.logical_or.reduce(differs.reshape(len(down), width, -1), -1)
-    return ~np.stack([differs[:, first - left : end - left].any(1) for first, end in across], 1)
+    rows_differ = np.stack([differs[first - top : end - top].any(0) for first, end in down])
+    pixels_differ = np.logical_or.reduce(rows_differ.reshape(len(down), width, -1), -1)
+    cells_differ = np.stack([pixels_differ[:, first - left : end - left].any(1) for first, end in across], 1)
+    return ~cells_differ
 
 
 def _cell_pixels(cells: int, pitch: float, length: int) -> _Spans:

@@ -77,10 +77,13 @@ class Certainty:
             InputError: there are too few or too many.
         """
         if len(numbers) == 2:
-            return cls(numbers[0], (numbers[1], *[0.0] * (len(FACTS) - 1)))
+            offset, weight_of_score = numbers
+            weights_of_others = [0.0] * (len(FACTS) - 1)
+            return cls(offset, (weight_of_score, *weights_of_others))
         count = len(FACTS) + 6
         check(len(numbers) == count, "certainty", f"2 or {count} numbers", len(numbers))
-        return cls(numbers[0], tuple(numbers[1:-5]), *numbers[-5:])
+        offset, *weights = numbers[:-5]
+        return cls(offset, tuple(weights), *numbers[-5:])
 
     @property
     def numbers(self) -> list[float]:
@@ -166,5 +169,7 @@ def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tu
         Mean and variance.
     """
     p = chances.double()
-    mean = float(p.sum()) + unseen[0]
-    return mean, float((p * (1 - p)).sum()) + unseen[1] + (spread * mean) ** 2
+    mean_unseen, variance_unseen = unseen
+    mean = float(p.sum()) + mean_unseen
+    variance = float((p * (1 - p)).sum()) + variance_unseen + (spread * mean) ** 2
+    return mean, variance

@@ -95,19 +95,24 @@ class SearchFacts:
             hit_chance: chance that the best remaining window shows the target.
         """
         looks = self.looks
+        # With a single look, there is no second score.
         best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)
         closest = max(look.closest for look in looks)
         named = max(look.named for look in looks)
         scores = torch.tensor([best, second, closest, looks[0].score, named, hit_chance], dtype=torch.float32)
-        last = self.belief.lattice.levels - 1
-        # Number of looks of the last level that are expected to show the target. Windows start at every cell: this is
-        # the mean over all ways to lay them side by side.
-        showing = float(self.belief.chances(last).sum()) / CELLS**2 if last else 0.0
-        share = float(self.belief.unexplored.sum() / self.belief.visible.sum().clamp(1))
-        remaining = [math.log(showing + 1e-3) / 4, share]
+        unexplored = float(self.belief.unexplored.sum() / self.belief.visible.sum().clamp(1))
+        remaining = [math.log(self._expected_shows() + 1e-3) / 4, unexplored]
         detected = sum(look.score >= DETECTION_SCORE for look in looks)
         counts = [math.log1p(detected) / 2, math.log(len(looks)) / 2]
         return torch.cat([features(scores), torch.tensor([*remaining, *counts])])
+
+    def _expected_shows(self) -> float:
+        """Estimate how many looks of the last level, side by side, would show the target."""
+        last = self.belief.lattice.levels - 1
+        if not last:
+            return 0.0
+        # Windows start at every cell: this is the mean over all ways to lay them side by side.
+        return float(self.belief.chances(last).sum()) / CELLS**2
 
     @torch.no_grad()
     def presence(self, hit_chance: float) -> float:
@@ -321,11 +326,17 @@ def decisions_of(
     """
     photograph = belief.photograph
     prior = _prior_of(settings.prior, photograph, belief.target)
-    fitted = belief.evidence.thresholds if photograph is None else photograph.verification.thresholds
+    if photograph is None:
+        fitted = belief.evidence.thresholds
+        verification = belief.evidence.verification
+        most = CLOSER
+    else:
+        fitted = photograph.verification.thresholds
+        verification = photograph.verification
+        most = MOST_IN_PHOTOGRAPH
+    if settings.closer is not None:
+        most = settings.closer
     thresholds = (fitted or _DEFAULTS).changed(give_up=settings.give_up)
-    verification = belief.evidence.verification if photograph is None else photograph.verification
-    usual = CLOSER if photograph is None else MOST_IN_PHOTOGRAPH
-    most = usual if settings.closer is None else settings.closer
     if not most or verification is None or verification.thresholds is None:
         return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior)
     places: CandidateBoxes
@@ -333,8 +344,8 @@ def decisions_of(
         places = CandidateBoxes(belief.target, thresholds.confirm, forgetting, prior)
     else:
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
-    sure = verification.thresholds.changed(settings.confirm, thresholds.give_up)
-    verifier = Verifier(verification, places, close_up, sure, most)
+    thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.give_up)
+    verifier = Verifier(verification, places, close_up, thresholds_of_places, most)
     return DecisionsByCloserLooks(belief, thresholds, prior, verifier)
 
 

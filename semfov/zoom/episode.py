@@ -172,12 +172,13 @@ class _Recent(Generic[_Belief]):
             self.kept = [newest, *self.kept[1:-1]]
             first = newest
         # An old overview is kept until there is a new one, as all other looks are predicted from it.
-        self.kept = [
-            look
-            for look in self.kept
-            if look in (first, newest)
-            or (newest.time - look.time <= span and look.current.window != newest.current.window)
-        ]
+        kept = []
+        for look in self.kept:
+            is_recent = newest.time - look.time <= span
+            is_replaced = look.current.window == newest.current.window
+            if look in (first, newest) or (is_recent and not is_replaced):
+                kept.append(look)
+        self.kept = kept
         at_next_frame = newest.time + self.source.passed
         is_old = at_next_frame - first.time > span
         self.lacks_overview = is_old or share_shown(first.current.window, self.source.lattice) < _LEAST_SHOWN
@@ -199,34 +200,13 @@ def look_by_look(
     its window. Where the order has no window left, the one that was looked at longest ago is looked at again.
     """
     recent = _Recent(belief, source, forgetting)
-    overview = Window.overview(source.lattice)
-
-    def choose() -> Sequence[WindowChoice]:
-        if not recent.kept:
-            return [(overview, float("inf"))]
-        choices = order(recent.looks, recent.windows)
-        if forgetting is None:
-            return choices
-        if not choices:
-            oldest = min(recent.kept, key=lambda look: look.time)
-            return [(oldest.original.window, 0.0)]
-        return [(overview, choices[0][1])] if recent.lacks_overview else choices
-
-    def prepare(window: Window) -> None:
-        assert guess is not None
-        beside: Window | None = window
-        if belief is not None and not window.points_closer(source.lattice):
-            # Whatever the look shows, the belief about where to look next is known.
-            belief.discount(window)
-            beside = None
-        if likely := guess(recent.looks, recent.windows | {window}, beside):
-            source.prepare(likely[0])
-
+    choose = partial(_next_choices, recent, order)
     choices = choose()
     while choices:
         if guess is not None and forgetting is None and len(choices) == 1 and recent.kept:
-            source.meanwhile = partial(prepare, choices[0][0])
-        looks = source.see([window for window, _ in choices], hints=hints)
+            source.meanwhile = partial(_resample_likely, recent, guess, choices[0][0])
+        windows = [window for window, _ in choices]
+        looks = source.see(windows, hints=hints)
         for look, (_, value) in zip(looks, choices, strict=True):
             newest = recent.add(look, value)
             step = WindowStep(newest, belief, tuple(recent.kept), choose)
@@ -237,6 +217,34 @@ def look_by_look(
         else:
             recent.follow(camera)
             choices = choose()
+
+
+def _next_choices(recent: _Recent[_Belief], order: Order) -> Sequence[WindowChoice]:
+    """Choose the next windows: the overview, then those of the order; in a stream there is always one."""
+    overview = Window.overview(recent.source.lattice)
+    if not recent.kept:
+        return [(overview, float("inf"))]
+    choices = order(recent.looks, recent.windows)
+    if recent.forgetting is None:
+        return choices
+    if not choices:
+        oldest = min(recent.kept, key=lambda look: look.time)
+        return [(oldest.original.window, 0.0)]
+    if recent.lacks_overview:
+        return [(overview, choices[0][1])]
+    return choices
+
+
+def _resample_likely(recent: _Recent[_Belief], guess: _Guess, window: Window) -> None:
+    """Resample the window that is likely to follow the one that is being looked at."""
+    unknown: Window | None = window
+    if recent.belief is not None and not window.points_closer(recent.source.lattice):
+        # Whatever the look shows, the belief about where to look next is known.
+        recent.belief.discount(window)
+        unknown = None
+    likely = guess(recent.looks, recent.windows | {window}, unknown)
+    if likely is not None:
+        recent.source.prepare(likely[0])
 
 
 def look_for(

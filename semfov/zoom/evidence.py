@@ -23,7 +23,7 @@ from semfov.belief.prior import SHARES
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
-from semfov.io.compatibility import check_same_detector
+from semfov.io.compatibility import Settings, check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
 from semfov.zoom.certainty import Certainty
@@ -305,10 +305,12 @@ class GlimpseEvidence(Pretrained):
             `(...)`, log odds.
         """
         hint = facts[..., :1]
+        offset = facts[..., 5]
+        # A first look has no log odds before it: 0, which a flag tells from even odds.
         earlier = torch.zeros_like(hint) if before is None else before.view_as(hint) / 3
         has_earlier = torch.full_like(hint, float(before is not None))
         inputs = torch.cat([facts[..., :5], earlier, has_earlier], -1)
-        return facts[..., 5] + through(self.shape, inputs)[..., 0]
+        return offset + through(self.shape, inputs)[..., 0]
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
         """Predict how many objects centred in each cell closer looks find that this look did not.
@@ -378,7 +380,7 @@ class GlimpseEvidence(Pretrained):
         """
         return self.photograph.certainty if self.photograph and lattice.levels == 1 else self.certainty
 
-    def check_compatible(self, settings: Mapping[str, Any]) -> None:
+    def check_compatible(self, settings: Settings) -> None:
         """Raise `InputError` for another detector than the evidence was fitted for.
 
         Args:

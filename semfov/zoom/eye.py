@@ -217,12 +217,11 @@ class WindowEye(nn.Module):
             fixations = torch.cat([fixations, closest], -1)
         check_shape(fixations, "fixations", None, 3)
         rows = fixations.tolist()
-        check(all(math.isfinite(n) for row in rows for n in row), "fixations", "finite numbers", rows)
-        check(all(row[2] > 0 for row in rows), "fixations", "positive magnifications", [row[2] for row in rows])
+        check(bool(fixations.isfinite().all()), "fixations", "finite numbers", rows)
+        magnifications = [row[2] for row in rows]
+        check(min(magnifications, default=1) > 0, "fixations", "positive magnifications", magnifications)
         limits = [None] * len(rows) if within is None else within
-        fill = 255 * float(self.detector.fill)
-        is_byte = abs(fill - round(fill)) < 1e-6
-        padding = torch.tensor(round(fill), dtype=torch.uint8) if is_byte else torch.tensor(fill)
+        padding = self._padding()
         canvases = []
         frames = []
         for row, limit in zip(rows, limits, strict=True):
@@ -230,6 +229,12 @@ class WindowEye(nn.Module):
             canvases.append(canvas)
             frames.append(frame)
         return canvases[0] if len(canvases) == 1 else torch.cat(canvases), frames
+
+    def _padding(self) -> Tensor:
+        """Make the detector's padding from 0 to 255: a byte where it is a whole number, for canvases of bytes."""
+        fill = 255 * float(self.detector.fill)
+        is_byte = abs(fill - round(fill)) < 1e-6
+        return torch.tensor(round(fill), dtype=torch.uint8) if is_byte else torch.tensor(fill)
 
     def _show(
         self, padding: Tensor, picture: LargePicture, fixation: list[float], limit: _Limit | None

@@ -126,13 +126,21 @@ def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None
     last = len(network) - 1
     for place, layer in enumerate(network):
         if isinstance(layer, nn.Linear):
-            if outputs is None or place < last:
-                values = F.linear(values, layer.weight, layer.bias)
-            else:
-                values = F.linear(values, layer.weight[outputs], layer.bias[outputs])
+            weight: Tensor = layer.weight
+            bias: Tensor = layer.bias
+            if place == last and outputs is not None:
+                weight = weight[outputs]
+                bias = bias[outputs]
+            values = F.linear(values, weight, bias)
         elif isinstance(layer, nn.GELU):
-            # torch gives contiguous arrays to oneDNN, whose call is slow: transposed matrices and repeated vectors.
-            values = F.gelu(values.expand(2, -1))[0] if values.ndim == 1 else F.gelu(values.mT).mT
+            values = _gelu(values)
         elif layer.training:  # dropout
             values = layer(values)
     return values
+
+
+def _gelu(values: Tensor) -> Tensor:
+    """Apply GELU to values that are not contiguous: torch gives those that are to oneDNN, whose call is slow."""
+    if values.ndim == 1:
+        return F.gelu(values.expand(2, -1))[0]
+    return F.gelu(values.mT).mT

@@ -68,12 +68,14 @@ class Lattice:
         check(min(size) >= 1, "picture", "a width and a height in pixels", size)
         check(finest > 0, "finest", "a positive magnification", finest)
         # Magnifications one octave apart, from the one that shows the whole picture up to the finest one.
-        magnifications = [min(canvas[0] / size[0], canvas[1] / size[1])]
+        width, height = size
+        magnifications = [min(canvas[0] / width, canvas[1] / height)]
         while magnifications[-1] * 2 <= finest * (1 + 1e-9):
             magnifications.append(magnifications[-1] * 2)
         lattice = cls(size, canvas, tuple(magnifications))
         cells = lattice.columns * lattice.rows
-        got = f"{cells:,} in {size[0]} × {size[1]} px; divide the picture, or look less closely, finest={finest / 2:g}"
+        remedy = f"divide the picture, or look less closely, finest={finest / 2:g}"
+        got = f"{cells:,} in {width} × {height} px; {remedy}"
         check(cells <= MOST_CELLS, "picture", f"at most {MOST_CELLS:,} cells of a belief", got)
         return lattice
 
@@ -168,10 +170,13 @@ class Lattice:
         Returns:
             `(..., 4)`, `(x1, y1, x2, y2)` in picture pixels.
         """
+        levels = actions[..., 0]
+        first_cells = actions[..., 1:]
         pitch = torch.tensor(self.pitch, dtype=torch.float64)
-        low = actions[..., 1:] * pitch
         sizes = torch.tensor([self.window(level) for level in range(self.levels)], dtype=torch.float64)
-        return torch.cat([low, low + sizes[actions[..., 0]]], -1).float()
+        lower = first_cells * pitch
+        upper = lower + sizes[levels]
+        return torch.cat([lower, upper], -1).float()
 
     def fixations(self, actions: Tensor) -> Tensor:
         """Compute the centres and magnifications of actions.
@@ -183,8 +188,11 @@ class Lattice:
             `(..., 3)`, `(x, y, m)` in picture pixels and canvas pixels per picture pixel.
         """
         boxes = self.boxes(actions).double()
-        magnification = torch.tensor(self.magnifications, dtype=torch.float64)[actions[..., 0]]
-        return torch.cat([(boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5, magnification[..., None]], -1).float()
+        # Edges are between pixels, and places count from the centre of the first pixel.
+        centres = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
+        levels = actions[..., :1]
+        magnifications = torch.tensor(self.magnifications, dtype=torch.float64)[levels]
+        return torch.cat([centres, magnifications], -1).float()
 
     def fixation(self, level: int, column: int, row: int) -> tuple[float, float, float]:
         """Compute centre and magnification of one window: a row of `fixations`, without tensors.

@@ -64,8 +64,13 @@ class Window:
     def around(lattice: Lattice, box: tuple[float, float, float, float]) -> "Window":
         """Make the window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
         x1, y1, x2, y2 = box
-        magnification = min(lattice.canvas[0] / (x2 - x1), lattice.canvas[1] / (y2 - y1))
-        level = min(range(lattice.levels), key=lambda k: abs(lattice.magnifications[k] / magnification - 1))
+        canvas_width, canvas_height = lattice.canvas
+        magnification = min(canvas_width / (x2 - x1), canvas_height / (y2 - y1))
+
+        def difference(level: int) -> float:
+            return abs(lattice.magnifications[level] / magnification - 1)
+
+        level = min(range(lattice.levels), key=difference)
         fixation = (x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, magnification
         return Window(fixation, level, nearest_cells(lattice, box), box)
 
@@ -213,11 +218,12 @@ def _look_at(looks: WindowDetections, number: int, window: Window, lattice: Latt
     else:
         scores = hints.scores
     is_photograph = lattice.levels == 1
+    best_scores = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
     return WindowLook(
         window,
         detections,
         cut=looks.cut[number, : detections.mask.shape[1]],
-        show=scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1]),
+        show=best_scores,
         gist=gist,
         hints=hints if is_photograph and gist is None else None,
     )

@@ -285,8 +285,9 @@ def _should_show(
     # The border of the picture cuts no object.
     low = np.where(first_edges > 0, first_edges + margin, -np.inf)
     high = np.where(last_edges < np.array(size) - 0.5, last_edges - margin, np.inf)
-    inside = (boxes[:, None, :2] >= low).all(-1) & (boxes[:, None, 2:] <= high).all(-1)
-    visible = inside & (side[:, None] + np.log2(scale) >= math.log2(_SMALLEST))
+    is_inside = (boxes[:, None, :2] >= low).all(-1) & (boxes[:, None, 2:] <= high).all(-1)
+    is_large_enough = side[:, None] + np.log2(scale) >= math.log2(_SMALLEST)
+    visible = is_inside & is_large_enough
     if latest:
         for number in range(len(scale) - 1):
             later = visible[:, number + 1 :] & (scale[number + 1 :] >= scale[number])

@@ -172,22 +172,29 @@ def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
     return replace(objects, scores=chances)[chances.argsort(descending=True, stable=True)]
 
 
+def _joined(batches: Sequence[Detections]) -> Detections:
+    """Put detections of single looks one after another, as those of one picture."""
+    return Detections(
+        boxes=torch.cat([batch.boxes for batch in batches], 1),
+        scores=torch.cat([batch.scores for batch in batches], 1),
+        mask=torch.cat([batch.mask for batch in batches], 1),
+        confidence=torch.cat([batch.confidence for batch in batches], 1),
+    )
+
+
 def _detected(looks: Sequence[WindowLook], target: int | Sequence[int] | None, *, shares: bool) -> DetectedBoxes:
     """Collect the boxes of all detections, each with its best class of the targets.
 
     Scores are those of the vectors, on which a certainty is fitted (`shares`), or the detector's own.
     """
     batches = [look.detections for look in looks]
-    detections = Detections(
-        boxes=torch.cat([batch.boxes for batch in batches], 1),
-        scores=torch.cat([batch.scores for batch in batches], 1),
-        mask=torch.cat([batch.mask for batch in batches], 1),
-        confidence=torch.cat([batch.confidence for batch in batches], 1),
-    )
+    detections = _joined(batches)
     class_scores = detections.scores[0, :, 1:] if shares else detections.class_scores[0]
-    classes = [target] if isinstance(target, int) else list(target or range(1, class_scores.shape[-1] + 1))
+    all_classes = range(1, class_scores.shape[-1] + 1)
+    classes = [target] if isinstance(target, int) else list(target or all_classes)
     columns = [label - 1 for label in classes]
-    scores, best = (class_scores * detections.mask[0, :, None])[:, columns].max(-1)
+    scores_without_padding = class_scores * detections.mask[0, :, None]
+    scores, best = scores_without_padding[:, columns].max(-1)
     counts = torch.tensor([batch.mask.shape[1] for batch in batches])
     number = torch.arange(len(looks)).repeat_interleave(counts)
     magnifications = torch.tensor([look.window.fixation[2] for look in looks]).to(scores)

@@ -23,7 +23,9 @@ def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor
     x1, y1, x2, y2 = box
     cells = scores[max(y1, 0) : y2, max(x1, 0) : x2].flatten(0, 1)
     best = cells.amax(-1)
-    summary = torch.stack([best.sum(), (best > 0).to(best).mean(), (best > _CLEAR).to(best).sum()])
+    share_with_hint = (best > 0).to(best).mean()
+    clear_hints = (best > _CLEAR).to(best).sum()
+    summary = torch.stack([best.sum(), share_with_hint, clear_hints])
     return cells.amax(0), summary
 
 

@@ -127,7 +127,8 @@ def _hints_inside(hints: Hints, window: Window) -> Tensor:
     boxes = hints.boxes
     region = boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9))
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-    return hints.scores[((region[:2] <= centre) & (centre < region[2:])).all(-1)]
+    is_inside = ((region[:2] <= centre) & (centre < region[2:])).all(-1)
+    return hints.scores[is_inside]
 
 
 def _cells_inside(gist: Gist, window: Window) -> Tensor:

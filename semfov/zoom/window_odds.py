@@ -297,15 +297,16 @@ class WindowOdds:
         Returns:
             By level, the log odds of all windows, `(down, across)`; -inf where unknown. The next call changes them.
         """
-        new = [_LookPredictions(gist, self._lattice) for gist in self._gists[len(self._looks) :]]
+        new_looks = [_LookPredictions(gist, self._lattice) for gist in self._gists[len(self._looks) :]]
         # A look changes what closer ones start from, and a change in the shares concerns looks of all levels.
-        changes = [(look.box, look.gist.level) for look in new]
+        changes = [(look.box, look.gist.level) for look in new_looks]
         if self.changed is not None:
             changes.append((self.changed, -1))
             self.changed = None
         if not changes:
             return self._odds
-        self._looks = sorted(self._looks + new, key=lambda look: look.gist.level)
+        # Coarse looks first: closer ones start from their odds, and write over them.
+        self._looks = sorted(self._looks + new_looks, key=lambda look: look.gist.level)
         affected = [look for look in self._looks if look.is_new or _meets_coarser(look, changes)]
         self._renew_facts(affected)
         for odds in self._odds.values():
@@ -326,14 +327,12 @@ class WindowOdds:
         if not pooled:
             return
         counts = [len(windows.scores) for windows in pooled]
-        octaves = np.repeat([windows.octaves for windows in pooled], counts)
-        facts = self._evidence.hint_facts(
-            torch.cat([windows.scores for windows in pooled]),
-            torch.cat([windows.summary for windows in pooled]),
-            torch.from_numpy(octaves),
-            self._target,
-        )[:, 0].numpy()
-        for windows, values in zip(pooled, np.split(facts, np.cumsum(counts)[:-1]), strict=True):
+        scores = torch.cat([windows.scores for windows in pooled])
+        summaries = torch.cat([windows.summary for windows in pooled])
+        octaves = torch.from_numpy(np.repeat([windows.octaves for windows in pooled], counts))
+        facts = self._evidence.hint_facts(scores, summaries, octaves, self._target)[:, 0].numpy()
+        facts_by_look = np.split(facts, np.cumsum(counts)[:-1])
+        for windows, values in zip(pooled, facts_by_look, strict=True):
             windows.facts[:] = values.reshape(windows.facts.shape)
             windows.outdated[:] = True
 
