@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 from torch import Tensor
 
 from semfov.errors import DataError, InputError, check, lookup
-from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
+from semfov.io.compatibility import Settings, check_grid, check_same_detector, check_sensor
 from semfov.io.schema import Json, Object, Schema, Text
 from semfov.io.state import StatedModule, without_settings
 from semfov.io.storage import checksum, read, write_file
@@ -113,7 +113,7 @@ class Pretrained(StatedModule):
 class PretrainedForEye(Pretrained):
     """Base of models that were fitted for one eye; `metadata` holds the settings of its `detector` and `sensor`."""
 
-    def check_compatible(self, settings: Mapping[str, Any], grid: tuple[int, int] | None = None) -> None:
+    def check_compatible(self, settings: Settings, grid: tuple[int, int] | None = None) -> None:
         """Raise `InputError` for another detector or a very different grid; warn where other settings differ."""
         if grid is not None:
             check_grid(self.metadata.get("training", {}), grid, self.title)

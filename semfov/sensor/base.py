@@ -1,7 +1,7 @@
 """The interface of the sensors of an eye."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, values_known
+from semfov.io.compatibility import Settings
 from semfov.io.state import StatedModule
 
 
@@ -137,7 +138,7 @@ class Sensor(StatedModule, ABC):
         return {name: value for name, value in self.settings().items() if name in {*self.names} - learned}
 
     @classmethod
-    def from_settings(cls, settings: Mapping[str, Any]) -> Self:
+    def from_settings(cls, settings: Settings) -> Self:
         """Make the sensor from its settings.
 
         Args:
@@ -154,7 +155,7 @@ class Sensor(StatedModule, ABC):
         return cls(**{name: settings[name] for name in cls.names})
 
     @classmethod
-    def width(cls, settings: Mapping[str, Any]) -> float:
+    def width(cls, settings: Settings) -> float:
         """Tell the width of the fovea, in pixels of the image that the settings are for.
 
         Policies that bring the fovea closer use it. A sensor that does not tell counts as wide as `published`.
@@ -168,7 +169,7 @@ class Sensor(StatedModule, ABC):
         return 100.0
 
     @classmethod
-    def borders(cls, settings: Mapping[str, Any]) -> list[float] | None:
+    def borders(cls, settings: Settings) -> list[float] | None:
         """List the distances from the fixation at which acuity changes, of a sensor with steps of acuity.
 
         Args:
@@ -180,7 +181,7 @@ class Sensor(StatedModule, ABC):
         return None
 
     @classmethod
-    def describe(cls, settings: Mapping[str, Any]) -> str:
+    def describe(cls, settings: Settings) -> str:
         """Describe the settings in words, for titles.
 
         Args:
@@ -214,12 +215,13 @@ def stacked_views(view: Callable[[int, int], Tensor], batch: int, number: int, e
     Returns:
         Views `(B, G, ...)`.
     """
-    views = [view(b, g) for b in range(batch) for g in range(number)]
-    if len(views) > 1:
-        return torch.stack(views).unflatten(0, (batch, number))
-    # One view is not copied.
-    shape = (views[0] if views else empty).shape
-    return (views[0] if views else empty)[None].expand(len(views), *shape).reshape(batch, number, *shape)
+    views: list[Tensor] = []
+    for image in range(batch):
+        views += [view(image, fixation) for fixation in range(number)]
+    if not views:
+        return empty.expand(batch, number, *empty.shape)
+    stack = views[0][None] if len(views) == 1 else torch.stack(views)  # one view is not copied
+    return stack.unflatten(0, (batch, number))
 
 
 def fixations(gaze: Tensor, like: Tensor) -> Tensor:

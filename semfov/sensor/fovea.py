@@ -101,10 +101,14 @@ class Fovea:
         tiny = torch.finfo(self.sigma.dtype).tiny  # a width that underflows to 0 would give 0 / 0 at the fixation
         growth = (self.growth**lattice.exponent).clamp(min=tiny)
         widths = (self.sigma[..., None] * growth).clamp(min=tiny).flatten(1)
+        # The columns and the rows of all bands lie one after another: the windows of all are computed at once.
         centre = self.fixation.index_select(-1, lattice.axis)
         width = widths.index_select(-1, lattice.width)[:, None]
-        weights = ((lattice.place - centre) / width).square().mul(-0.5).exp().to(dtype)[:, :, None]
-        lengths = [length for height, width in sizes for length in (width, height)]
+        distance = (lattice.place - centre) / width
+        weights = distance.square().mul(-0.5).exp().to(dtype)[:, :, None]
+        lengths: list[int] = []
+        for rows_of_band, columns_of_band in sizes:
+            lengths += [columns_of_band, rows_of_band]
         lines = weights.split(lengths, -1)
         return tuple(FovealWindow(columns, rows) for columns, rows in zip(lines[0::2], lines[1::2], strict=True))
 
@@ -168,8 +172,8 @@ def _check_positive(value: float | Tensor, name: str) -> None:
     """Raise `InputError` unless a number or all numbers of a tensor are positive; traced ones are not read."""
     if isinstance(value, Tensor) and not values_known(value):
         return
-    positive = value > 0 if isinstance(value, Real) else bool((torch.as_tensor(value) > 0).all())
-    if not positive:
+    is_positive = value > 0 if isinstance(value, Real) else bool((torch.as_tensor(value) > 0).all())
+    if not is_positive:
         # The message copies the numbers from their device, which is waited for.
         got = value.tolist() if isinstance(value, Tensor) else value
         raise InputError(f"{name}: expected a positive number, got {got}")

@@ -6,7 +6,7 @@ the same views are made in blocks that stay in the processor's cache (`_foveate_
 of a large image without its finest band (`_foveate_large`).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from numbers import Real
 from typing import Any, TypeGuard, get_args
 
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points
 from semfov.errors import check, lookup, values_known
+from semfov.io.compatibility import Settings
 from semfov.sensor.base import Sensor
 from semfov.sensor.fovea import Fovea, FovealWindow
 from semfov.sensor.lines import difference, empty
@@ -142,8 +143,11 @@ def _blend(views: Tensor, window: Tensor, band: Tensor, into: Tensor | None = No
     if into is not None and into.dtype == views.dtype:
         return torch.addcmul(views, window, band, out=into)
     # Writing over the views avoids allocating memory; a traced graph must not do it.
-    in_place = views.shape[1] == window.shape[1] and values_known(views, window, band)
-    blended = views.addcmul_(window, band) if in_place else views.addcmul(window, band)
+    has_room = views.shape[1] == window.shape[1]  # else the fixations share the views, and not the result
+    if has_room and values_known(views, window, band):
+        blended = views.addcmul_(window, band)
+    else:
+        blended = views.addcmul(window, band)
     return blended if into is None else into.copy_(blended)
 
 
@@ -340,12 +344,12 @@ class Foveation(Sensor):
         }
 
     @classmethod
-    def width(cls, settings: Mapping[str, Any]) -> float:
+    def width(cls, settings: Settings) -> float:
         """Tell the width of the fovea, σ."""
         return float(settings["sigma"])
 
     @classmethod
-    def describe(cls, settings: Mapping[str, Any]) -> str:
+    def describe(cls, settings: Settings) -> str:
         """Describe width and growth of the fovea."""
         return f"σ {settings['sigma']:g} px, growth {settings['growth']:g}"
 

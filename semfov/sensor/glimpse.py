@@ -62,8 +62,8 @@ def glimpse(
     check(image.is_floating_point(), "image", "floating-point pixels", image.dtype)
     if values_known(boxes):
         check_finite(boxes.detach(), "boxes")
-        full = bool(((boxes[..., 2:] - boxes[..., :2]) > 0).all())
-        check(full, "boxes", "windows with a positive width and height", "an empty window")
+        sides = boxes[..., 2:] - boxes[..., :2]
+        check(bool((sides > 0).all()), "boxes", "windows with a positive width and height", "an empty window")
     # Windows stay where they are: their corners are read, and a GPU would be waited for.
     windows = as_positions(boxes if boxes.ndim == 3 else boxes[:, None], image.dtype)
     value = 0.0 if padding_mode == "zeros" else fill_value
@@ -143,9 +143,11 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
     part = image[:, top:bottom, left:right]
     columns = columns.to(part)
     rows = rows.to(part)
+    # Weights end at the image, as if 0 followed; another value is subtracted before and added after.
     part = part - value if value else part
-    recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
-    if recorded or not part.numel() or image.device.type != "cpu" or not values_known(image, box):
+    is_recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
+    can_fill = image.device.type == "cpu" and part.numel() > 0 and not is_recorded and values_known(image, box)
+    if not can_fill:
         canvas = rows @ part @ columns.mT
     else:
         x1, y1, x2, y2 = box.tolist()
@@ -174,8 +176,11 @@ def _fill(result: Tensor, weight: Tensor, part: Tensor, start: float, end: float
     together = _TOGETHER if length > 4 * _TOGETHER else count
     for first in range(0, count, together):
         last = min(first + together, count)
-        begin = min(max(math.floor(start + (first + 0.5) * step - reach), 0), length - 1)
-        stop = min(max(math.ceil(start + (last - 0.5) * step + reach), begin + 1), length)
+        first_centre = start + (first + 0.5) * step
+        last_centre = start + (last - 0.5) * step
+        # At least one pixel, also for a part that shows none.
+        begin = min(max(math.floor(first_centre - reach), 0), length - 1)
+        stop = min(max(math.ceil(last_centre + reach), begin + 1), length)
         matrix = weight[first:last, begin:stop].expand(len(part), -1, -1)
         torch.bmm(matrix, part[:, begin:stop], out=result[:, first:last])
 

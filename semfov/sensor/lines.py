@@ -136,10 +136,13 @@ def banded(
         middle = middle[:1].expand(tiles, -1, -1)
     # Both ends have the same size, so that one product computes them; the longer one decides.
     edge = max(rows, length - stop)
-    span = min(count, max(-(-edge // tile) * shift, count - (length - edge) // tile * shift) + reach)
+    span_of_head = -(-edge // tile) * shift
+    span_of_tail = count - (length - edge) // tile * shift
+    span = min(count, max(span_of_head, span_of_tail) + reach)
     head = _dense(index[:edge], weight[:edge], span)
     tail = _dense(index[length - edge :] - (count - span), weight[length - edge :], span)
-    return Lines(count, length, None, torch.stack([head, tail]).to(device, dtype), middle, rows, start, shift)
+    ends = torch.stack([head, tail]).to(device, dtype)
+    return Lines(count, length, None, ends, middle, rows, start, shift)
 
 
 def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
@@ -153,13 +156,15 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     Returns:
         `(..., h', w')`, with the numbers of output pixels.
     """
-    recorded = image.requires_grad and torch.is_grad_enabled()
-    if recorded or image.device.type != "cpu" or not values_known(image):
-        return _product(_product(image.mT, across).mT, down)
+    is_recorded = image.requires_grad and torch.is_grad_enabled()
+    if is_recorded or image.device.type != "cpu" or not values_known(image):
+        filtered_rows = _product(image.mT, across).mT
+        return _product(filtered_rows, down)
     if down.dense is not None and across.dense is not None:
         return down.dense @ (image @ across.dense.mT)
-    planes = image.reshape(image.shape[:-2].numel(), *image.shape[-2:])
-    return _filter_planes(planes, down, across).view(*image.shape[:-2], down.length, across.length)
+    leading = image.shape[:-2]
+    planes = image.reshape(leading.numel(), *image.shape[-2:])
+    return _filter_planes(planes, down, across).view(*leading, down.length, across.length)
 
 
 def _filter_planes(planes: Tensor, down: Lines, across: Lines) -> Tensor:

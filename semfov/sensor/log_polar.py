@@ -1,6 +1,5 @@
 """The log-polar sensor: cortical images, whose receptors lie further apart with eccentricity, and their projections."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import ceil, exp, hypot, inf, log1p, log2, pi, sqrt
 from typing import Any
@@ -10,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
+from semfov.io.compatibility import Settings
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.constants import constant
 from semfov.sensor.pyramid import gaussian_pyramid
@@ -43,7 +43,8 @@ class _Retina:
     def receptors(self, size: tuple[int, int]) -> tuple[int, int]:
         """Count the `(rings, wedges)` that cover an image of `(width, height)` from any fixation inside it."""
         wedges = 4 * max(1, round(pi * self.fovea / (2 * self.spacing)))
-        rings = 2 + ceil(self.fovea * log1p(self._reach(size) / self.fovea) / self.spacing)
+        farthest = self.fovea * log1p(self._reach(size) / self.fovea)  # cortical distance of the farthest pixel
+        rings = 2 + ceil(farthest / self.spacing)
         expected = f"a distance large enough for at most {_MOST:,} receptors"
         check(rings * wedges <= _MOST, "spacing", expected, self.spacing)
         return rings, wedges
@@ -227,7 +228,7 @@ class LogPolar(Sensor):
         return {"kind": self.kind, "fovea": retina.fovea, "spacing": retina.spacing, "pooling": retina.pooling}
 
     @classmethod
-    def width(cls, settings: Mapping[str, Any]) -> float:
+    def width(cls, settings: Settings) -> float:
         """Tell the eccentricity at which acuity is half the acuity at the fixation."""
         return float(settings["fovea"])
 
@@ -280,28 +281,47 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
         Images `(B, G, C, H, W)`.
     """
     batch, number, _, rings, wedges = cortical.shape
-    # Squares of longer distances overflow, and beyond this distance the view no longer changes.
-    fixation = fixation.clamp(-_FARTHEST, _FARTHEST)
-    x, y = (torch.arange(n, dtype=fixation.dtype, device=fixation.device) for n in size)
-    scale = fixation.new_tensor(retina.scale)
-    x_offset = ((x - fixation[..., :1]) / scale[0])[:, :, None, :]
-    y_offset = ((y - fixation[..., 1:]) / scale[1])[:, :, :, None]
-    squared = x_offset.square() + y_offset.square()
-    # The angle is not defined at the fixation itself, so no gradient may flow through it there.
-    middle = squared == 0
-    x_offset = torch.where(middle, torch.ones_like(squared), x_offset)
-    radius = torch.where(middle, torch.ones_like(squared), squared).sqrt()
-    angle = torch.atan2(y_offset.expand_as(x_offset), x_offset)
-    radius = torch.where(middle, torch.zeros_like(squared), radius)
+    radius, angle = _polar(fixation, size, retina.scale)
     ring = retina.fovea * torch.log1p(radius / retina.fovea) / retina.spacing - 0.5
     wedge = angle.remainder(2 * pi) * (wedges / (2 * pi))
     # Bicubic interpolation needs neighbours: those of the innermost ring lie on the opposite side of the fixation, and
     # the last wedge is next to the first.
-    extended = torch.cat([cortical[..., :2, :].flip(-2).roll(wedges // 2, -1), cortical], -2)
+    opposite_rings = cortical[..., :2, :].flip(-2).roll(wedges // 2, -1)
+    extended = torch.cat([opposite_rings, cortical], -2)
     extended = torch.cat([extended[..., -1:], extended, extended[..., :2]], -1).flatten(0, 1)
-    points = torch.stack([2 * (wedge + 1) / (wedges + 2) - 1, 2 * (ring + 2) / (rings + 1) - 1], -1).flatten(0, 1)
+    # Places in the extended image from -1 to 1: two more rings lie before the first, a wedge before and two behind.
+    columns = 2 * (wedge + 1) / (wedges + 2) - 1
+    rows = 2 * (ring + 2) / (rings + 1) - 1
+    points = torch.stack([columns, rows], -1).flatten(0, 1)
     images = F.grid_sample(extended.to(points), points, "bicubic", "border", align_corners=True)
     return images.to(cortical).unflatten(0, (batch, number))
+
+
+def _polar(fixation: Tensor, size: tuple[int, int], scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """Compute the polar coordinates of all pixels around fixations.
+
+    Args:
+        fixation: `(B, G, 2)` in image pixels.
+        size: `(width, height)` of the images.
+        scale: image pixels for a pixel of the retina, along x and y.
+
+    Returns:
+        Distances in pixels of the retina, and angles in radians, `(B, G, H, W)`.
+    """
+    # Squares of longer distances overflow, and beyond this distance the view no longer changes.
+    fixation = fixation.clamp(-_FARTHEST, _FARTHEST)
+    x, y = (torch.arange(n, dtype=fixation.dtype, device=fixation.device) for n in size)
+    x_scale, y_scale = fixation.new_tensor(scale)
+    x_offset = ((x - fixation[..., :1]) / x_scale)[:, :, None, :]
+    y_offset = ((y - fixation[..., 1:]) / y_scale)[:, :, :, None]
+    squared = x_offset.square() + y_offset.square()
+    # The angle is not defined at the fixation itself, so no gradient may flow through it there.
+    is_middle = squared == 0
+    one = torch.ones_like(squared)
+    x_offset = torch.where(is_middle, one, x_offset)
+    radius = torch.where(is_middle, one, squared).sqrt()
+    angle = torch.atan2(y_offset.expand_as(x_offset), x_offset)
+    return torch.where(is_middle, torch.zeros_like(squared), radius), angle
 
 
 @constant
@@ -312,8 +332,9 @@ def _places(numbers: _Numbers, size: tuple[int, int], dtype: torch.dtype, device
     rho = (torch.arange(rings, dtype=torch.float64) + 0.5) * retina.spacing
     radius = retina.fovea * torch.expm1(rho / retina.fovea)
     angle = torch.arange(wedges, dtype=torch.float64) * (2 * pi / wedges)
-    unit = torch.stack([angle.cos(), angle.sin()], -1) * torch.tensor(retina.scale, dtype=torch.float64)
-    return (radius[:, None, None] * unit).to(device, dtype)
+    directions = torch.stack([angle.cos(), angle.sin()], -1)
+    steps = directions * torch.tensor(retina.scale, dtype=torch.float64)
+    return (radius[:, None, None] * steps).to(device, dtype)
 
 
 @constant
@@ -324,11 +345,15 @@ def _shares(
     retina = _Retina(*numbers)
     rings, _ = retina.receptors(size)
     top = retina.levels(size)
+    # A ring reads the two levels around its own, which is no whole number, with weights that sum to 1.
     levels = [min(retina.level(retina.eccentricity(ring)), top) for ring in range(rings)]
     shares = []
     for level in range(top + 1):
-        reading = [ring for ring in range(rings) if abs(levels[ring] - level) < 1]
-        if reading:
-            weight = [1 - abs(levels[ring] - level) for ring in range(reading[0], reading[-1] + 1)]
-            shares.append((level, reading[0], torch.tensor(weight, dtype=torch.float64).to(device, dtype)))
+        readers = [ring for ring in range(rings) if abs(levels[ring] - level) < 1]
+        if not readers:
+            continue
+        first = readers[0]
+        last = readers[-1]
+        weights = [1 - abs(ring_level - level) for ring_level in levels[first : last + 1]]
+        shares.append((level, first, torch.tensor(weights, dtype=torch.float64).to(device, dtype)))
     return shares

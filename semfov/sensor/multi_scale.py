@@ -1,6 +1,5 @@
 """The multi-scale fovea: square crops around the fixation, each twice as wide as the one before, all of one size."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -9,6 +8,7 @@ from torch.nn import functional as F
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_shape, check_whole
+from semfov.io.compatibility import Settings
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.glimpse import windows_at
 
@@ -108,7 +108,8 @@ class MultiScaleFovea(Sensor):
         """
         reduced = 0.5 ** torch.arange(self.scales, dtype=gaze.dtype, device=gaze.device)
         points = gaze[..., None, :].expand(*gaze.shape[:-1], self.scales, 2)
-        return windows_at(points, reduced.expand(points.shape[:-1]), (self.side, self.side))
+        magnifications = reduced.expand(points.shape[:-1])
+        return windows_at(points, magnifications, (self.side, self.side))
 
     def canvas_size(self, size: tuple[int, int], reference: float) -> tuple[int, int]:
         """Tell the size of the canvas: that of the picture with its longer side at the reference."""
@@ -135,40 +136,45 @@ class MultiScaleFovea(Sensor):
         for scale in reversed(range(self.scales)):
             corner = windows[:, scale, :2]
             side = self.side * 2**scale
+            # Places in the crop from -1 to 1.
             columns = 2 * (x - corner[:, :1]) / side - 1
             rows = 2 * (y - corner[:, 1:]) / side - 1
-            place = torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
-            crop = F.grid_sample(crops[:, scale].to(place), place, "bilinear", "border", align_corners=False).to(crops)
-            picture = torch.where((place.abs() <= 1).all(-1)[:, None], crop, picture)
+            places = torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
+            crop = crops[:, scale].to(places)
+            shown = F.grid_sample(crop, places, "bilinear", "border", align_corners=False).to(crops)
+            is_inside = (places.abs() <= 1).all(-1)[:, None]
+            picture = torch.where(is_inside, shown, picture)
         return picture
 
     def boxes_to_canvas(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""
         windows = self.windows(as_positions(gaze, boxes)).flatten(0, 1)[:, None]
-        unit = (windows[..., 2:] - windows[..., :2]).repeat(1, 1, 2) / self.side
-        return boxes * unit + windows[..., :2].repeat(1, 1, 2)
+        corner = windows[..., :2]
+        pixels = (windows[..., 2:] - corner) / self.side  # of the canvas, for one of the crop
+        return boxes * pixels.repeat(1, 1, 2) + corner.repeat(1, 1, 2)
 
     def settings(self) -> dict[str, Any]:
         """List the settings that the views depend on."""
         return {"kind": self.kind, "side": self.side, "scales": self.scales}
 
     @classmethod
-    def width(cls, settings: Mapping[str, Any]) -> float:
+    def width(cls, settings: Settings) -> float:
         """Tell half the side of the finest crop."""
         return float(settings["side"]) / 2
 
     @classmethod
-    def borders(cls, settings: Mapping[str, Any]) -> list[float]:
+    def borders(cls, settings: Settings) -> list[float]:
         """List where acuity changes: at half the side of each crop."""
         return [cls.width(settings) * 2**scale for scale in range(int(settings["scales"]))]
 
     def _crop(self, plane: Tensor, fixation: Tensor, scale: int) -> Tensor:
         """Cut crops `(B, G, C, side, side)` of one scale from the means of its squares, `(B, C, h, w)`."""
         step = 2**scale
+        height, width = plane.shape[-2:]
         # Squares that start before 1 - step or after the last pixel show nothing: they are the border of the plane.
         first = fixation + 0.5 - self.side * step / 2 + step
-        sizes = plane.shape[-1], plane.shape[-2]
-        reach = torch.tensor([float(n + self.side * step) for n in sizes], dtype=first.dtype, device=first.device)
+        farthest = [float(width + self.side * step), float(height + self.side * step)]
+        reach = torch.tensor(farthest, dtype=first.dtype, device=first.device)
         first = torch.minimum(torch.maximum(first, -reach), reach)
         square = first.detach().floor()
         x, y = (first - square)[..., None, None, None].unbind(2)  # shares of the next square
@@ -178,10 +184,11 @@ class MultiScaleFovea(Sensor):
         # Rows first: they are contiguous in memory.
         planes = plane.transpose(1, 2)
         image = torch.arange(len(plane), device=plane.device)[:, None, None]
-        upper = planes[image, row.clamp(0, sizes[1] - 1)]
-        lower = planes[image, (row + 1).clamp(0, sizes[1] - 1)]
+        upper = planes[image, row.clamp(0, height - 1)]
+        lower = planes[image, (row + 1).clamp(0, height - 1)]
         lines = upper * (1 - y) + lower * y
         columns = column[..., None, None, :].expand(*lines.shape[:-1], self.side)
-        left = lines.gather(-1, columns.clamp(0, sizes[0] - 1))
-        right = lines.gather(-1, (columns + 1).clamp(0, sizes[0] - 1))
-        return (left * (1 - x) + right * x).transpose(-3, -2).to(plane.dtype)
+        left = lines.gather(-1, columns.clamp(0, width - 1))
+        right = lines.gather(-1, (columns + 1).clamp(0, width - 1))
+        crops = left * (1 - x) + right * x
+        return crops.transpose(-3, -2).to(plane.dtype)

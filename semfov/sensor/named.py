@@ -1,10 +1,10 @@
 """Sensors by name, which commands and model folders can select."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from semfov.errors import InputError, check, lookup
+from semfov.io.compatibility import Settings
 from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.log_polar import LogPolar
@@ -18,10 +18,10 @@ class _NamedSensor:
     """How a named sensor is made; for those of the paper observation models of maximum likelihood are shipped."""
 
     make: type[Sensor]
-    settings: Mapping[str, Any]
+    settings: Settings
     published: bool = False
 
-    def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+    def changed(self, changes: Settings) -> dict[str, Any]:
         """List the settings with some of them replaced."""
         for name in changes:
             names = ", ".join(self.make.names)
@@ -71,11 +71,12 @@ def named_sensor(name: str, **settings: Any) -> Sensor:
     return named.make.from_settings(named.changed(settings))
 
 
-def sensor_of(settings: Mapping[str, Any]) -> Sensor:
-    """One of the library's sensors from its settings (`Sensor.settings`)."""
+def sensor_of(settings: Settings) -> Sensor:
+    """Make one of the library's sensors from its settings (`Sensor.settings`)."""
+    name_of_kind = settings.get("kind", Foveation.kind)
     kinds = dict.fromkeys(named.make for named in SENSORS.values())
     for kind in kinds:
-        if settings.get("kind", Foveation.kind) == kind.kind and all(name in settings for name in kind.names):
+        if name_of_kind == kind.kind and settings.keys() >= set(kind.names):
             return kind.from_settings(settings)
     expected = " or a ".join(kind.__name__ for kind in kinds)
     raise InputError(f"sensor: expected the settings of a {expected}, got {dict(settings)}")

@@ -99,7 +99,9 @@ def _even_rows(panorama: Tensor) -> Tensor:
         index = pixel.expand(*panorama.shape[:-2], rows, columns)
         return total.gather(-1, index) + (place - pixel) * twice.gather(-1, index)
 
-    means = (integral(middle + width[:, None] / 2) - integral(middle - width[:, None] / 2)) / width[:, None]
+    width = width[:, None]
+    sums = integral(middle + width / 2) - integral(middle - width / 2)
+    means = sums / width
     return means.roll(columns // 2, -1).to(panorama)
 
 
@@ -122,18 +124,23 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
     x = _sample_positions(size[0], samples, pose)
     y = _sample_positions(size[1], samples, pose)
     grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1)
-    points = panorama_points(camera.directions(grid.flatten(0, 1)), (width, height)).unflatten(0, grid.shape[:2])
+    directions = camera.directions(grid.flatten(0, 1))
+    points = panorama_points(directions, (width, height)).unflatten(0, grid.shape[:2])
+    # Places in the source from -1 to 1, beyond its border of one pixel.
     place = (2 * points + 3) / points.new_tensor([width + 2, height + 2]) - 1
     place = as_positions(place, source)
     view = F.grid_sample(source[None].to(place.dtype), place[None], mode="bilinear", align_corners=False)
-    return (F.avg_pool2d(view, samples) if samples > 1 else view)[0].to(source.dtype)
+    if samples > 1:
+        view = F.avg_pool2d(view, samples)
+    return view[0].to(source.dtype)
 
 
 def _samples(camera: Camera, width: int) -> int:
     """Count the samples along each axis for a pixel of a view: panorama pixels that one in its middle covers."""
-    known = values_known(camera.pose)
-    check(known, "antialias", "False where the pose is not known, as in vmap and torch.export", True)
-    return max(1, math.ceil(width / (2 * math.pi * float(camera.focal.detach())) - 1e-6))
+    is_known = values_known(camera.pose)
+    check(is_known, "antialias", "False where the pose is not known, as in vmap and torch.export", True)
+    panorama_pixels = width / (2 * math.pi * float(camera.focal.detach()))  # that a pixel in the middle covers
+    return max(1, math.ceil(panorama_pixels - 1e-6))
 
 
 def _sample_positions(pixels: int, samples: int, like: Tensor) -> Tensor:

@@ -93,7 +93,8 @@ def reduce(image: Tensor, convention: Convention) -> Tensor:
 
         return transform.pyrdown(image.contiguous())
     height, width = image.shape[-2:]
-    return separable(image, *_reducing(height, width, convention, image.dtype, image.device))
+    down, across = _reducing(height, width, convention, image.dtype, image.device)
+    return separable(image, down, across)
 
 
 def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -271,7 +272,9 @@ def expanding(
         else:
             taps = _compose(_blur(torch.arange(length), length), _resize(count, length, dtype))
         drift = abs(length - 2 * count)
-        lines.append(banded(taps, count, 2 * shift, shift if drift <= 1 else count, 2 + drift, dtype, device))
+        # A size that is far from twice the other has taps that advance unevenly, and no tiles.
+        advance = shift if drift <= 1 else count
+        lines.append(banded(taps, count, 2 * shift, advance, 2 + drift, dtype, device))
     return lines[0], lines[1]
 
 
@@ -282,9 +285,12 @@ def _stuff_and_blur(count: int, length: int) -> Taps:
     """
     place = torch.arange(length)[:, None]
     half = place.div(2, rounding_mode="floor")
-    even = place % 2 == 0
-    index = torch.where(even, half + torch.tensor([-1, 0, 1]), half + torch.tensor([0, 1, 1]))
-    weight = torch.where(even, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
+    # Between the zeros, a pixel at an even place sees itself and two neighbours, one at an odd place its neighbours.
+    is_even = place % 2 == 0
+    index_at_even = half + torch.tensor([-1, 0, 1])
+    index_at_odd = half + torch.tensor([0, 1, 1])
+    index = torch.where(is_even, index_at_even, index_at_odd)
+    weight = torch.where(is_even, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
     mirrored = torch.where(index < 0, min(1, count - 1), index.clamp(max=count - 1))
     return Taps(mirrored, weight.double())
 
@@ -304,7 +310,8 @@ def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
     place = (place * (torch.tensor(count).to(place) / length) - 0.5).clamp(0, count - 1).double()
     before = place.floor()
     index = before.long()[:, None] + torch.arange(2)
-    return Taps(index.clamp(max=count - 1), torch.stack([1 - place + before, place - before], -1))
+    weight = torch.stack([1 - place + before, place - before], -1)
+    return Taps(index.clamp(max=count - 1), weight)
 
 
 def _compose(outer: Taps, inner: Taps) -> Taps:

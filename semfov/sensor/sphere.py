@@ -28,10 +28,15 @@ def panorama_directions(points: Tensor, size: tuple[int, int]) -> Tensor:
         Unit vectors `(..., 3)`.
     """
     check_shape(points, "points", 2)
-    longitude = (points[..., 0] + 0.5) * (2 * torch.pi / size[0]) - torch.pi
-    latitude = torch.pi / 2 - (points[..., 1] + 0.5) * (torch.pi / size[1])
+    column, row = points.unbind(-1)
+    width, height = size
+    longitude = (column + 0.5) * (2 * torch.pi / width) - torch.pi
+    latitude = torch.pi / 2 - (row + 0.5) * (torch.pi / height)
     radius = latitude.cos()  # of the circle of latitude
-    return torch.stack([radius * longitude.sin(), -latitude.sin(), radius * longitude.cos()], -1)
+    x = radius * longitude.sin()
+    y = -latitude.sin()
+    z = radius * longitude.cos()
+    return torch.stack([x, y, z], -1)
 
 
 def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
@@ -57,7 +62,8 @@ def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
     column = (longitude + torch.pi) * (size[0] / (2 * torch.pi)) - 0.5
     # A longitude that is rounded up to half a turn belongs to the other end of the row.
     column = torch.where(column >= size[0] - 0.5, column - size[0], column)
-    return torch.stack([column, (torch.pi / 2 - latitude) * (size[1] / torch.pi) - 0.5], -1)
+    row = (torch.pi / 2 - latitude) * (size[1] / torch.pi) - 0.5
+    return torch.stack([column, row], -1)
 
 
 @dataclass(frozen=True)
