@@ -49,11 +49,7 @@ def average_precision(
     judged_images = sorted(annotations.images if images is None else images)
     image_ids = {image: number for number, image in enumerate(judged_images, 1)}
     class_ids = _class_ids(annotations, classes)
-    objects = []
-    for image in judged_images:
-        visible = (entry for entry in annotations.objects[image] if min(entry["bbox"][2:]) > 0)
-        objects += [{**entry, "image_id": image} for entry in visible]
-    truth = _copies(objects, image_ids, class_ids)
+    truth = _copies(_objects(annotations, judged_images), image_ids, class_ids)
     boxes = _copies(results, image_ids, class_ids)
 
     # In LVIS a box counts only where its class is annotated, or known to be absent.
@@ -69,12 +65,23 @@ def average_precision(
     return float(judged.mean()), float(judged[0].mean())
 
 
+def _objects(annotations: Annotations, images: Iterable[Id]) -> list[_Entry]:
+    """List the objects of images that have an area, each with the id of its image."""
+    objects: list[_Entry] = []
+    for image in images:
+        for entry in annotations.objects[image]:
+            width_and_height = entry["bbox"][2:]
+            if min(width_and_height) > 0:
+                objects.append({**entry, "image_id": image})
+    return objects
+
+
 def _class_ids(annotations: Annotations, classes: Collection[str] | None) -> dict[Id, int]:
     """Give the classes of the categories that are judged numbers from 1; categories of one name are one class."""
-    names = {id_: canonical_name(category["name"]) for id_, category in annotations.categories.items()}
-    judged = {*names.values()} if classes is None else {canonical_name(name) for name in classes}
+    names = {category: canonical_name(entry["name"]) for category, entry in annotations.categories.items()}
+    judged = set(names.values()) if classes is None else set(map(canonical_name, classes))
     numbers = {name: number for number, name in enumerate(sorted(judged), 1)}
-    return {id_: numbers[name] for id_, name in names.items() if name in judged}
+    return {category: numbers[name] for category, name in names.items() if name in judged}
 
 
 def _copies(entries: Iterable[_Entry], image_ids: Mapping[Id, int], class_ids: Mapping[Id, int]) -> list[_Entry]:
@@ -136,18 +143,20 @@ def _precision(
     from pycocotools.cocoeval import COCOeval
 
     classes = sorted({entry["category_id"] for entry in (*truth, *boxes)})
+
+    def indexed(entries: Sequence[_Entry]) -> COCO:
+        """Put entries into the form of an annotation file, which pycocotools reads."""
+        side = COCO()
+        side.dataset = {
+            "images": [{"id": number} for number in range(1, images + 1)],
+            "categories": [{"id": number} for number in classes],
+            "annotations": list(entries),
+        }
+        side.createIndex()
+        return side
+
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
-        sides = []
-        for entries in (truth, boxes):
-            side = COCO()
-            side.dataset = {
-                "images": [{"id": number} for number in range(1, images + 1)],
-                "categories": [{"id": number} for number in classes],
-                "annotations": list(entries),
-            }
-            side.createIndex()
-            sides.append(side)
-        judge = COCOeval(*sides, "bbox")
+        judge = COCOeval(indexed(truth), indexed(boxes), "bbox")
         # One range of areas, all of them, whose label COCOeval expects beside it.
         judge.params.areaRng = [[0, math.inf]]
         judge.params.areaRngLbl = ["all"]

@@ -151,8 +151,10 @@ def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) ->
     p = _probabilities(confidence, "confidence").detach().cpu().contiguous()
     came_true = as_outcomes(correct, "correct")
     check_shape(came_true, "correct", len(p))
+    bin_of_prediction = torch.bucketize(p, edges)
     values = torch.stack([torch.ones_like(p), p, came_true.to(p)])
-    return torch.zeros(3, len(edges) + 1, dtype=torch.float64).index_add_(1, torch.bucketize(p, edges), values)
+    sums = torch.zeros(3, len(edges) + 1, dtype=torch.float64)
+    return sums.index_add_(1, bin_of_prediction, values)
 
 
 _EQUAL_EDGES = torch.arange(1, 15, dtype=torch.float64) / 15  # of the bins of `calibration_error`

@@ -102,7 +102,9 @@ def _as_tensor(values: object, argument: str) -> Tensor:
         return values.to_dense() if values.layout != torch.strided else values
     try:
         array = np.asarray([*values] if isinstance(values, Sequence) else values)
-        return torch.as_tensor(array if array.flags.writeable else array.copy())
+        if not array.flags.writeable:
+            array = array.copy()  # torch warns of memory that it may not write to
+        return torch.as_tensor(array)
     except (TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{argument}: expected numbers, got {type(values).__name__} ({reason[:100]})") from None

@@ -75,9 +75,9 @@ def fit_discriminative(
     check(samples > 0, "scores", "at least one sample", samples)
     check_shape(distance, "distance", samples)
     check_shape(labels, "labels", samples)
-    inside = bool(((labels >= 0) & (labels < components)).all())
-    check(inside, "labels", f"class indices from 0 to {components - 1}", "one outside")
-    for name, value in [("decay", decay), ("level_decay", level_decay), ("bias_decay", bias_decay)]:
+    are_inside = bool(((labels >= 0) & (labels < components)).all())
+    check(are_inside, "labels", f"class indices from 0 to {components - 1}", "one outside")
+    for name, value in (("decay", decay), ("level_decay", level_decay), ("bias_decay", bias_decay)):
         check(value > 0, name, "a positive number", value)
 
     # Log scores are measured from the floor: those of tiny scores are then close to 0, and L-BFGS converges faster.
@@ -120,7 +120,8 @@ def fit_discriminative(
         optimiser.zero_grad()
         values = current()
         alpha, constant = parameters(values)
-        total = torch.stack([(p * v.square()).sum() for p, v in zip(precisions, values, strict=True)]).sum() / 2
+        penalties = [(p * v.square()).sum() for p, v in zip(precisions, values, strict=True)]
+        total = torch.stack(penalties).sum() / 2  # -log of the normal priors, without their constants
         for n, (rows, truth) in enumerate(groups):
             logits = F.linear(rows, alpha[:, n] - 1, constant[:, n])
             total = total + F.cross_entropy(logits, truth, reduction="sum")

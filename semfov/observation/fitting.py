@@ -56,15 +56,18 @@ def fit_tables(
         # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
         warnings.warn(f"levels with fewer than {minimum} objects are fitted with neighbours: {text}", stacklevel=4)
     classes = statistics.sum(1)
-    uniform = vacuous(statistics.components).to(statistics.count.device)
-    class_mean_log = shrink(classes.mean_log, classes.count, uniform, _UNIFORM)
+
+    uniform_mean_log = vacuous(statistics.components).to(statistics.count.device)
+    class_mean_log = shrink(classes.mean_log, classes.count, uniform_mean_log, _UNIFORM)
     mean_log = shrink(pooled.mean_log, pooled.count, class_mean_log[:, None], shrinkage)
     if enough is not None:
         check(enough >= 2, "enough", "2 or more", enough)
-        mean_log = torch.where((pooled.count >= enough)[..., None], pooled.mean_log, mean_log)
+        has_enough = (pooled.count >= enough)[..., None]
+        mean_log = torch.where(has_enough, pooled.mean_log, mean_log)
     alpha = mle(mean_log, method=method, max_precision=_MAX_PRECISION)
-    uniform = torch.full_like(classes.mean[0], 1 / statistics.components)
-    class_mean = shrink(classes.mean, classes.count, uniform, _UNIFORM)
+
+    uniform_mean = torch.full_like(classes.mean[0], 1 / statistics.components)
+    class_mean = shrink(classes.mean, classes.count, uniform_mean, _UNIFORM)
     expected = shrink(pooled.mean, pooled.count, class_mean[:, None], shrinkage)
     expected = expected / expected.sum(-1, keepdim=True)
     record = {
@@ -89,8 +92,9 @@ def _pool(objects: Sequence[int], level: int, minimum: int) -> range:
 def _pooled(statistics: DirichletStatistics, pools: Sequence[range]) -> DirichletStatistics:
     """Put the statistics of a pool of levels in the place of each level."""
     table = DirichletStatistics(statistics.shape, statistics.components, epsilon=statistics.epsilon)
-    table.count = torch.stack([statistics.count[:, pool.start : pool.stop].sum(1) for pool in pools], 1)
-    table.sums = torch.stack([statistics.sums[:, :, pool.start : pool.stop].sum(2) for pool in pools], 2)
+    levels = [slice(pool.start, pool.stop) for pool in pools]
+    table.count = torch.stack([statistics.count[:, part].sum(1) for part in levels], 1)
+    table.sums = torch.stack([statistics.sums[:, :, part].sum(2) for part in levels], 2)
     return table
 
 

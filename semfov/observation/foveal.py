@@ -121,10 +121,7 @@ class FovealObservationModel(Pretrained):
         check_tensor(alpha, "alpha")
         check(not isinstance(classes, str), "classes", "a sequence of names", repr(classes))
         components = len(classes) + 1
-        borders = torch.as_tensor(edges, dtype=alpha.dtype, device=alpha.device).reshape(-1).clone()
-        check_finite(borders, "edges")
-        ascending = bool((borders.diff() > 0).all()) and bool((borders > 0).all())
-        check(ascending, "edges", "positive, ascending numbers", borders.tolist())
+        borders = _checked_borders(edges, alpha)
         shape = (components, len(borders) + 1, components)
         check(tuple(alpha.shape) == shape, "alpha", f"shape (K+1, N, K+1) = {shape}", tuple(alpha.shape))
         check_finite(alpha, "alpha")
@@ -142,14 +139,18 @@ class FovealObservationModel(Pretrained):
         powers = _table(exponents, "exponents", shape[1:2], alpha)
         refuted = torch.as_tensor(refutation).detach().to(alpha).clone()
         if rates is not None:
-            probable = bool(((rates >= 0) & (rates <= 1)).all())
-            check(probable, "miss_rate", "probabilities", "numbers outside [0, 1]")
+            are_probabilities = bool(((rates >= 0) & (rates <= 1)).all())
+            check(are_probabilities, "miss_rate", "probabilities", "numbers outside [0, 1]")
         check(0 <= float(refuted) <= 1, "refutation", "a number from 0 to 1", refutation)
         self.register_buffer("expected", _table(expected, "expected", shape, alpha))
         self.register_buffer("miss_rate", rates)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
-        self.log_prior = nn.Parameter(alpha.new_zeros(shape[:2]) if priors is None else priors)
-        self.log_exponents = nn.Parameter((alpha.new_ones(shape[1:2]) if powers is None else powers).log())
+        if priors is None:
+            priors = alpha.new_zeros(shape[:2])
+        if powers is None:
+            powers = alpha.new_ones(shape[1:2])
+        self.log_prior = nn.Parameter(priors)
+        self.log_exponents = nn.Parameter(powers.log())
         self.log_miss = None if odds is None else nn.Parameter(odds.log())
         self.refutation = nn.Parameter(refuted)
 
@@ -166,7 +167,8 @@ class FovealObservationModel(Pretrained):
             The model.
         """
         levels = len(edges) + 1
-        alpha = 1 + torch.eye(len(classes) + 1)[:, None].repeat(1, levels, 1)
+        unit = torch.eye(len(classes) + 1)
+        alpha = 1 + unit[:, None].repeat(1, levels, 1)
         return cls(alpha, edges, classes, **settings)
 
     @property
@@ -503,6 +505,15 @@ class FoldedObservationModel(FovealObservationModel):
 
     def _linear(self) -> tuple[Tensor, Tensor]:
         return self.weight, self.constant
+
+
+def _checked_borders(edges: Sequence[float] | Tensor, like: Tensor) -> Tensor:
+    """Check the borders of the levels of distance, and copy them, `(N - 1,)`."""
+    borders = torch.as_tensor(edges, dtype=like.dtype, device=like.device).reshape(-1).clone()
+    check_finite(borders, "edges")
+    are_ascending = bool((borders.diff() > 0).all()) and bool((borders > 0).all())
+    check(are_ascending, "edges", "positive, ascending numbers", borders.tolist())
+    return borders
 
 
 def _table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor) -> Tensor | None:

@@ -281,17 +281,18 @@ def _fixed_point(rows: Tensor) -> Tensor:
 def _gradient(rows: Tensor) -> Tensor:
     """Maximise by L-BFGS, started anew until a step of Newton's method would be short."""
     alpha = _first_guess(rows)
+    if not len(rows):
+        return alpha
     distance = torch.inf
-    for _ in range(_ROUNDS if len(rows) else 0):
+    for _ in range(_ROUNDS):
         # Close to the maximum the likelihood changes by less than its rounding error, so a line search would stall.
-        alpha = _descend(alpha, rows, "strong_wolfe" if distance > 1e-3 else None)
+        line_search = "strong_wolfe" if distance > 1e-3 else None
+        alpha = _descend(alpha, rows, line_search)
         step = (_response(alpha, _residual(alpha, rows)) / alpha).abs().amax(-1)
         if bool((step <= _tolerance(alpha.sum(-1))).all()):
             return alpha
         distance = float(step.max())
-    if len(rows):
-        raise _not_converged("gradient", len(rows))
-    return alpha
+    raise _not_converged("gradient", len(rows))
 
 
 def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:

@@ -105,8 +105,10 @@ def _interpolate(c: float) -> tuple[float, ...]:
     def rest(lift: NDArray[np.float64]) -> NDArray[np.float64]:
         """Subtract all other terms of h from h, at values of g."""
         x = (c + lift) / (1 - lift)
-        terms = (x - c) * (1 - 1 / x) + np.log1p(lift / c) + (0.5 - c) * np.log1p((x - c) / (c + 1))
-        return log_gamma_divergence(torch.from_numpy(x), c).numpy() - terms
+        linear = (x - c) * (1 - 1 / x)
+        terms = linear + np.log1p(lift / c) + (0.5 - c) * np.log1p((x - c) / (c + 1))
+        divergence = log_gamma_divergence(torch.from_numpy(x), c).numpy()
+        return divergence - terms
 
     # g Q(g) is 0 at 0, where the slopes of the other terms sum to 1/2 for every c.
     series = Chebyshev.interpolate(rest, 8, [-c, 1]).convert(kind=Polynomial)

@@ -70,11 +70,7 @@ class DirichletStatistics:
         Raises:
             InputError: a vector is off the simplex, an index is outside the table, or a sum would overflow.
         """
-        check_shape(scores, "scores", None, self.components)
-        check_finite(scores, "scores")
-        off = (scores.sum(-1) - 1).abs() > _OFF_SIMPLEX
-        check(not bool((scores < 0).any()), "scores", "no negative numbers", "some")
-        check(not bool(off.any()), "scores", "vectors that sum to 1", f"{int(off.sum())} that do not")
+        self._check_simplex(scores)
         scores = scores.reshape(-1, self.components)
         cells = self._cells(index, len(scores)).to(self.count.device)
         count = self.count + torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
@@ -85,8 +81,17 @@ class DirichletStatistics:
         shares = raised / (total.to(torch.float64) / 2.0**48)
         terms = torch.stack([shares.log(), shares, shares.square()]) * 2.0**_FRACTION_BITS
         self.count = count
-        self.sums.view(3, -1, self.components).index_add_(1, cells, terms.round().to(torch.int64))
+        sums_by_cell = self.sums.view(3, -1, self.components)
+        sums_by_cell.index_add_(1, cells, terms.round().to(torch.int64))
         return self
+
+    def _check_simplex(self, scores: Tensor) -> None:
+        """Raise `InputError` unless scores are points of the simplex, `(M, components)`."""
+        check_shape(scores, "scores", None, self.components)
+        check_finite(scores, "scores")
+        check(not bool((scores < 0).any()), "scores", "no negative numbers", "some")
+        is_off = (scores.sum(-1) - 1).abs() > _OFF_SIMPLEX
+        check(not bool(is_off.any()), "scores", "vectors that sum to 1", f"{int(is_off.sum())} that do not")
 
     def _cells(self, index: Tensor | Sequence[Tensor], samples: int) -> Tensor:
         """Check the cells of samples (`update`), and number them row by row, `(samples,)`."""
@@ -95,10 +100,11 @@ class DirichletStatistics:
         check(len(indices) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(indices))
         cells = torch.zeros(samples, dtype=torch.int64, device=indices[0].device)
         for row, size in zip(indices, sizes, strict=True):
-            integer = not row.is_floating_point() and row.dtype != torch.bool
-            check(integer and row.shape == (samples,), "index", f"({samples},) integers", (row.dtype, row.shape))
-            inside = bool(((row >= 0) & (row < size)).all())
-            check(inside, "index", f"numbers from 0 to {size - 1}", "one outside")
+            is_whole = not row.is_floating_point() and row.dtype != torch.bool
+            has_shape = row.shape == (samples,)
+            check(is_whole and has_shape, "index", f"({samples},) integers", (row.dtype, row.shape))
+            are_inside = bool(((row >= 0) & (row < size)).all())
+            check(are_inside, "index", f"numbers from 0 to {size - 1}", "one outside")
             cells = cells * size + row
         return cells
 
