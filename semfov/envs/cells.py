@@ -253,13 +253,15 @@ class CellGazes(Gazes[CellEpisode]):
     def begin(self, rows: Tensor, episodes: Sequence[CellEpisode]) -> None:
         super().begin(rows, episodes)
         scenes = [episode.scene for episode in episodes]
+        targets = None
         if self.searching:
             trials = [episode for episode in episodes if isinstance(episode, Trial)]
             self.targets[rows] = torch.tensor([trial.cue for trial in trials])
             self._right[rows] = _goals(trials, self._right.shape[1])
+            targets = self.targets[rows]
         else:
             self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])
-        self.looks.enter(rows, scenes, self.targets[rows] if self.searching else None)
+        self.looks.enter(rows, scenes, targets)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
         self.cell[rows] = torch.tensor([episode.start for episode in episodes])
         self._stimulus = None

@@ -209,8 +209,8 @@ class Gazes(ABC, Generic[_Episode]):
         """Show what the eye sees in the rows `(n,)`, `(n, side, side, 3)`."""
         # Scenes have sizes of their own, so that each view is resized alone.
         views = [interpolate(self._view(row), (side, side), mode="bilinear", antialias=True) for row in rows.tolist()]
-        pixels = torch.cat(views).clamp(0, 1).mul(255).round().byte().permute(0, 2, 3, 1)
-        return np.ascontiguousarray(pixels.numpy())
+        pixels = torch.cat(views).clamp(0, 1).mul(255).round().byte()
+        return np.ascontiguousarray(pixels.permute(0, 2, 3, 1).numpy())
 
     def infos(self, rows: Tensor, *, detections: bool = True) -> Arrays:
         """Tell what a learner may use beside the observations of some rows.

@@ -369,7 +369,10 @@ class ZoomScenery(_Surroundings[WindowEye]):
                 targets = self.episodes(picture)
                 if targets:
                     return picture, targets[random.integers(len(targets))]
-            elif not self.annotated or len(self.pictures.annotation(picture).boxes):
+                continue
+            # Nobody knows whether a picture without annotations shows objects.
+            may_have_objects = not self.annotated or len(self.pictures.annotation(picture).boxes) > 0
+            if may_have_objects:
                 return picture, 0
         raise DataError(
             "scenes: expected pictures with objects to look for, found none; give other pictures or targets"
@@ -404,17 +407,24 @@ class _PictureLooking(WindowLooking):
         super().__init__(config)
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
-        if self._source is not None and not isinstance(self._source, str | Path):
-            return self._source
-        if self._source is None or self.config.data.annotations is not None:
+        source = self._source
+        if source is None:
             return super().open_scenes(classes)
-        root = Path(self._source)
-        if not root.is_dir():
-            raise DataError(f"scenes: no such folder: {root}; check the path")
-        names = [path.name for path in root.iterdir() if path.suffix.lower() in PHOTOGRAPHS]
-        if not names:
-            raise DataError(f"scenes: expected pictures ({', '.join(PHOTOGRAPHS)}) in {root}, found none")
-        return Pictures(root, names, classes)
+        if not isinstance(source, str | Path):
+            return source
+        if self.config.data.annotations is not None:
+            return super().open_scenes(classes)
+        return _pictures_in(Path(source), classes)
+
+
+def _pictures_in(folder: Path, classes: tuple[str, ...]) -> Pictures:
+    """Open the pictures in a folder."""
+    if not folder.is_dir():
+        raise DataError(f"scenes: no such folder: {folder}; check the path")
+    names = [path.name for path in folder.iterdir() if path.suffix.lower() in PHOTOGRAPHS]
+    if not names:
+        raise DataError(f"scenes: expected pictures ({', '.join(PHOTOGRAPHS)}) in {folder}, found none")
+    return Pictures(folder, names, classes)
 
 
 def open_zoom_scenery(
@@ -508,7 +518,9 @@ def scenery_or_open(
     """
     expected = f"no options of `{opener.__name__}` beside it"
     check(scenery is None or not options, "scenery", expected, ", ".join(options))
-    is_scenery = scenery is None or hasattr(scenery, "classes")
-    check(is_scenery, "scenery", f"what `{opener.__name__}` makes", f"a {type(scenery).__name__}")
-    check_options(options, signature(opener).parameters.keys() - {"task"}, f"`{opener.__name__}`")
-    return opener(*task, **options) if scenery is None else scenery
+    if scenery is not None:
+        check(hasattr(scenery, "classes"), "scenery", f"what `{opener.__name__}` makes", f"a {type(scenery).__name__}")
+        return scenery
+    known_options = signature(opener).parameters.keys() - {"task"}
+    check_options(options, known_options, f"`{opener.__name__}`")
+    return opener(*task, **options)

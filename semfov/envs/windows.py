@@ -152,8 +152,9 @@ class WindowGaze(Gazes[_WindowEpisode]):
     def draw(self) -> NDArray[np.uint8]:
         """Picture of the windows that were looked at, and of the objects that were found."""
         image = self.scenery.image(self.episodes[0].scene)[None]
-        reduction = min(1.0, _PICTURE_SIDE / max(image.shape[-2:]))
-        size = [max(1, round(side * reduction)) for side in image.shape[-2:]]
+        shape = image.shape[-2:]
+        reduction = min(1.0, _PICTURE_SIDE / max(shape))
+        size = [max(1, round(side * reduction)) for side in shape]
         reduced = interpolate(image, size, mode="bilinear", antialias=True)[0]
         return render([plot_scanpath(self.looking.record(), reduced)])[0]
 
