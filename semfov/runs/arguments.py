@@ -47,14 +47,17 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
         if not word.startswith("--") or option not in options:
             usual.append(word)
             continue
-        hint = hints.get(option.removeprefix("--"))
+        setting = option.removeprefix("--")
+        hint = hints.get(setting)
         _check_given_once(option, hint, usual)
         value = text if has_value else _value_after(hint, words)
         if hint is Path:
             # As `--out "$FOLDER"` is where the variable is not set; it would be the present folder.
             following = words[0] if value is None and words else value
-            check(following != "", option.removeprefix("--"), "the name of a file or folder", "an empty one")
-        usual.append(option if value is None else f"{option}={_in_brackets(hint, value)}")
+            check(following != "", setting, "the name of a file or folder", "an empty one")
+        if value is not None:
+            option = f"{option}={_in_brackets(hint, value)}"
+        usual.append(option)
     return usual
 
 
@@ -157,14 +160,20 @@ def setting_types(config: type[CheckedSettings]) -> dict[str, object]:
     types: dict[str, object] = {}
     hints = get_type_hints(config, include_extras=True)
     for setting in fields(config):
-        hint = hints[setting.name]
-        if get_origin(hint) in (Union, UnionType):
-            alternatives = [option for option in get_args(hint) if option is not type(None)]
-            hint = alternatives[0] if len(alternatives) == 1 else hint
+        hint = _without_none(hints[setting.name])
         types[setting.name] = hint
         if isinstance(hint, type) and issubclass(hint, CheckedSettings):
-            types |= {f"{setting.name}.{name}": inner for name, inner in setting_types(hint).items()}
+            for name, inner_hint in setting_types(hint).items():
+                types[f"{setting.name}.{name}"] = inner_hint
     return types
+
+
+def _without_none(hint: object) -> object:
+    """Find the type of a setting that may also be None; others stay as they are."""
+    if get_origin(hint) not in (Union, UnionType):
+        return hint
+    alternatives = [alternative for alternative in get_args(hint) if alternative is not type(None)]
+    return alternatives[0] if len(alternatives) == 1 else hint
 
 
 def _is_list(hint: object) -> bool:
@@ -190,13 +199,16 @@ def _words_of(hint: object) -> list[str]:
 
 def _expected(hint: object) -> str | None:
     """Say what a setting must be; None for types that need more words."""
-    words = _words_of(hint)
+    words = [repr(word) for word in _words_of(hint)]
     if words:
-        return f"some of {', '.join(map(repr, words))}" if _is_list(hint) else " or ".join(map(repr, words))
+        return f"some of {', '.join(words)}" if _is_list(hint) else " or ".join(words)
     if get_origin(hint) is Annotated:
         base, *annotations = get_args(hint)
         nouns = [annotation.noun for annotation in annotations if annotation.noun is not None]
-        return " ".join([nouns[0] if nouns else NOUNS[base], *map(repr, annotations)])
+        noun = nouns[0] if nouns else NOUNS[base]
+        return " ".join([noun, *map(repr, annotations)])
     if hint is bool:
         return "true or false"
-    return NOUNS[hint] if hint is int or hint is float else None
+    if hint is int or hint is float:
+        return NOUNS[hint]
+    return None

@@ -210,6 +210,15 @@ class _Terminated(BaseException):
     """SIGTERM or SIGHUP was received; unfinished work is cleaned up before the process ends."""
 
 
+def _is_importing(frame: FrameType | None) -> bool:
+    """Tell whether a command is importing a module at a frame."""
+    while frame is not None and frame.f_code is not run_command.__code__:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
 @contextmanager
 def _signals(advice: str) -> Iterator[None]:
     """Let the first SIGINT, SIGTERM or SIGHUP end the command in good order, and the second one at once."""
@@ -220,13 +229,10 @@ def _signals(advice: str) -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         for ending in _ENDINGS:
             signal.signal(ending, _leave)
-        below = frame
-        while below is not None and below.f_code is not run_command.__code__:
-            if below.f_code.co_filename.startswith("<frozen importlib"):
-                # An exception from here would pass through the start of a native module, and some abort the process.
-                os.write(sys.stderr.fileno(), f"{_ENDINGS[number]}{advice}\n".encode())
-                _leave(number, frame)
-            below = below.f_back
+        if _is_importing(frame):
+            # An exception from here would pass through the start of a native module, and some abort the process.
+            os.write(sys.stderr.fileno(), f"{_ENDINGS[number]}{advice}\n".encode())
+            _leave(number, frame)
         raise KeyboardInterrupt if number == signal.SIGINT else _Terminated(number)
 
     signals = [number for number in _ENDINGS if signal.getsignal(number) != signal.SIG_IGN]

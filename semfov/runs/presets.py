@@ -92,10 +92,12 @@ def _exploration_presets(plain: _Presets, salient: _Presets) -> _Presets:
 
 
 def _with_both_scores(policies: _Presets) -> _Presets:
-    """Policies with raw and with calibrated scores, after which the presets are named."""
-    return {
-        f"{name}-{scores}": replace(policy, scores=scores) for name, policy in policies.items() for scores in _SCORED
-    }
+    """Make policies with raw and with calibrated scores, after which the presets are named."""
+    named = {}
+    for name, policy in policies.items():
+        for scores in _SCORED:
+            named[f"{name}-{scores}"] = replace(policy, scores=scores)
+    return named
 
 
 def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
@@ -113,15 +115,11 @@ def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
     """
     if isinstance(choice, str):
         return _preset(choice, task)
-    names = [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
+    names = policy_names(task)
+    if task == "search":
+        names = [*names, TARGET_EVIDENCE]
     lookup(choice.policy, names, "policy")
-    if choice.policy == Static.name and choice.saliency is None:
-        models = ", ".join(_SALIENCY_MODELS)
-        raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
-    for setting, words in _WORDS.items():
-        word = getattr(choice, setting)
-        if word is not None:
-            lookup(word, get_args(words), setting)
+    _check_words(choice)
     if choice.samples is not None:
         _check_takes_samples(choice, task)
     _check_scores(choice, task)
@@ -162,6 +160,17 @@ def _check_scores(choice: PolicyConfig, task: Task) -> None:
     )
 
 
+def _check_words(choice: PolicyConfig) -> None:
+    """Raise `InputError` for a setting that is none of its words, and for a saliency map that is not named."""
+    if choice.policy == Static.name and choice.saliency is None:
+        models = ", ".join(_SALIENCY_MODELS)
+        raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
+    for setting, words in _WORDS.items():
+        word = getattr(choice, setting)
+        if word is not None:
+            lookup(word, get_args(words), setting)
+
+
 def _check_own_belief(choice: PolicyConfig) -> None:
     """Raise `InputError` for settings of the map of all classes where the policy has a belief of its own."""
     for setting in _OF_THE_MAP:
@@ -175,7 +184,8 @@ def _check_own_belief(choice: PolicyConfig) -> None:
 
 def _based_on(choice: PolicyConfig, scores: Scores) -> PolicyConfig:
     """Make the preset that settings are based on, with some scores: a static policy is named by its saliency map."""
-    return PolicyConfig(choice.policy, scores, saliency=choice.saliency if choice.policy == Static.name else None)
+    saliency = choice.saliency if choice.policy == Static.name else None
+    return PolicyConfig(choice.policy, scores, saliency=saliency)
 
 
 def label(choice: str | PolicyConfig, task: Task) -> str:

@@ -56,14 +56,14 @@ class SceneResults:
         """Numbers of the finished scenes, whose outcomes are verified but not made."""
         return {row[0] for row in self._rows("SELECT * FROM scenes WHERE number < ?", scenes) if self._whole(*row)}
 
-    def items(self, scenes: int) -> Iterator[tuple[int, dict[str, Any]]]:
+    def items(self, scenes: int) -> Iterator[tuple[int, ResultRecord]]:
         """Yield the numbers and outcomes of finished scenes in their order, one at a time."""
         for row in self._rows("SELECT * FROM scenes WHERE number < ? ORDER BY number", scenes):
             result = self._read(*row)
             if result is not None:
                 yield row[0], result
 
-    def read(self, scenes: int) -> Iterator[dict[str, Any]]:
+    def read(self, scenes: int) -> Iterator[ResultRecord]:
         """Yield the outcomes of all scenes in their order, one at a time."""
         expected = 0
         for number, result in self.items(scenes):
@@ -127,19 +127,20 @@ class SceneResults:
         except Exception:  # whatever is wrong with the row, the scene can be run again
             return False
 
-    def _read(self, index: int, sha256: str, seconds: str, records: str) -> dict[str, Any] | None:
+    def _read(self, index: int, sha256: str, seconds: str, records: str) -> ResultRecord | None:
         """Read the outcomes of a row; None if it is damaged, or of a scene that has changed."""
         if not self._whole(index, sha256, seconds, records):
             return None
         try:
-            result = {"records": json.loads(records), "seconds": json.loads(seconds)}
+            outcomes = json.loads(records)
+            times = json.loads(seconds)
         except (ValueError, RecursionError):
             return None
-        records_are_formed = isinstance(result["records"], list) and all(
-            isinstance(record, dict) for record in result["records"]
-        )
-        seconds_are_formed = isinstance(result["seconds"], dict) and all(map(is_number, result["seconds"].values()))
-        return result if records_are_formed and seconds_are_formed else None
+        if not isinstance(outcomes, list) or not all(isinstance(outcome, dict) for outcome in outcomes):
+            return None
+        if not isinstance(times, dict) or not all(map(is_number, times.values())):
+            return None
+        return {"records": outcomes, "seconds": times}
 
     def _sha256(self, index: int, seconds: str, records: str) -> str:
         head = json.dumps([self.key, index, self.digest(index), seconds])

@@ -26,12 +26,9 @@ _Learned = TypeVar("_Learned", TargetEvidence, MapEvidence, Verification)
 
 def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> None:
     """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
-    if (data.root is None) != (data.annotations is None):
-        present, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
-        raise InputError(
-            f"data: expected both data.root and data.annotations, or neither for the embedded scenes, got {present} "
-            f"alone; add {missing}"
-        )
+    expected = "both data.root and data.annotations, or neither for the embedded scenes"
+    check(data.root is None or data.annotations is not None, "data", expected, "data.root alone; add data.annotations")
+    check(data.annotations is None or data.root is not None, "data", expected, "data.annotations alone; add data.root")
     if data.root is not None and not data.root.is_dir():
         raise DataError(f"data.root: no such folder: {data.root}; check the path")
     if data.annotations is not None and not data.annotations.exists():

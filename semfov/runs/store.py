@@ -81,7 +81,8 @@ class DetectionStore(SceneStore):
         rows = {action: tuple(map(float, self.encode(action))) for action in looks}
         actions = sorted(looks, key=rows.__getitem__)
         numbers = torch.tensor([rows[action] for action in actions], dtype=torch.float64)
-        self.write(digest, {"actions": numbers, **self.pack([looks[action] for action in actions])})
+        packed = self.pack([looks[action] for action in actions])
+        self.write(digest, {"actions": numbers, **packed})
 
     def encode(self, action: Any) -> Sequence[float]:
         """Write an action as numbers: itself, or -1 and the corners of a box."""

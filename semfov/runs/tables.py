@@ -6,11 +6,15 @@ from collections.abc import Sequence
 
 def table(rows: list[list[str]]) -> list[str]:
     """Write a Markdown table with aligned columns; the first row holds the headings."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
-    ]
-    return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
+    columns = zip(*rows, strict=True)
+    widths = [max(map(len, column)) for column in columns]
+    lines = []
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append(f"| {' | '.join(cells)} |")
+    rules = ["-" * (width + 2) for width in widths]
+    headings, *others = lines
+    return [headings, f"|{'|'.join(rules)}|", *others]
 
 
 def plus_minus(value: float, error: float, digits: int = 1, *, sign: str = "") -> str:

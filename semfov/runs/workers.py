@@ -19,7 +19,7 @@ from itertools import islice
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar, cast
 
 import torch
 
@@ -151,7 +151,7 @@ def run_tasks(
                 tell(task)
             return
         code = None if isinstance(processes, int) else package_digest()
-        job: Callable[[_Task], _Result] = _Job(function, make, settings, Path.cwd(), code).run
+        job = _Job(function, make, settings, Path.cwd(), code).run
         if isinstance(processes, int):
             yield from _in_processes(job, tasks, processes, title, tell)
         elif isinstance(processes, Executor):
@@ -171,31 +171,46 @@ def shared_processes() -> Iterator[None]:
             _shared.reset(before)
 
 
-class _Job(NamedTuple):
+class _Job(NamedTuple, Generic[_Made, _Task, _Result]):
     """A function and what it needs made, for workers that may have had other jobs; `code` is checked if it is given."""
 
-    function: Callable[[Any, Any], Any]
-    make: Callable[..., Any]
+    function: Callable[[_Made, _Task], _Result]
+    make: Callable[..., _Made]
     settings: tuple[object, ...]
     folder: Path
     code: str | None = None
 
-    def run(self, task: Any) -> Any:
+    def run(self, task: _Task) -> _Result:
         """Prepare the process unless its last task has, and run the task; threads of a worker take turns."""
         with _turn:
             if self.code is not None and package_digest() != self.code:
                 raise SemfovError("a worker has another version of semfov; install the same version on all machines")
-            if [(make, settings) for make, settings, _ in _ready] != [(self.make, self.settings)]:
-                _ready.clear()
-                if self.folder.is_dir():  # relative paths of the settings are those of the process that asks
-                    os.chdir(self.folder)
-                prepare_worker()
-                _ready.append((self.make, self.settings, self.make(*self.settings)))
-            return self.function(_ready[0][2], task)
+            return self.function(self._made(), task)
+
+    def _made(self) -> _Made:
+        """Give what the function needs; what another job has made in this process is dropped."""
+        for ready in _ready:
+            if (ready.make, ready.settings) == (self.make, self.settings):
+                return cast(_Made, ready.made)
+        _ready.clear()
+        if self.folder.is_dir():  # relative paths of the settings are those of the process that asks
+            os.chdir(self.folder)
+        prepare_worker()
+        made = self.make(*self.settings)
+        _ready.append(_Ready(self.make, self.settings, made))
+        return made
+
+
+class _Ready(NamedTuple):
+    """What a process has made, and by what."""
+
+    make: Callable[..., object]
+    settings: tuple[object, ...]
+    made: object
 
 
 _turn = threading.Lock()
-_ready: list[tuple[Callable[..., Any], tuple[object, ...], Any]] = []  # what this process has made, behind what made it
+_ready: list[_Ready] = []  # at most one, that of the last job
 
 
 def _results(
