@@ -197,8 +197,11 @@ def warn_of_form(boxes: torch.Tensor, limits: torch.Tensor, path: object, *, sta
     """
     if not len(boxes):
         return
-    are_ordered = (boxes[:, 2:] > boxes[:, :2]) & (boxes[:, 2:] <= limits[:, 2:] + 1)
-    leaves_picture = (boxes[:, :2] + boxes[:, 2:] > limits[:, 2:] + 1).any(-1)
+    first = boxes[:, :2]
+    last = boxes[:, 2:]
+    size = limits[:, 2:]
+    are_ordered = (last > first) & (last <= size + 1)
+    leaves_picture = (first + last > size + 1).any(-1)
     # A picture of one or two pixels may have such boxes in pixels.
     if float(boxes.max()) <= 1 and float(limits.min()) > 2:
         form = "fractions of the picture"

@@ -109,7 +109,8 @@ class CocoScenes(Scenes):
         self._files = _files_of(root, names)
         # Names and sizes tell another copy of the images apart without reading them.
         settings = [file.digest, self.classes, self.ids, max_target_area, coverage, crowd]
-        self.fingerprint = json_sha256([settings, names, [path.stat().st_size for path in self._files]])
+        sizes = [path.stat().st_size for path in self._files]
+        self.fingerprint = json_sha256([settings, names, sizes])
 
     def _rows_of(self, ids: Collection[int | str] | None) -> list[int]:
         """Find the rows of the images to select from, ascending; raises `DataError` for ids of no image."""

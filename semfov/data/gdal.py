@@ -164,7 +164,9 @@ def _check_opened(file: Dataset, held: int, path: Path) -> None:
     names = {key.upper() for key in file.tags(ns="OVERVIEWS")}
     expected = "a raster with overviews of its own"
     check_data("OVERVIEW_FILE" not in names, path, expected, "one that names another file")
-    block = max(math.prod(shape) for shape in file.block_shapes) * file.count * np.dtype(file.dtypes[0]).itemsize
+    pixels = max(math.prod(shape) for shape in file.block_shapes)
+    bytes_a_pixel = file.count * np.dtype(file.dtypes[0]).itemsize
+    block = pixels * bytes_a_pixel
     got = f"{block:,}; convert it to a tiled TIFF"
     check_data(block <= _MOST_BLOCK, path, f"tiles of at most {_MOST_BLOCK:,} bytes", got)
 

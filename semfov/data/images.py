@@ -371,6 +371,9 @@ class PhotographPicture(LargePicture):
     """A picture in a file that Pillow decodes as a whole, when the first window is read.
 
     Private attribute: `_array` has the decoded bytes `(H, W, 3)`; None before.
+
+    Invariant: once it is there, `_array` is all that windows are read from, and it has the size that was found when the
+    file was opened; a file that is changed or removed afterwards changes nothing.
     """
 
     path: Path

@@ -147,17 +147,22 @@ def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum
     if boxes.shape[0] == 0:
         return 0.0
     x1, y1, x2, y2 = boxes.double().unbind(-1)
-    if coverage == "sum":
-        area = ((x2 - x1) * (y2 - y1)).sum()
-    else:
-        xs = torch.cat([x1, x2]).unique()
-        ys = torch.cat([y1, y2]).unique()
-        # Which of the columns and of the rows between these edges each box covers.
-        columns = (x1[:, None] <= xs[:-1]) & (xs[1:] <= x2[:, None])
-        rows = (y1[:, None] <= ys[:-1]) & (ys[1:] <= y2[:, None])
-        covered = (rows.double().T @ columns.double() > 0).double()  # by any box
-        area = ys.diff() @ covered @ xs.diff()
-    return float(area) / (size[0] * size[1])
+    areas = (x2 - x1) * (y2 - y1)
+    covered = areas.sum() if coverage == "sum" else _union_area(x1, y1, x2, y2)
+    width, height = size
+    return float(covered) / (width * height)
+
+
+def _union_area(x1: Tensor, y1: Tensor, x2: Tensor, y2: Tensor) -> Tensor:
+    """Compute the area that boxes cover together, `()`, by the rectangles between all their edges, `(N,)` each."""
+    xs = torch.cat([x1, x2]).unique()
+    ys = torch.cat([y1, y2]).unique()
+    # Which of the columns and of the rows between these edges each box covers.
+    columns = (x1[:, None] <= xs[:-1]) & (xs[1:] <= x2[:, None])
+    rows = (y1[:, None] <= ys[:-1]) & (ys[1:] <= y2[:, None])
+    boxes_over = rows.double().T @ columns.double()  # how many boxes cover each rectangle
+    is_covered = (boxes_over > 0).double()
+    return ys.diff() @ is_covered @ xs.diff()
 
 
 def boxes_meet(box: Sequence[float], other: Sequence[float]) -> bool:

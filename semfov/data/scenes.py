@@ -82,11 +82,13 @@ class _Part(NamedTuple):
         end = torch.tensor([right, bottom, right, bottom]).float()
         boxes = objects.boxes.clamp(corner, end)
         in_part = _areas(boxes) >= _LEAST_SEEN * _areas(objects.boxes)
+        width = right - left
+        height = bottom - top
         x1, y1, x2, y2 = (boxes[in_part] - corner).unbind(-1)
         if self.mirrored:
-            x1, x2 = right - left - x2, right - left - x1
+            x1, x2 = width - x2, width - x1
         visible = torch.stack([x1, y1, x2, y2], -1)
-        return Annotation(visible, objects.labels[in_part], objects.crowd[in_part], (right - left, bottom - top))
+        return Annotation(visible, objects.labels[in_part], objects.crowd[in_part], (width, height))
 
     def image(self) -> Tensor:
         """Cut out the pixels, `(3, H, W)`."""

@@ -375,6 +375,9 @@ class _Recording:
     Private attributes, all of the frames so far: `_read` counts those that were read, and `_gaps` those that were lost
     between them; `_missed` counts attempts since the last frame that gave none; `_waited` has the seconds for which a
     stream was away since then.
+
+    Invariant: an attempt that gives no frame is counted by `_missed`, which the next frame moves to `_gaps["lost"]`;
+    those that no frame follows are left out, as the number of frames that a file states tells what was lost at its end.
     """
 
     def __init__(

@@ -215,6 +215,9 @@ class _Tiles:
 
     Private attributes: `_decoded` keeps strips that are the whole picture, by page and number, as each window would
     decode them again. `_lock` is held while the place in the file is moved.
+
+    Invariant: tiles of a grid cover the picture without overlaps, `columns` by `rows` of them; those of the last column
+    and the last row may reach beyond it. `_decoded` is empty for pictures of several tiles.
     """
 
     def __init__(self, path: Path, file: "TiffFile", page: _Page, layers: Sequence[_Layer]) -> None:

@@ -180,6 +180,9 @@ class _Reader:
         has_overviews: of each file of the sources read so far, whether it has reduced copies.
 
     Private attribute: `_files` has these files, which are checked, by the names in the text.
+
+    Invariant: a file is in `_files` only after it was found to lie in the folder of the mosaic or below and to be a
+    picture, and is then in `has_overviews`, too; no other file is opened.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], open_source: Callable[[Path], Dataset]) -> None:

@@ -56,7 +56,8 @@ def _merge_fixation(
     cut = ~in_full[index, crop[index]]
     sharpness = -crop[index]
     columns = (boxes[index], score, label, crop[index], cut, sharpness)
-    objects = index[unlike(*(column.cpu() for column in columns))[:limit].to(index)]
+    distinct = unlike(*(column.cpu() for column in columns))
+    objects = index[distinct[:limit].to(index)]
     return rows.take(objects)[None]
 
 

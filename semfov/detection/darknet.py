@@ -164,6 +164,9 @@ class _Builder:
 
     `_here` is the shape of the last output, before the first layer that of the image. `_pixels` are those of the image
     at the input size of the cfg, and `_parameters` those of all layers so far, for the limits.
+
+    Invariant: after `add`, `shapes` and `sources` have one entry more, at the layer's number, all of whose sources are
+    smaller numbers; and `_here` is the last shape.
     """
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
@@ -277,12 +280,14 @@ class _Builder:
         anchors = list(zip(numbers[::2], numbers[1::2], strict=False))
         every_anchor = ",".join(map(str, range(len(anchors))))
         mask = section.integers("mask", every_anchor)
-        paired = len(numbers) % 2 == 0 and bool(mask) and all(0 <= index < len(anchors) for index in mask)
+        are_pairs = len(numbers) % 2 == 0
+        is_mask = bool(mask) and all(0 <= index < len(anchors) for index in mask)
         got = f"{len(numbers)} numbers and the mask {mask}"
-        section.check(paired, "pairs of anchors and a mask of their indices", got)
+        section.check(are_pairs and is_mask, "pairs of anchors and a mask of their indices", got)
         scale = section.numbers("scale_x_y", "1")
         section.check(len(scale) == 1, "one number", excerpt(section.text("scale_x_y", "1")), "scale_x_y")
-        head = Head(tuple(anchors[index] for index in mask), section.integer("classes", 20), scale[0])
+        anchors_of_head = tuple(anchors[index] for index in mask)
+        head = Head(anchors_of_head, section.integer("classes", 20), scale[0])
         section.check(head.channels == self._here.channels, f"{head.channels} channels", self._here.channels)
         self._note(self._here, self._previous)
         return head

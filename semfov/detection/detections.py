@@ -29,10 +29,11 @@ def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
     elif not scores.is_floating_point():
         scores = scores.float()
     check_shape(scores, "scores", len(labels))
-    in_range = bool(((labels >= 1) & (labels <= classes)).all())
-    check(in_range, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
-    # The comparison also refuses NaN.
-    check(bool(((scores >= 0) & (scores <= 1)).all()), "scores", "numbers from 0 to 1", scores.tolist()[:3])
+    are_classes = bool(((labels >= 1) & (labels <= classes)).all())
+    largest = sorted(set(labels.tolist()))[-3:]
+    check(are_classes, "labels", f"classes from 1 to {classes}", largest)
+    are_scores = bool(((scores >= 0) & (scores <= 1)).all())  # NaN is neither
+    check(are_scores, "scores", "numbers from 0 to 1", scores.tolist()[:3])
     vectors = scores.new_zeros(len(labels), classes + 1)
     vectors[:, 0] = 1 - scores
     return vectors.scatter(1, labels[:, None], scores[:, None])

@@ -228,8 +228,9 @@ def _cut_by_windows(boxes: Tensor, windows: Tensor, side: Tensor, size: tuple[fl
     else:
         upper = torch.tensor(size)
     border = _BORDER * side[:, None]
-    at_low_border = (boxes - windows <= border)[:, :2] & (windows[:, :2] > lower)
-    at_high_border = (boxes - windows >= -border)[:, 2:] & (windows[:, 2:] < upper)
+    distance = boxes - windows
+    at_low_border = (distance <= border)[:, :2] & (windows[:, :2] > lower)
+    at_high_border = (distance >= -border)[:, 2:] & (windows[:, 2:] < upper)
     return at_low_border.any(-1) | at_high_border.any(-1)
 
 
@@ -304,21 +305,27 @@ def unlike(
     """
     # Best first: boxes that are not cut, of these the sharpest, of these the most confident. The sorts are stable, so
     # the last key comes first.
+    # The best box first: whole before cut, then sharper, then more confident. Sorts are stable, so the last one leads.
     order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
     corners, classes, look, is_cut = (column[order].numpy() for column in (boxes, labels.double(), looks, cut))
     better, worse, shared = _overlapping_pairs(corners, classes, around)
+
     x1, y1, x2, y2 = corners.T
     area = (x2 - x1) * (y2 - y1)
     union = area[better] + area[worse] - shared
-    same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
+    overlap = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
+    is_same = overlap >= np.float32(iou)
     # Boxes without area share none; equal ones are one object all the same.
     empty = np.flatnonzero(union <= 0)
-    same[empty] = (corners[better[empty]] == corners[worse[empty]]).all(-1)
+    is_same[empty] = (corners[better[empty]] == corners[worse[empty]]).all(-1)
     share_of_worse = shared / np.maximum(area, 1e-6)[worse]
-    same |= (share_of_worse >= np.float32(inside)) & is_cut[worse] & (look[better] != look[worse])
-    index = order[torch.from_numpy(_survivors(len(corners), better[same], worse[same]))]
+    is_inside = share_of_worse >= np.float32(inside)
+    is_same |= is_inside & is_cut[worse] & (look[better] != look[worse])
+
+    survivors = _survivors(len(corners), better[is_same], worse[is_same])
+    index = order[torch.from_numpy(survivors)]
     return index[scores[index].argsort(descending=True, stable=True)]
 
 

@@ -37,15 +37,17 @@ def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candi
     if values_known(raw) and raw.numel():
         # Exports with boxes as fractions of the canvas have the same shape.
         least, greatest = map(float, raw[..., :4].detach().aminmax())
-        form = "offsets from cells and logarithms of sizes, some of them below 0"
-        as_fractions = "numbers from 0 to 1, as fractions of the canvas"
-        check(not 0 <= least < greatest <= 1, "output of the head", form, as_fractions)
+        are_fractions = 0 <= least < greatest <= 1
+        expected = "offsets from cells and logarithms of sizes, some of them below 0"
+        got = "numbers from 0 to 1, as fractions of the canvas"
+        check(not are_fractions, "output of the head", expected, got)
     grid = cell_grid(raw.shape[1], canvas, strides, 0.0, raw.dtype, raw.device)
     cell = grid[:, :2]
     stride = grid[:, 2:]
     centre = (raw[..., 0:2] + cell) * stride
     size = raw[..., 2:4].exp() * stride
-    return Candidates(corners(torch.cat([centre, size], -1)), raw[..., 5:], raw[..., 4])
+    boxes = corners(torch.cat([centre, size], -1))
+    return Candidates(boxes, classes=raw[..., 5:], objectness=raw[..., 4])
 
 
 def decode_yolov5(rows: Tensor) -> Candidates:
@@ -163,7 +165,8 @@ def decode_distances(
     grid = cell_grid(distances.shape[1], canvas, strides, offset, distances.dtype, distances.device)
     stride = grid[:, 2:]
     point = grid[:, :2] * stride
-    expected_bin = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
+    chances = distances.unflatten(-1, (4, bins)).softmax(-1)
+    expected_bin = chances @ torch.arange(bins).to(distances)
     distance = expected_bin * stride
     upper_left = point - distance[..., :2]
     lower_right = point + distance[..., 2:]

@@ -183,13 +183,13 @@ class OnnxSession:
         inputs = self._session.get_inputs()
         images = [node for node in inputs if len(node.shape) == 4 and node.type in _FLOATS]
         description = ", ".join(f"{node.name} {node.shape} {node.type}" for node in inputs)
-        rgb = len(images) == 1 and _sizes(images[0].shape)[1] in (3, None)
-        check(rgb, self.path.name, "one floating-point input (B, 3, H, W)", description)
+        takes_rgb = len(images) == 1 and _sizes(images[0].shape)[1] in (3, None)
+        check(takes_rgb, self.path.name, "one floating-point input (B, 3, H, W)", description)
         image = images[0]
-        extra = tuple(node.name for node in inputs if node is not image)
+        others = tuple(node.name for node in inputs if node is not image)
         expected = f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}"
-        check(set(extra) <= set(_EXTRA_INPUTS), self.path.name, expected, description)
-        return _Inputs(image.name, _sizes(image.shape), _FLOATS[image.type], extra)
+        check(set(others) <= set(_EXTRA_INPUTS), self.path.name, expected, description)
+        return _Inputs(image.name, _sizes(image.shape), _FLOATS[image.type], others)
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model on images, without gradients, in parts where its batch size is fixed.

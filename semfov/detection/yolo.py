@@ -150,19 +150,22 @@ class YoloV3(Detector):
         """Compute all boxes of all heads, and the maps of layers by name, by the runtime that this canvas allows."""
         check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
         twin = self._twin
-        if twin is not None and self._choose_runtime(twin.obstacle_here(self.network, canvas)) == "onnxruntime":
-            return twin(self.network, canvas, layers)
+        if twin is not None:
+            obstacle = twin.obstacle_here(self.network, canvas)
+            if self._choose_runtime(obstacle) == "onnxruntime":
+                return twin(self.network, canvas, layers)
         modules = {layer: self.network.layers[number] for layer, number in layers.items()}
+        dtype = next(self.network.parameters()).dtype
         with record_maps(modules) as maps_by_layer:
-            raw_maps = self.network(canvas.to(next(self.network.parameters()).dtype))
-        size = (canvas.shape[-1], canvas.shape[-2])
+            raw_maps = self.network(canvas.to(dtype))
+        height, width = canvas.shape[-2:]
         boxes = []
         classes = []
         objectness = []
         for raw, head in zip(raw_maps, self.network.heads, strict=True):
             # Half precision is too coarse for pixels.
             precise = raw.float() if raw.dtype in HALVES else raw
-            candidates = decode_yolo(precise, head.anchors, size, head.scale)
+            candidates = decode_yolo(precise, head.anchors, (width, height), head.scale)
             boxes.append(candidates.boxes)
             classes.append(candidates.classes)
             objectness.append(cast(Tensor, candidates.objectness))

@@ -247,7 +247,8 @@ class WindowEye(nn.Module):
         x1, x2, u1, u2 = _window_pixels(x, magnification, width, picture.size[0], left, right, reduction)
         y1, y2, v1, v2 = _window_pixels(y, magnification, height, picture.size[1], top, bottom, reduction)
         frame = x1, y1, x2, y2, u1, v1, u2, v2
-        pixels = resized(picture.read((x1, y1, x2, y2), reduction), (v2 - v1, u2 - u1)).to(padding.dtype)
+        window = picture.read((x1, y1, x2, y2), reduction)
+        pixels = resized(window, (v2 - v1, u2 - u1)).to(padding.dtype)
         if (u1, v1, u2, v2) == (0, 0, width, height):
             return pixels, frame
         canvas = padding.expand(1, 3, height, width).contiguous(memory_format=torch.channels_last)

@@ -134,9 +134,11 @@ class _GistCells(NamedTuple):
         rows, columns = self.shape
         # One array for all numbers: arrays this small spend their time in calls.
         origin, pitch, last = np.array([self.origin, self.pitch, (columns - 1, rows - 1)], np.float32)
-        cell = ((boxes[:, :2] + boxes[:, 2:]) / 2 - origin) / pitch
-        across, down = np.minimum(np.maximum(cell, 0), last).astype(np.intp).T
-        return down * columns + across
+        centres = (boxes[:, :2] + boxes[:, 2:]) / 2
+        cells = (centres - origin) / pitch
+        nearest = np.minimum(np.maximum(cells, 0), last)
+        column, row = nearest.astype(np.intp).T
+        return row * columns + column
 
 
 def _found_objects(detections: Detections) -> tuple[NDArray[np.float32], NDArray[np.intp]]:

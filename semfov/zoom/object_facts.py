@@ -237,10 +237,12 @@ def _better_neighbours(
         Four measures `(M,)`: of objects of the same class the overlap, the share of this object inside the other, and
         the share of the other inside this one; and the overlap with objects of other classes.
     """
-    pair = np.flatnonzero((object_of[overlaps.first] >= 0) & (object_of[overlaps.second] >= 0))
+    are_objects = (object_of[overlaps.first] >= 0) & (object_of[overlaps.second] >= 0)
+    pair = np.flatnonzero(are_objects)
     one = object_of[overlaps.first[pair]]
     other = object_of[overlaps.second[pair]]
-    is_worse = (best[other] > best[one]) | ((best[other] == best[one]) & (other < one))
+    is_tie = best[other] == best[one]
+    is_worse = (best[other] > best[one]) | (is_tie & (other < one))
     pair = pair[is_worse]
     worse = one[is_worse]
     weight = 1 / (1 + np.exp(-best[other[is_worse]]))

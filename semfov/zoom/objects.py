@@ -121,8 +121,10 @@ def _fused(index: Tensor, detected: DetectedBoxes) -> Tensor:
     labels = detected.labels.numpy()
     is_whole = ~detected.cut.numpy()
     object_of = object_of_box(chosen, len(detected.boxes))
-    counts = (object_of[first] >= 0) & is_whole[first] & is_whole[second] & (labels[first] == labels[second])
-    counts &= overlaps.shared >= SAME * overlaps.union
+    is_of_object = object_of[first] >= 0
+    are_whole = is_whole[first] & is_whole[second]
+    are_alike = (labels[first] == labels[second]) & (overlaps.shared >= SAME * overlaps.union)
+    counts = is_of_object & are_whole & are_alike
     objects = object_of[first[counts]]
     others = second[counts]
     weight = (detected.scores * detected.magnifications.square()).double().numpy()
