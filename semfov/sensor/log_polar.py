@@ -345,7 +345,7 @@ def _shares(
     retina = _Retina(*numbers)
     rings, _ = retina.receptors(size)
     top = retina.levels(size)
-    # A ring reads the two levels around its own, which is no whole number, with weights that sum to 1.
+    # A ring reads the two levels around its own, which need not be a whole number, with weights that sum to 1.
     levels = [min(retina.level(retina.eccentricity(ring)), top) for ring in range(rings)]
     shares = []
     for level in range(top + 1):
