@@ -14,11 +14,13 @@ except ImportError:
 from semfov.envs.environment import EpisodeEnv, GazeEnv, GazeExplore, GazeSearch, ZoomEnv
 from semfov.envs.registration import register
 from semfov.envs.scenery import open_scenery, open_zoom_scenery
+from semfov.envs.state import EnvState
 from semfov.envs.vector import GazeVectorEnv
 
 register()
 
 __all__ = [
+    "EnvState",
     "EpisodeEnv",
     "GazeEnv",
     "GazeExplore",

@@ -6,6 +6,7 @@ All looks that an episode can make are stored, so that a gaze shift reads a row 
                                            └──────────────────────────► table of detections ──row + cell──► infos
 """
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -116,6 +117,14 @@ class _SceneLooks(Looks):
         if self._detections is None:
             self._detections = Detections.stack([looks.detections for looks in self._scenes.values()])
         return self._detections
+
+
+class _SavedLooks(NamedTuple):
+    """What looks from cell to cell have shown: the fixated cells `(B,)`, the belief, and looks kept for pictures."""
+
+    cell: Tensor
+    memory: Memory
+    trace: Trace | None
 
 
 class CellGazes(Gazes[CellEpisode]):
@@ -252,6 +261,16 @@ class CellGazes(Gazes[CellEpisode]):
     @torch.inference_mode()
     def begin(self, rows: Tensor, episodes: Sequence[CellEpisode]) -> None:
         super().begin(rows, episodes)
+        self._enter(rows, episodes)
+        self.cell[rows] = torch.tensor([episode.start for episode in episodes])
+        self._stimulus = None
+        self._trace = self._new_trace() if self.pictures else None
+        self._see(rows, Memory.empty(self.looks, self.observer, len(rows)))
+        self._rate(rows)
+        self._extend_trace()
+
+    def _enter(self, rows: Tensor, episodes: Sequence[CellEpisode]) -> None:
+        """Take the scenes, the targets and the goals of episodes."""
         scenes = [episode.scene for episode in episodes]
         targets = None
         if self.searching:
@@ -263,12 +282,18 @@ class CellGazes(Gazes[CellEpisode]):
             self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])
         self.looks.enter(rows, scenes, targets)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
-        self.cell[rows] = torch.tensor([episode.start for episode in episodes])
+
+    @torch.inference_mode()
+    def _saved_looks(self) -> _SavedLooks:
+        return _SavedLooks(self.cell.clone(), self.memory, copy.deepcopy(self._trace))
+
+    @torch.inference_mode()
+    def _restore_looks(self, looks: _SavedLooks) -> None:
+        self._enter(torch.arange(self.count), self.episodes)
+        self.cell = looks.cell.clone()
+        self.memory = looks.memory
         self._stimulus = None
-        self._trace = self._new_trace() if self.pictures else None
-        self._see(rows, Memory.empty(self.looks, self.observer, len(rows)))
-        self._rate(rows)
-        self._extend_trace()
+        self._trace = copy.deepcopy(looks.trace)
 
     @torch.inference_mode()
     def _look(self, rows: Tensor, actions: Tensor) -> Tensor:

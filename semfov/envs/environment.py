@@ -1,5 +1,6 @@
 """The environments for `gymnasium.make`: one episode at a time, with cells or with windows as actions."""
 
+import copy
 from collections.abc import Mapping
 from typing import ClassVar, get_args
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from semfov.envs.cells import CellGazes
 from semfov.envs.gazes import Arrays, GazeSettings, check_options_of_reset
 from semfov.envs.scenery import Scenery, ZoomScenery, open_scenery, open_zoom_scenery, scenery_or_open
+from semfov.envs.state import EnvState, check_state
 from semfov.envs.windows import WindowGaze
 from semfov.errors import InputError, check, lookup
 from semfov.gaze.acquisition.base import Task
@@ -46,6 +48,7 @@ class EpisodeEnv(gymnasium.Env[Arrays, object], EzPickle):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 (Gymnasium has it so)
     gazes: CellGazes | WindowGaze
+    scenery: Scenery | ZoomScenery
 
     def __init__(self, gazes: CellGazes | WindowGaze, render_mode: str | None = None) -> None:
         check(render_mode in (None, "rgb_array"), "render_mode", "'rgb_array' or None", repr(render_mode))
@@ -101,6 +104,39 @@ class EpisodeEnv(gymnasium.Env[Arrays, object], EzPickle):
         observation, info = self._observed()
         return observation, float(outcome.reward), terminated, truncated, info
 
+    def save_state(self) -> EnvState:
+        """Save the episode in progress, and the random numbers to come, for a search in the tree of actions.
+
+        Returns:
+            The state, which later steps leave as it is.
+
+        Raises:
+            InputError: no episode was started.
+
+        Example::
+
+            state = env.save_state()
+            for action in range(env.action_space.n):
+                env.restore(state)
+                _, reward, *_ = env.step(action)
+        """
+        randoms = (copy.deepcopy(self.np_random),)
+        return EnvState(self.scenery, self.gazes.task, self.gazes.save(), randoms, (self._over,))
+
+    def restore(self, state: EnvState) -> None:
+        """Go back to a saved state; all that follows is the same, bit by bit.
+
+        Args:
+            state: a state of this environment, or of one with the same scenery and task. It can be restored again.
+
+        Raises:
+            InputError: it is the state of another environment.
+        """
+        check_state(state, self.scenery, self.gazes.task, 1)
+        self.gazes.restore(state.gazes)
+        self.np_random = copy.deepcopy(state.randoms[0])
+        self._over = state.over[0]
+
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the last look: the scanpath, the foveated view and the belief, or the windows and found objects.
 
@@ -146,6 +182,7 @@ class GazeEnv(EpisodeEnv):
 
     task: ClassVar[Task]
     gazes: CellGazes
+    scenery: Scenery
 
     def __init__(
         self,
@@ -248,6 +285,7 @@ class ZoomEnv(EpisodeEnv):
     """
 
     gazes: WindowGaze
+    scenery: ZoomScenery
 
     def __init__(
         self,

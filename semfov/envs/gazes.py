@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 
 from semfov.detection.detections import Detections
 from semfov.envs.scenery import Scenery, ZoomScenery
-from semfov.errors import check, check_number, check_whole
+from semfov.errors import InputError, check, check_number, check_whole
 from semfov.gaze.acquisition.base import Task
 
 Arrays = dict[str, Any]
@@ -73,6 +73,22 @@ class Outcome(NamedTuple):
     reward: Tensor
     terminated: Tensor
     truncated: Tensor
+
+
+class SavedGazes(NamedTuple):
+    """State of a batch of episodes.
+
+    Attributes:
+        episodes: the episodes of the rows.
+        shift: `(B,)`, number of gaze shifts so far.
+        result: `(B,)`, results of the last looks.
+        looks: what the kind of gazes keeps of its looks.
+    """
+
+    episodes: tuple[Any, ...]
+    shift: Tensor
+    result: Tensor
+    looks: Any
 
 
 class Gazes(ABC, Generic[_Episode]):
@@ -184,6 +200,30 @@ class Gazes(ABC, Generic[_Episode]):
         truncated = ~done & (self.shift[rows] >= self.scenery.shifts)
         return Outcome(self.find * gain.double() - self.price, done, truncated)
 
+    def save(self) -> SavedGazes:
+        """Save the state of all episodes.
+
+        Returns:
+            The state. Later steps leave it as it is.
+
+        Raises:
+            InputError: no episode was started.
+        """
+        if not self.episodes:
+            raise InputError("save_state: expected an episode, got none; call reset first")
+        return SavedGazes(tuple(self.episodes), self.shift.clone(), self.result.clone(), self._saved_looks())
+
+    def restore(self, saved: SavedGazes) -> None:
+        """Go back to a state that `save` gave.
+
+        Args:
+            saved: the state, which can be restored again.
+        """
+        self.episodes = list(saved.episodes)
+        self._restore_looks(saved.looks)
+        self.shift = saved.shift.clone()
+        self.result = saved.result.clone()
+
     def observe(self, rows: Tensor) -> Arrays:
         """Observe some rows.
 
@@ -234,6 +274,14 @@ class Gazes(ABC, Generic[_Episode]):
             # Gymnasium requires infos of constant shape: as many rows as the detector can give.
             entries["detections"] = _padded(self.detections(rows), self.scenery.eye.detector.selection.limit)
         return entries
+
+    @abstractmethod
+    def _saved_looks(self) -> object:
+        """Save what the looks of the episodes have shown."""
+
+    @abstractmethod
+    def _restore_looks(self, looks: Any) -> None:
+        """Go back to what `_saved_looks` gave; `episodes` are those of that time."""
 
     @abstractmethod
     def planes(self, rows: Tensor) -> NDArray[np.float32]:

@@ -1,5 +1,6 @@
 """Many episodes side by side for `gymnasium.make_vec`, with cells as actions."""
 
+import copy
 from collections.abc import Collection, Mapping, Sequence
 from typing import get_args
 
@@ -14,6 +15,7 @@ from torch import Tensor
 from semfov.envs.cells import CellGazes
 from semfov.envs.gazes import Arrays, GazeSettings, check_options_of_reset
 from semfov.envs.scenery import Scenery, open_scenery, scenery_or_open
+from semfov.envs.state import EnvState, check_state
 from semfov.errors import InputError, check, check_whole, lookup
 from semfov.gaze.acquisition.base import Task
 
@@ -206,6 +208,34 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
                 self._start(ended, {})
         observations, infos = self._observed()
         return observations, reward, terminated, truncated, infos | final
+
+    def save_state(self) -> EnvState:
+        """Save all episodes in progress, and the random numbers to come (`GazeEnv.save_state`).
+
+        Returns:
+            The state, which later steps leave as it is.
+
+        Raises:
+            InputError: no episode was started.
+        """
+        over = (self._terminated.clone(), self._truncated.clone())
+        return EnvState(self.scenery, self.task, self.gazes.save(), tuple(copy.deepcopy(self._randoms)), over)
+
+    def restore(self, state: EnvState) -> None:
+        """Go back to a saved state; all that follows is the same, bit by bit.
+
+        Args:
+            state: a state of this environment, or of one with the same scenery, task and number of episodes.
+
+        Raises:
+            InputError: it is the state of another environment.
+        """
+        check_state(state, self.scenery, self.task, self.num_envs)
+        self.gazes.restore(state.gazes)
+        self._randoms = copy.deepcopy(list(state.randoms))
+        terminated, truncated = state.over
+        self._terminated = terminated.clone()
+        self._truncated = truncated.clone()
 
     def _checked(self, actions: NDArray[np.int64]) -> Tensor:
         """Check that actions are a cell for each environment, `(num_envs,)`."""

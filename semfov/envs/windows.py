@@ -33,6 +33,13 @@ class _WindowEpisode(NamedTuple):
     target: int
 
 
+class _SavedLooks(NamedTuple):
+    """Looks from window to window: the present window, and the different windows in their order."""
+
+    window: Window
+    windows: tuple[Window, ...]
+
+
 class WindowGaze(Gazes[_WindowEpisode]):
     """An episode in a large picture, whose first look is the whole picture; one at a time, as it has its own belief.
 
@@ -160,13 +167,28 @@ class WindowGaze(Gazes[_WindowEpisode]):
 
     def begin(self, rows: Tensor, episodes: Sequence[_WindowEpisode]) -> None:
         super().begin(rows, episodes)
-        (episode,) = episodes
-        self.targets[rows] = episode.target
+        self._open()
+        self._see(Window.overview(self.source.lattice))
+
+    def _open(self) -> None:
+        """Open the picture of the episode, before its first look."""
+        (episode,) = self.episodes
+        self.targets[:] = episode.target
         self.source = self.scenery.looks_at(episode.scene)
         goal = Goal.of(self.scenery.classes, episode.target or None)
         self.looking = GivenWindows(goal, self.scenery.evidence, self.source)
         self.done = set()
-        self._see(Window.overview(self.source.lattice))
+
+    def _saved_looks(self) -> _SavedLooks:
+        return _SavedLooks(self.window, tuple(look.shown.window for look in self.looking.looks))
+
+    def _restore_looks(self, looks: _SavedLooks) -> None:
+        self._open()
+        # The detector looks at no window again, because all looks at a picture are kept.
+        for window in looks.windows:
+            self.looking.look(window)
+        self.done = set(looks.windows)
+        self.window = looks.window
 
     def _look(self, rows: Tensor, actions: Tensor) -> Tensor:
         self._see(_window_of(self.source.lattice, actions[0].numpy()))

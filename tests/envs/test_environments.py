@@ -288,6 +288,61 @@ def test_copies_of_environments_begin_the_same_episodes(sceneries):
         assert equal(env.reset(seed=3)[0], twin.reset(seed=3)[0])
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_a_restored_environment_goes_on_as_it_did(sceneries, task):
+    """Observations, rewards, infos, pictures and later resets; from one state, twice, and in another environment."""
+    options = {"belief": True, "glimpse": 24, "render_mode": "rgb_array"}
+    env, other = (KINDS[task](sceneries[task], **options) for _ in range(2))
+    refused("save_state: expected an episode, got none; call reset first", env.save_state)
+    env.reset(seed=1)
+    env.step(3)
+    state = env.save_state()
+    cells = np.flatnonzero(env.action_masks())[:3]
+
+    def goes_on(env):
+        went = [env.step(int(cell)) for cell in cells]
+        return [*went, env.render(), env.reset(), *(env.step(int(cell)) for cell in cells)]
+
+    first = goes_on(env)
+    for each in (env, other, env):
+        if each is other:  # it has opened scenes in another order, and an episode in another scene
+            other.reset(options={"scene": sceneries[task].scenes[-1]})
+        each.restore(state)
+        assert same(goes_on(each), first)
+
+
+def same(one, other):
+    """Whether what steps and resets have returned is the same bit for bit."""
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(same(*pair) for pair in zip(one, other, strict=True))
+    return equal(one, other)
+
+
+def test_restored_environments_side_by_side_go_on_as_they_did(sceneries):
+    envs = GazeVectorEnv("search", 3, sceneries["search"], belief=True)
+    envs.reset(seed=2)
+    random = np.random.default_rng(1)
+    for _ in range(3):
+        envs.step(random.integers(20, size=3))
+    state = envs.save_state()
+    actions = [random.integers(20, size=3) for _ in range(8)]
+    first = [envs.step(each) for each in actions]
+    assert any((step[2] | step[3]).any() for step in first)  # episodes end, and others are drawn
+    for _ in range(2):
+        envs.restore(state)
+        assert same([envs.step(each) for each in actions], first)
+
+
+def test_states_of_other_environments_are_refused(sceneries, world):
+    env = GazeSearch(sceneries["search"])
+    env.reset(seed=0)
+    refused("state: expected what .* gave, got a dict", env.restore, {})
+    two = GazeVectorEnv("search", 2, sceneries["search"])
+    refused(r"state: .*\(search, episodes: 2\), got search, episodes: 1", two.restore, env.save_state())
+    another = GazeSearch(open_scenery("search", **world))
+    refused("state: .* got one of other scenes", another.restore, env.save_state())
+
+
 def test_ended_environments_stay_idle_until_they_are_reset(sceneries):
     scenery = sceneries["search"]
     envs = GazeVectorEnv("search", 2, scenery, autoreset_mode="Disabled")

@@ -21,6 +21,7 @@ from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window
 from tests.envs.agents import WindowAgent
+from tests.envs.test_environments import same
 from tests.refusals import refused
 
 KINDS = {task: partial(ZoomEnv, task) for task in ("search", "exploration")}
@@ -56,6 +57,27 @@ def test_environments_pass_the_checker_of_gymnasium(cache, task):
     env = gymnasium.make(_IDS[task], action="window", mosaics=1, tiles=(2, 1), passes=6, cache=cache, **EVERYTHING)
     assert isinstance(env.unwrapped, ZoomEnv)
     check_env(env.unwrapped)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", KINDS)
+def test_a_restored_environment_goes_on_as_it_did(zoom_scenery, task, monkeypatch):
+    """Observations, rewards, infos, pictures and later resets, without a pass of the detector."""
+    env = KINDS[task](zoom_scenery, **EVERYTHING)
+    env.reset(seed=1)
+    random = np.random.default_rng(0)
+    env.step(random.random(3))
+    state = env.save_state()
+    actions = random.random((3, 3))
+
+    def goes_on():
+        return [*(env.step(each) for each in actions), env.render(), env.reset(), env.step(actions[1])]
+
+    first = goes_on()
+    monkeypatch.setattr(env.gazes.source.looks, "_look", lambda window: pytest.fail("a look was computed again"))
+    for _ in range(2):
+        env.restore(state)
+        assert same(goes_on(), first)
 
 
 def shown_in(env):

@@ -1,0 +1,42 @@
+"""States of environments, which a search in the tree of actions saves and restores."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from semfov.envs.gazes import SavedGazes
+from semfov.envs.scenery import Scenery, ZoomScenery
+from semfov.errors import InputError
+from semfov.gaze.acquisition.base import Task
+
+
+@dataclass(frozen=True, repr=False)
+class EnvState:
+    """A state of an environment, from `save_state`, for `restore`.
+
+    Attributes:
+        scenery: the scenes, which are not copied.
+        task: `search` or `exploration`.
+        gazes: the episodes.
+        randoms: copies of the generators of random numbers, one for each episode.
+        over: how the episodes have ended, as the environment keeps it.
+    """
+
+    scenery: Scenery | ZoomScenery
+    task: Task
+    gazes: SavedGazes
+    randoms: tuple[np.random.Generator, ...]
+    over: tuple[Any, ...]
+
+
+def check_state(state: object, scenery: Scenery | ZoomScenery, task: Task, count: int) -> None:
+    """Raise `InputError` unless a state is one of an environment with these scenes, this task and `count` episodes."""
+    expected = "what `save_state` of this environment gave"
+    if not isinstance(state, EnvState):
+        raise InputError(f"state: expected {expected}, got a {type(state).__name__}")
+    if state.scenery is not scenery:
+        raise InputError(f"state: expected {expected}, got one of other scenes; share them by scenery=")
+    got = (state.task, len(state.randoms))
+    if got != (task, count):
+        raise InputError(f"state: expected {expected} ({task}, episodes: {count}), got {got[0]}, episodes: {got[1]}")
