@@ -186,7 +186,7 @@ class HeadRun(SceneRun):
     def start(self, index: int, views: Views, what: int) -> int:
         """First action of the episodes for a target (0: an exploration): the centre of a random view of the tiling."""
         generator = np.random.Generator(np.random.PCG64([self.config.seed, index, what]))
-        poses = [*chain(*views.tiling[0])]
+        poses = [*chain(*views.tiling)]
         return int(generator.choice(poses)) * views.cells + views.cells // 2 + 5
 
     def targets(self, index: int) -> list[int]:
@@ -276,8 +276,7 @@ def turns(steps: list[HeadStep], views: Views) -> int:
 
 def _tiling_order(views: Views, pose: int) -> list[int]:
     """The poses that tile the scene in the order of a scan that begins at `pose`: row by row, alternating direction."""
-    rows = next(rows for rows in views.tiling if any(pose in row for row in rows))
-    snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(rows)))]
+    snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(views.tiling)))]
     at = snake.index(pose)
     return snake[at:] + snake[:at]
 

@@ -21,6 +21,7 @@ from semfov.errors import check_number, check_whole
 from semfov.eye import Eye
 from semfov.head.belief import SceneObserver
 from semfov.head.camera import SceneLike, open_scene
+from semfov.head.closer import CloserLooks
 from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
@@ -267,6 +268,8 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         check_number(duration, "duration", 0, float("inf"))
         check_whole(seed, "seed", 0, 2**63 - 1)
         views = observer.views
+        speeds = views.world.speeds
+        zooms = len(views.fields) > 1
         first = views.ahead if start is None else start
         check_whole(first, "start", 0, len(views.grid) - 1)
         self.views = views
@@ -279,9 +282,10 @@ class HeadEpisode(PictureEpisode[HeadPath]):
             views,
             live(agent.eye, views),
             observer,
-            lambda action: PerSecond(gain, views.world.speeds, action),
+            lambda action: PerSecond(gain, speeds, action),
             first,
             target=self.goal.target,
+            closer=CloserLooks(gain, speeds, self.goal.target) if zooms else None,
             passes=MOST_PASSES,
             duration=duration,
             worth=worth,

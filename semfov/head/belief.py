@@ -1,11 +1,13 @@
 """The belief about a scene that is seen through one window at a time."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, pick
+from semfov.belief.evidence import farther
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.observers.base import Look, Observer, own
@@ -13,6 +15,8 @@ from semfov.belief.observers.gathering import EvidenceLook
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check
 from semfov.head.views import Views
+
+_CERTAIN = 1e-6  # probabilities nearer to 0 or 1 fade as this one does
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class SceneBelief(Belief):
         owner: `(1, S)`, number of the pose of that fixation; -1 where none was.
         examined: `(1, S)`, whether the cell was fixated.
         looks: `(1,)`, number of looks.
-        views: for each pose, the belief about the cells of its view; None where none was.
+        views: by the number of a pose, the belief about the cells of its view.
     """
 
     values: Tensor
@@ -48,7 +52,7 @@ class SceneBelief(Belief):
     owner: Tensor
     examined: Tensor
     looks: Tensor
-    views: tuple[Belief | None, ...]
+    views: Mapping[int, Belief]
 
     @property
     def about_all(self) -> bool:
@@ -83,8 +87,7 @@ class SceneObserver(Observer):
         cells = len(self.views.world.scene)
         nothing = like.new_zeros(1, cells)
         values = like.new_zeros(1, cells, 2 if isinstance(self.inner, Target) else len(self.inner.model.prior))
-        never = tuple(None for _ in self.views.poses)
-        return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), never)
+        return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), {})
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
         """Weigh a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
@@ -102,7 +105,7 @@ class SceneObserver(Observer):
         values = belief.values
         if not bool(belief.looks):
             values = self._unseen(look.inner, values)
-        before = belief.views[pose]
+        before = belief.views.get(pose)
         if before is None:
             before = self.inner.start(1, views.view_grid, values)
         view = self.inner.update(before, look.inner)
@@ -123,8 +126,40 @@ class SceneObserver(Observer):
         closest[0, taken] = nearest[takes]
         owner[0, taken] = pose
         examined = belief.examined.scatter(-1, look.gaze[:, None], True)
-        after = (*belief.views[:pose], view, *belief.views[pose + 1 :])
-        return SceneBelief(values, closest, owner, examined, belief.looks + 1, after)
+        return SceneBelief(values, closest, owner, examined, belief.looks + 1, {**belief.views, pose: view})
+
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> SceneBelief:
+        """Discount the evidence of the looks so far; all cells return towards what is believed of an unseen one.
+
+        Args:
+            belief: the belief after the looks so far.
+            look: the next look.
+            keep: share of the evidence to keep, in (0, 1].
+            visited: `(1, A)` boolean, actions that still count as fixated.
+
+        Returns:
+            The faded belief.
+        """
+        belief = own(belief, SceneBelief, "belief")
+        look = own(look, _SceneLook, "look")
+        if keep == 1:
+            return belief
+        cells = self.views.cells
+        views = {
+            pose: self.inner.fade(view, look.inner, keep, visited[:, pose * cells : (pose + 1) * cells])
+            for pose, view in belief.views.items()
+        }
+        examined = torch.zeros_like(belief.examined)
+        examined[0, self.views.gaze_cell[visited[0]]] = True
+        unseen = self._unseen(look.inner, belief.values)
+        return replace(
+            belief,
+            values=_faded(belief.values, unseen, keep, about_all=belief.about_all),
+            closest=belief.closest + farther(keep),
+            examined=examined,
+            looks=keep * belief.looks,
+            views=views,
+        )
 
     def _probabilities(self, view: Belief) -> Tensor:
         """Take the belief about the cells of a view, `(C, cells)`."""
@@ -141,3 +176,11 @@ class SceneObserver(Observer):
         probabilities = self._probabilities(self.inner.update(self.inner.start(1, self.views.view_grid, like), blank))
         # The median leaves out the one cell that counts as fixated.
         return probabilities.median(-1).values.expand_as(like).clone()
+
+
+def _faded(values: Tensor, unseen: Tensor, keep: float, *, about_all: bool) -> Tensor:
+    """Move log odds, or the logarithms of the probabilities of all classes, towards those of an unseen cell."""
+    if not about_all:
+        return (unseen.logit(_CERTAIN) + keep * (values.logit(_CERTAIN) - unseen.logit(_CERTAIN))).sigmoid()
+    logarithms = unseen.clamp(min=_CERTAIN).log()
+    return (logarithms + keep * (values.clamp(min=_CERTAIN).log() - logarithms)).softmax(-1)

@@ -1,6 +1,5 @@
 """Cameras that turn: the protocol that a camera of your own implements, and the scene around it."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +11,11 @@ from torch import Tensor
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture, resized
-from semfov.errors import DataError, InputError, check
-from semfov.head.scenes import Flat, Panorama, Sphere, World, check_fields
+from semfov.errors import DataError, InputError, check, check_number
+from semfov.head.scenes import Flat, Panorama, Sphere, World, check_degrees, check_fields
 from semfov.head.speeds import Speeds
 from semfov.sensor.sphere import Camera, panorama_directions
 
-_RADIANS = {"pan": 2 * math.pi, "tilt": math.pi / 2}  # the largest angles in radians
 _TRIES = 25  # largest number of frames that are asked for until one is from the right direction
 _WIDEST = 8192  # pixels of the panorama in which objects are located
 _DRAWING_WIDTH = 480  # width of the frames that are kept for drawing
@@ -54,6 +52,7 @@ class PanTiltCamera(Protocol):
         tilt: limits of tilt, down and up.
         fields: fields of view across, narrowest first; more than one for a camera that zooms.
         speeds: speeds of the motors, and the time until a frame is sharp after a movement.
+        rate: rate at which what was seen is forgotten, per second, for a scene that changes; 0: never.
 
     >>> class Still(PanTiltCamera):
     ...     size, pan, tilt = (40, 30), (-90, 90), (-20, 20)
@@ -69,6 +68,7 @@ class PanTiltCamera(Protocol):
     tilt: tuple[float, float] = (-90.0, 90.0)
     fields: tuple[float, ...] = (60.0,)
     speeds: Speeds = Speeds()
+    rate: float = 0.0
 
     @abstractmethod
     def look_at(self, direction: tuple[float, float], field: float) -> ImageLike | CameraFrame:
@@ -99,11 +99,13 @@ class _CameraScene(Sphere):
         fields = check_fields(camera.fields)
         for name, limits in (("pan", camera.pan), ("tilt", camera.tilt)):
             check(isinstance(limits, Sequence) and len(limits) == 2, name, "a pair of limits in degrees", limits)
-            _check_degrees(name, limits)
+            check_degrees(name, limits)
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
         super().__init__(
             (width, width // 2), camera.size, pan=camera.pan, tilt=camera.tilt, fields=fields, speeds=camera.speeds
         )
+        self.rate = getattr(camera, "rate", 0.0)
+        check_number(self.rate, "rate", 0, 100)
         self.camera = camera
         self.color = color
         # By the pose that was asked for, a small copy of the last frame, and the pose where it was taken.
@@ -157,15 +159,6 @@ class _CameraScene(Sphere):
             x, y = points[inside].round().long().unbind(-1)
             canvas[:, inside] = frame[:, y.clamp(0, height - 1), x.clamp(0, width - 1)].float() / 255
         return canvas.unflatten(-1, (rows, columns))
-
-
-def _check_degrees(name: str, limits: Sequence[float]) -> None:
-    """Refuse limits of `pan` or `tilt` that look like radians or shares; both are judged alone, as units may differ."""
-    widest = max(abs(float(side)) for side in limits)
-    unit = "radians; use math.degrees"
-    if widest <= 1:
-        unit = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"
-    check(widest == 0 or widest > _RADIANS[name], name, "limits in degrees", f"{limits}, which look like {unit}")
 
 
 SceneLike: TypeAlias = World | PanTiltCamera | LargePicture | ImageLike

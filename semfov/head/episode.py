@@ -8,18 +8,24 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from semfov.belief.observers.base import Observer
+from semfov.belief.observers.base import Observer, own
 from semfov.detection.detections import Detections
-from semfov.episode import EpisodeLook, Looks, rollout
+from semfov.episode import EpisodeLook, Looks
+from semfov.episode.loop import attend
+from semfov.episode.memory import Forgetting, Memory
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.head.belief import SceneBelief, SceneObserver
+from semfov.head.closer import CloserLooks
 from semfov.head.gain import OUT
 from semfov.head.scenes import World
 from semfov.head.views import Views
+
+_ONE = torch.tensor([0])  # the only episode
 
 Detect = Callable[[int], Detections]
 """Maps an action to its detections, a batch of one with boxes in pixels of the view."""
@@ -34,14 +40,15 @@ class _HeadLooks(Looks):
         self.target = target
         self.grid = views.grid
         self.like = views.poses
+        self.passed = 0.0  # seconds since the look before
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         watch = Stopwatch()
         detections = self.detect(int(cell))
         watch.lap("detect")
-        look = observer.weigh(detections, fixation, self.grid, self.target)
+        look = observer.weigh(detections, fixation, self.views.grid, self.target)
         watch.lap("weigh")
-        return EpisodeLook(look, lambda: detections, watch.seconds)
+        return EpisodeLook(look, lambda: detections, watch.seconds, self.passed)
 
 
 def live(eye: Eye, views: Views) -> Detect:
@@ -113,12 +120,13 @@ def look_around(
     start: int,
     *,
     target: int | None = None,
+    closer: CloserLooks | None = None,
     passes: int = 100,
     duration: float = math.inf,
     worth: float = 0.0,
     seed: int | Sequence[int] = 0,
 ) -> Iterator[HeadStep]:
-    """Run an episode look by look; the caller may stop at any time.
+    """Run an episode look by look; the caller may stop at any time. What was seen fades at the rate of the scene.
 
     Args:
         views: poses and fixations.
@@ -127,6 +135,7 @@ def look_around(
         acquire: gives the acquisition function after a look from an action.
         start: first action.
         target: class of a search; None explores.
+        closer: offers closer looks of a head that zooms; None for none.
         passes: largest number of looks.
         duration: seconds after which no look ends.
         worth: least gain of a look; 0 for any.
@@ -143,25 +152,34 @@ def look_around(
     spent = speeds.look  # seconds at the end of the present look
     ahead = 0.0  # seconds that the next one takes
     gain = math.inf  # value that it is chosen for
-
-    def ends(_: object) -> Tensor:
-        """Tell whether the next look takes too long, is not allowed, or is not worth its pass; gains are per second."""
-        return torch.tensor([spent + ahead > duration or gain <= OUT or (worth > 0 and gain * ahead < worth)])
-
-    steps = rollout(
-        looks,
-        observer,
-        lambda _, cell: acquire(int(cell)),
-        torch.tensor([start]),
-        Greedy(drawn_by(generator, len(views.grid), looks.like)),
-        most=passes,
-        ends=ends,
-    )
-    for step in steps:
-        action = int(step.cell)
+    memory = Memory.empty(looks, observer, 1)
+    forgetting = Forgetting(views.world.rate) if views.world.rate else None
+    action = start
+    for number in range(passes):
+        looks.passed = ahead
+        cell = torch.tensor([action])
+        look, memory = attend(looks, observer, memory, _ONE, cell, views.grid.centres[cell], forgetting)
+        belief = own(memory.belief, SceneBelief, "belief")
+        values = acquire(action)(belief, memory.visited)
+        if closer is not None:
+            closer.see(action, look.detections())
+            values, memory = _with_closer(values, closer.values(belief, action), memory)
+        choice = Greedy(drawn_by(generator, len(views.grid), looks.like))
+        following = int(choice(number, _ONE, values, memory.visited, views.grid.centres)[1])
         spent += ahead
         chosen_for = gain
-        ahead = float(views.durations(action, speeds)[step.next_cell])
-        gain = float(step.values[0, step.next_cell])
-        assert isinstance(step.belief, SceneBelief)
-        yield HeadStep(action, spent, step.belief, step.detections, chosen_for, ahead)
+        ahead = float(views.durations(action, speeds)[following])
+        gain = float(values[0, following])
+        yield HeadStep(action, spent, belief, look.detections(), chosen_for, ahead)
+        is_over = spent + ahead > duration or gain <= OUT or (worth > 0 and gain * ahead < worth)
+        if is_over or bool(memory.visited.all()):
+            return
+        action = following
+
+
+def _with_closer(values: Tensor, closer: Tensor, memory: Memory) -> tuple[Tensor, Memory]:
+    """Add the values `(A,)` of closer looks, some of whose actions are new, to those of the others, `(1, A)`."""
+    new = len(closer) - values.shape[-1]
+    joined = torch.maximum(F.pad(values, (0, new), value=OUT), closer)
+    visited = F.pad(memory.visited, (0, new), value=False)
+    return joined, replace(memory, visited=visited, age=F.pad(memory.age, (0, new), value=torch.inf))

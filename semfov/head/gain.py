@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from semfov.belief import Belief, MapEvidence
 from semfov.belief.observers.base import own
+from semfov.errors import InputError
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief
 from semfov.head.speeds import Speeds
@@ -27,7 +28,19 @@ class LookGain(nn.Module):
     def __init__(self, views: Views) -> None:
         super().__init__()
         self.views = views
-        self._acuity = [views.acuity(distance) for distance in views.distances]
+        self._acuity = [views.acuity(distance) for distance in views.distances[: views.lattice]]
+
+    def closer(self, belief: SceneBelief, cells: Tensor) -> Tensor:
+        """Compute the expected gain of closer looks at places, with a narrower field of view.
+
+        Args:
+            belief: the belief over the scene.
+            cells: `(n,)`, cells of the places in the scene.
+
+        Returns:
+            `(n,)`, in the unit of the gains.
+        """
+        raise InputError(f"gain: expected one for several fields of view, got {type(self).__name__} without `closer`")
 
 
 class SearchGain(LookGain):
@@ -81,6 +94,10 @@ class SearchGain(LookGain):
             actions = slice(pose * views.cells, (pose + 1) * views.cells)
             gains[actions] = found[actions] + self.foresight * sharper
         return gains
+
+    def closer(self, belief: SceneBelief, cells: Tensor) -> Tensor:
+        """Compute the probability that the target is at the places, fixated before or not; → `(n,)`."""
+        return belief.probability(0)[0, cells]
 
 
 class ExploreGain(LookGain):
@@ -145,6 +162,11 @@ class ExploreGain(LookGain):
             gains[pose * views.cells + fixated] = gain
         return gains
 
+    def closer(self, belief: SceneBelief, cells: Tensor) -> Tensor:
+        """Compute the probability that the most probable class of the places is wrong, times their area; → `(n,)`."""
+        wrong = 1 - belief.class_probabilities()[0, cells].amax(-1)
+        return wrong * self.views.world.area[cells]
+
 
 class PerSecond(AcquisitionFunction):
     """Expected gain per second, for movements of the eye and turns of the head alike.
@@ -174,8 +196,7 @@ class PerSecond(AcquisitionFunction):
         self.gain = gain
         self.speeds = speeds
         self.action = action
-        tiling = chain.from_iterable(chain.from_iterable(gain.views.tiling))
-        self.poses = [*tiling] if poses is None else [*poses]
+        self.poses = [*chain.from_iterable(gain.views.tiling)] if poses is None else [*poses]
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Compute the values of all actions.
@@ -195,5 +216,5 @@ class PerSecond(AcquisitionFunction):
             values = values / views.durations(self.action, self.speeds)
             pose = views.poses[self.action // views.cells]
             turn = views.world.turn(pose.expand_as(views.poses), views.poses)
-            allowed &= (self.speeds.turn(turn) == 0) | (turn >= self.speeds.dead_zone)
+            allowed &= self.speeds.makes(turn)
         return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]

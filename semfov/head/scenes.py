@@ -25,8 +25,37 @@ _FIELDS = (60.0,)  # default fields of view in degrees
 _VIEW = (416, 312)  # default `(width, height)` of a view in pixels
 
 
+_RADIANS = {"pan": 2 * math.pi, "tilt": math.pi / 2, "reach": math.pi / 2, "fields": math.pi}
+"""The largest angle of each kind in radians."""
+
+
+def check_degrees(name: str, angles: Sequence[float]) -> None:
+    """Refuse angles that are no degrees, but look like radians or like shares.
+
+    One rule holds for all: if the largest angle of one kind, its sign aside, is possible in radians and not 0, its unit
+    is taken to be another one. Each kind is judged alone, because a driver may mix units.
+
+    Args:
+        name: the kind of angles: `pan`, `tilt`, `reach` or `fields`.
+        angles: in degrees.
+
+    Raises:
+        InputError: they look like another unit.
+
+    >>> check_degrees("fields", (2.0, 60.0))
+    >>> check_degrees("pan", (-3.14, 3.14))
+    Traceback (most recent call last):
+    semfov.errors.InputError: pan: expected degrees, got (-3.14, 3.14), which look like radians; use math.degrees
+    """
+    largest = max(abs(float(angle)) for angle in angles)
+    unit = "radians; use math.degrees"
+    if largest <= 1:
+        unit = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"
+    check(largest == 0 or largest > _RADIANS[name], name, "degrees", f"{angles}, which look like {unit}")
+
+
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
-    """Check that fields of view are ascending angles below 180 degrees.
+    """Check that fields of view are ascending angles in degrees, below 180.
 
     Args:
         fields: in degrees.
@@ -40,6 +69,7 @@ def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
     are_numbers = isinstance(fields, Sequence) and len(fields) > 0 and all(is_number(field) for field in fields)
     are_angles = are_numbers and min(fields) > 0 and max(fields) < 180 and list(fields) == sorted(fields)
     check(are_angles, "fields", "one or more angles below 180 degrees, narrowest first, such as (60.0,)", fields)
+    check_degrees("fields", fields)
     return tuple(float(field) for field in fields)
 
 
@@ -55,6 +85,7 @@ class _Scene:
         area: `(S,)`, areas of the cells, 1 on average.
         closed: whether the left and the right border of the picture meet.
         still: whether two views from one pose are equal, as those of a picture are.
+        rate: rate at which what was seen is forgotten, per second; 0: never.
     """
 
     scene: Grid
@@ -65,6 +96,7 @@ class _Scene:
     area: Tensor
     closed: bool = False
     still: bool = True
+    rate: float = 0.0
 
     _drawn: Tensor | LargePicture | None = None
 
@@ -229,6 +261,24 @@ class Sphere(_Scene):
             rings.append([torch.tensor([width * n / max(count, 1) + start, pitch, field]) for n in steps])
         return rings
 
+    def aim(self, point: Tensor, field: float) -> Tensor:
+        """Find the pose that has a direction in the middle of its view, or as near to it as the limits allow.
+
+        Args:
+            point: `(3,)`.
+            field: field of view in degrees.
+
+        Returns:
+            `(3,)`.
+        """
+        pan, tilt = self.angles_of(point[None])[0].tolist()
+        left, right = self.pan
+        # The same direction between the limits, or beyond the right one and before the left one.
+        pan = left + (pan - left) % 360
+        if pan > right:
+            pan = right if pan - right < left + 360 - pan else left
+        return torch.tensor([pan, min(max(tilt, self.tilt[0]), self.tilt[1]), field])
+
     def places(self, boxes: Tensor, pose: Tensor) -> Regions:
         """Find the regions of the sphere that boxes `(M, 4)` in the view from a pose cover."""
         return Regions(boxes, Camera(pose.expand(len(boxes), 3), self.size))
@@ -275,6 +325,7 @@ class Panorama(Sphere):
         color: Color = "rgb",
     ) -> None:
         check(0 <= reach <= 90, "reach", "an angle from 0 to 90 degrees", reach)
+        check_degrees("reach", (reach,))
         pixels: Tensor | None = None
         if not isinstance(image, tuple):
             pixels = as_image(image, color=color)
@@ -387,6 +438,13 @@ class _Plane(_Scene):
         """Spread windows of a side over a length, half a window apart at most; middles in degrees from its middle."""
         steps = 2 * math.ceil(length / side - 1 - 1e-9)
         return [(length - side) * (n / max(steps, 1) - 0.5) / self.degree for n in range(steps + 1)]
+
+    def aim(self, point: Tensor, field: float) -> Tensor:
+        """Find the pose of the window whose middle is nearest to a point."""
+        pan, tilt = self.angles_of(point[None])[0].tolist()
+        across = max(self.pan[1] - field / 2, 0.0)
+        up = max(self.tilt[1] - field / 2 * self.size[1] / self.size[0], 0.0)
+        return torch.tensor([min(max(pan, -across), across), min(max(tilt, -up), up), field])
 
     def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
         return Boxes(self.boxes(boxes, pose))

@@ -80,6 +80,17 @@ class Speeds:
         cruising = angle / self.head + self.head / self.acceleration
         return torch.where(angle <= reaches_speed, accelerated, cruising)
 
+    def makes(self, angle: Tensor) -> Tensor:
+        """Tell which turns of the head are made, those beyond its dead zone; it can always stay.
+
+        Args:
+            angle: `(...)`, in degrees.
+
+        Returns:
+            `(...)`, boolean.
+        """
+        return (angle <= _STILL) | (angle >= self.dead_zone)
+
     def duration(self, eye: Tensor, head: Tensor, octaves: Tensor) -> Tensor:
         """Compute the duration of a gaze shift and its look: of the slowest movement, of settling, and of the look.
 

@@ -1,4 +1,4 @@
-"""All poses of a head and all fixations of its eye, numbered as the actions of an episode."""
+"""The poses of a head and the fixations of its eye, numbered as the actions of an episode."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -23,12 +23,16 @@ class Views:
         pose 1   │   ×    │
                  ├────────┤
 
+    The poses of the widest field of view are a lattice, which covers the scene. Those of narrower fields are closer
+    looks at places, and are added one by one (`aim`).
+
     Attributes:
         world: the scene.
-        fields: fields of view in degrees.
+        fields: fields of view in degrees, narrowest first.
         fovea: σ, radius of the fovea in longer sides of a view.
+        lattice: number of poses of the lattice, which are the first ones.
         poses: `(P, 3)`.
-        tiling: for each field of view, rows of numbers of poses that tile the scene.
+        tiling: rows of numbers of poses that tile the scene.
         view_grid: cells of one view.
         cells: number of cells of a view.
         grid: cells of the strip.
@@ -36,6 +40,7 @@ class Views:
         gaze_cell: `(A,)`, cell of the scene there.
         visible: for each pose, the cells of the scene that it shows, `(V,)`.
         points: for each pose, the pixels of the view at which it shows them, `(V, 2)`.
+        distances: for each pose, distances from the cells of its view to those seen, `(cells, V)`.
     """
 
     def __init__(self, world: World, fields: Sequence[float] | None = None, *, fovea: float = 100 / 640) -> None:
@@ -45,29 +50,79 @@ class Views:
         self.fields = fields
         self.fovea = fovea
         poses: list[Tensor] = []
-        self.tiling: list[list[list[int]]] = []
-        for field in fields:
-            numbers = []
-            for row in world.poses(field):
-                numbers.append([*range(len(poses), len(poses) + len(row))])
-                poses += row
-            self.tiling.append([row[::2] for row in numbers[::2]])
+        numbers = []
+        for row in world.poses(fields[-1]):
+            numbers.append([*range(len(poses), len(poses) + len(row))])
+            poses += row
+        self.tiling = [row[::2] for row in numbers[::2]]
+        self.lattice = len(poses)
         self.poses = torch.stack(poses)
         width, height = world.size
         self.view_grid = Grid(_POINTS, _POINTS, (width, height))
         self.cells = _POINTS**2
-        self.grid = Grid(_POINTS, _POINTS * len(poses), (width, height * len(poses)))
+        self.grid = self._strip()
         self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
         self.gaze_cell = world.scene.cell_of(world.pixels_of(self.gaze))
         centres = self.view_grid.centres
         # For each field of view, angles between the cells of a view, `(cells, cells)`.
-        self._shifts = [world.shift(centres[:, None], centres[None], field) for field in fields]
+        self._shifts = torch.stack([world.shift(centres[:, None], centres[None], field) for field in fields])
+        self._field_numbers = [len(fields) - 1] * len(poses)
         self.visible: list[Tensor] = []
         self.points: list[Tensor] = []
         for pose in self.poses:
             points, inside = world.to_view(world.centres, pose)
             self.visible.append(inside.nonzero()[:, 0])
             self.points.append(points[inside])
+        self.distances = [self._distances(pose, points) for pose, points in zip(self.poses, self.points, strict=True)]
+
+    def _strip(self) -> Grid:
+        """Make the grid of the cells of all views."""
+        width, height = self.world.size
+        return Grid(_POINTS, _POINTS * len(self.poses), (width, height * len(self.poses)))
+
+    def aim(self, point: Tensor, field: float) -> int:
+        """Aim a narrower field of view at a point of the scene; a pose that is new is added.
+
+        Args:
+            point: `(D,)`.
+            field: one of `fields`, narrower than the widest.
+
+        Returns:
+            The action that fixates the point, as nearly as the limits of the head allow.
+        """
+        pose = self.world.aim(point, field)
+        known = (self.poses == pose).all(-1).nonzero()
+        number = int(known[0, 0]) if len(known) else self.add(pose)
+        pixel, _ = self.world.to_view(point[None], pose)
+        return number * self.cells + int(self.view_grid.cell_of(pixel))
+
+    def add(self, pose: Tensor) -> int:
+        """Add a pose of a narrower field of view.
+
+        Args:
+            pose: `(3,)`.
+
+        Returns:
+            Its number.
+        """
+        world = self.world
+        number = len(self.poses)
+        self.poses = torch.cat([self.poses, pose[None]])
+        self._field_numbers.append(self.fields.index(float(pose[2])))
+        self.grid = self._strip()
+        gaze = world.to_scene(self.view_grid.centres, pose)
+        self.gaze = torch.cat([self.gaze, gaze])
+        self.gaze_cell = torch.cat([self.gaze_cell, world.scene.cell_of(world.pixels_of(gaze))])
+        points, inside = world.to_view(world.centres, pose)
+        # A narrow view may lie between the centres of cells. It shows the cell in its middle all the same.
+        middle = int(self.gaze_cell[number * self.cells + self.cells // 2 + _POINTS // 2])
+        if not bool(inside[middle]):
+            inside[middle] = True
+            points[middle] = self.view_grid.extent / 2 - 0.5
+        self.visible.append(inside.nonzero()[:, 0])
+        self.points.append(points[inside])
+        self.distances.append(self._distances(pose, points[inside]))
+        return number
 
     def __len__(self) -> int:
         """Count the poses."""
@@ -76,16 +131,16 @@ class Views:
     @cached_property
     def ahead(self) -> int:
         """Action in the middle of the view nearest to straight ahead, of those that tile the scene."""
-        poses = [pose for row in self.tiling[0] for pose in row]
-        middle = torch.tensor([0.0, 0.0, self.fields[0]]).expand(len(poses), 3)
+        poses = [pose for row in self.tiling for pose in row]
+        middle = torch.tensor([0.0, 0.0, self.fields[-1]]).expand(len(poses), 3)
         nearest = poses[int(self.world.turn(self.poses[poses], middle).argmin())]
         return nearest * self.cells + self.cells // 2 + _POINTS // 2
 
     @cached_property
     def reachable(self) -> Tensor:
-        """Cells of the scene that at least one view shows, `(S,)` boolean."""
+        """Cells of the scene that at least one view of the lattice shows, `(S,)` boolean."""
         reachable = torch.zeros(len(self.world.scene), dtype=torch.bool)
-        reachable[torch.cat(self.visible)] = True
+        reachable[torch.cat(self.visible[: self.lattice])] = True
         return reachable
 
     def spread(self, values: Tensor, pose: int) -> Tensor:
@@ -102,16 +157,11 @@ class Views:
         place = (2 * (self.points[pose] + 0.5) / self.view_grid.extent - 1)[None, None].to(values)
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 
-    @cached_property
-    def distances(self) -> list[Tensor]:
-        """Distance `(cells, V)` from each cell of a view to those seen; d in a view wider by r is r (σ + d) - σ."""
-        centres = self.view_grid.centres
-        side = self.view_grid.extent.amax()
-        distances = []
-        for pose, points in zip(self.poses, self.points, strict=True):
-            ratio = float(pose[2]) / self.fields[0]
-            distances.append(ratio * (self.fovea + torch.cdist(centres, points) / side) - self.fovea)
-        return distances
+    def _distances(self, pose: Tensor, points: Tensor) -> Tensor:
+        """Distance `(cells, V)` from each cell of a view to those seen; d in a view narrower by r is r (σ + d) - σ."""
+        ratio = float(pose[2]) / self.fields[-1]
+        distance = torch.cdist(self.view_grid.centres, points) / self.view_grid.extent.amax()
+        return ratio * (self.fovea + distance) - self.fovea
 
     def acuity(self, distance: Tensor) -> Tensor:
         """Compute the relative acuity of the fovea, 1 / (1 + d / σ).
@@ -120,7 +170,7 @@ class Views:
             distance: `(...)`, d; infinite for cells that were never seen.
 
         Returns:
-            `(...)`, from 0 to 1.
+            `(...)`, from 0 to 1; above 1 in a narrower field of view.
         """
         return 1 / (1 + distance / self.fovea)
 
@@ -139,6 +189,5 @@ class Views:
         head = self.world.turn(pose.expand_as(self.poses), self.poses)
         octaves = (self.poses[:, 2] / pose[2]).log2()
         # The angle of the saccade is measured in the field of view of the new pose.
-        field_numbers = torch.tensor([self.fields.index(float(field)) for field in self.poses[:, 2]])
-        eye = torch.stack([shifts[cell] for shifts in self._shifts])[field_numbers]
+        eye = self._shifts[:, cell][torch.tensor(self._field_numbers)]
         return speeds.duration(eye, head[:, None], octaves[:, None]).flatten()

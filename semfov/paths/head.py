@@ -58,6 +58,7 @@ _FORMAT = Format(
         "fields": Array(POSITIVE, least=1, ascending=True),
         "fovea": POSITIVE,
         "seconds": Array(Number(low=0), "n"),
+        "aimed": Maybe(Array(Array(Number(), 3))),
         "duration": Maybe(Number(low=0)),
     },
 )
@@ -349,6 +350,7 @@ class HeadPath(Record):
         views = self.views
         record: dict[str, Any] = {"fields": list(views.fields), "fovea": views.fovea, "duration": self.duration}
         record["seconds"] = list(self.seconds)
+        record["aimed"] = views.poses[views.lattice :].tolist()
         tensors = {"actions": torch.tensor(self.actions), "maps": self.maps}
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         return tensors, {"world": _settings(views.world), **record}
@@ -363,6 +365,11 @@ class HeadPath(Record):
         options: dict[str, Any] = {name: given[name] for name in names[2:]}
         world = scene(given["picture"], given["size"], **options)
         views = Views(world, record["fields"], fovea=record["fovea"])
+        aimed = record.get("aimed")
+        is_known = aimed is not None or len(views.fields) == 1
+        check(is_known, "aimed", "the poses of closer looks", "none, as earlier versions wrote it")
+        for pose in aimed or ():
+            views.add(torch.tensor(pose))
         actions, cells = tensors["actions"], len(views.world.scene)
         check(int(actions.max()) < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", int(actions.max()))
         maps, decision = tensors["maps"], shared["decision"]

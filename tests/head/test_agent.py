@@ -182,7 +182,7 @@ def test_without_a_find_the_rule_of_all_searches_decides(agent, panorama, examin
     fixated = torch.zeros(1, cells, dtype=torch.bool)
     fixated[0, here] = True
     nothing = torch.zeros(1, cells)
-    belief = SceneBelief(values, nothing, nothing.long(), fixated, torch.ones(1), (None,) * len(views))
+    belief = SceneBelief(values, nothing, nothing.long(), fixated, torch.ones(1), {})
     step = HeadStep(5, 0.2, belief, Detections.empty(1, 4))
     decision = _decide_look(views, step, 1, Thresholds(0.7, 0.03, 0.7))
     assert decision.outcome == outcome
@@ -494,6 +494,7 @@ def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_pat
         (((-1.57, 1.57), (-90, 90)), "radians"),
         (((-180, 180), (-0.5, 1.57)), "radians"),
         (((-1, 1), (-20, 90)), "ONVIF"),
+        (((-170, 170), (-1.57, 1.57)), "radians"),
     ],
 )
 def test_limits_in_other_units_are_refused(limits, unit):
@@ -503,4 +504,15 @@ def test_limits_in_other_units_are_refused(limits, unit):
         def look_at(self, direction, field):
             return torch.rand(3, 30, 40)
 
-    refused(f"(pan|tilt): expected .*limits in degrees.*{unit}", open_scene, Narrow())
+    refused(f"(pan|tilt): expected .*degrees.*{unit}", open_scene, Narrow())
+
+
+@pytest.mark.parametrize("fields", [(1.05,), (0.1, 1.05), (3,), (0.5,)])
+def test_fields_of_view_in_other_units_are_refused(fields, panorama):
+    """Whatever the scene. A narrow field beside a wide one is that of a camera that zooms."""
+    camera = type("Narrow", (Own,), {"fields": fields})(panorama)
+    for make in (lambda: Panorama(panorama, fields=fields), lambda: Flat(panorama, fields=fields)):
+        refused("fields: expected degrees, got .*, which look like (radians|numbers from -1 to 1)", make)
+    refused("fields: expected degrees", open_scene, camera)
+    assert open_scene(type("Zooms", (Own,), {"fields": (*fields, 60.0)})(panorama)).fields == (*fields, 60.0)
+    refused("reach: expected degrees", Panorama, panorama, reach=1.05)

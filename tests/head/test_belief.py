@@ -1,5 +1,6 @@
 """The world of a head and the belief about it: views, panoramas, speeds, and cells of several looks."""
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -145,7 +146,7 @@ def test_gain_per_second_by_hand(views, eye, models):
     )
     torch.testing.assert_close(PerSecond(gain, None, here, every)(belief, visited)[0], gains)
     tiling = PerSecond(gain, None, here)(belief, visited)[0].view(len(views), 100)
-    side_by_side = [pose for row in views.tiling[0] for pose in row]
+    side_by_side = [pose for row in views.tiling for pose in row]
     torch.testing.assert_close(tiling[side_by_side], gains.view(len(views), 100)[side_by_side])
     assert (tiling > OUT).any(-1).nonzero()[:, 0].tolist() == sorted(side_by_side)
 
@@ -186,6 +187,55 @@ def test_explore_gain_equals_brute_force(views, eye, models):
                 inputs = belief.class_probabilities()[:, x : x + 1], belief.closest[:, x : x + 1], belief.looks
                 value += float(area[x] * model.gain(*inputs, distance[None, None, None])[0, 0, 0])
         assert float(gains[action]) == pytest.approx(value, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("model", [0, 1])
+def test_what_was_seen_fades_by_the_seconds_that_pass(views, eye, models, model):
+    """By hand: log odds, or logarithms of all classes, of cells that the later looks do not show."""
+    views.world.rate = 0.2
+    speeds = views.world.speeds
+    inner = Target(models[0]) if model == 0 else LearnedMap(models[1])
+    observer = SceneObserver(inner, views, prior=None if model else 0.03)
+    order = [pose_ahead(views), views.tiling[1][5]]
+    steps = look_around(
+        views, live(eye, views), observer, lambda action: Scan(_NoGain(views), order, 1, action),
+        order[0] * 100 + 55, target=None if model else 3, passes=2,
+    )  # fmt: skip
+    before, after = steps
+    keep = math.exp(-0.2 * (after.seconds - before.seconds))
+    assert after.seconds - before.seconds > speeds.look
+    seen = before.belief.owner[0] == order[0]
+    assert torch.equal(seen, after.belief.owner[0] == order[0])
+    unseen = before.belief.values[0, before.belief.owner[0] < 0][0].double()
+    old, new = before.belief.values[0, seen].double(), after.belief.values[0, seen].double()
+    if model == 0:
+        expected = (unseen.logit() * (1 - keep) + keep * old.logit()).sigmoid()
+    else:
+        expected = unseen ** (1 - keep) * old.clamp(min=1e-6) ** keep
+        expected /= expected.sum(-1, keepdim=True)
+    torch.testing.assert_close(new, expected, atol=1e-5, rtol=1e-3)
+    assert (after.belief.closest[0, seen] > before.belief.closest[0, seen]).all()
+    assert float((new - old).abs().max()) > 0.01
+
+
+def test_a_still_head_that_forgets_believes_what_an_eye_without_a_head_does(views, eye, models):
+    """Cells at the middles of the view's own, by the stream's formula of forgetting."""
+    views.world.rate = 0.5
+    pose, inner = pose_ahead(views), Target(models[0])
+    steps = look_around(
+        views, live(eye, views), SceneObserver(inner, views), lambda action: Scan(_NoGain(views), [pose], 1, action),
+        pose * 100 + 44, target=3, passes=4,
+    )  # fmt: skip
+    belief = inner.start(1, views.view_grid, views.poses)
+    seconds = 0.0
+    for step in steps:
+        point = views.view_grid.centres[step.action % 100][None]
+        look = inner.weigh(step.detections, point, views.view_grid, 3)
+        keep = math.exp(-0.5 * (step.seconds - seconds)) if seconds else 1.0
+        belief = inner.update(inner.fade(belief, look, keep, belief.visited), look)
+        seconds = step.seconds
+        got = step.belief.probability(3)[0, views.visible[pose]]
+        torch.testing.assert_close(got, views.spread(belief.probability(3), pose)[0], atol=1e-5, rtol=0)
 
 
 def test_a_scan_goes_through_its_poses_in_order(views, eye, models):
