@@ -1,0 +1,310 @@
+"""Cameras that speak ONVIF: pan, tilt and zoom over the network, by SOAP messages of the standard library."""
+
+import base64
+import hashlib
+import math
+import os
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from http.client import HTTPException
+from typing import NamedTuple
+from urllib.error import HTTPError, URLError
+from urllib.parse import urlsplit, urlunsplit
+from urllib.request import Request, urlopen
+from xml.etree import ElementTree as XML
+from xml.sax.saxutils import escape
+
+from semfov.data.inputs import ImageLike
+from semfov.errors import DataError, check, check_number
+from semfov.head.camera import CameraFrame, PanTiltCamera
+from semfov.head.scenes import check_degrees, check_fields
+from semfov.head.speeds import Speeds
+
+_MOST_BYTES = 1 << 20  # of an answer
+_POLL = 0.05  # seconds between two questions whether the camera has arrived
+_NEAR = 0.01  # largest distance from the goal, in the units of ONVIF, at which a camera that says nothing has arrived
+_SECURITY = "http://docs.oasis-open.org/wss/2004/01/oasis-200401-wss-"
+_DEVICE = "http://www.onvif.org/ver10/device/wsdl"
+_MEDIA = "http://www.onvif.org/ver10/media/wsdl"
+_PTZ = "http://www.onvif.org/ver20/ptz/wsdl"
+_TYPES = "http://www.onvif.org/ver10/schema"
+_SOAP = "http://www.w3.org/2003/05/soap-envelope"
+
+
+class Position(NamedTuple):
+    """Position of a camera in the units of ONVIF: pan and tilt from -1 to 1, zoom from 0 to 1."""
+
+    pan: float
+    tilt: float
+    zoom: float
+
+
+class _Builder(XML.TreeBuilder):
+    """Builds a document without a type, which could define entities that grow without limit."""
+
+    def doctype(self, name: str, public: str | None, system: str | None) -> None:
+        """Refuse it."""
+        raise DataError(f"camera: expected a message without a document type, got <!DOCTYPE {name}>")
+
+
+class OnvifClient:
+    """Sends commands to a camera, and reads its answers.
+
+    Args:
+        address: of the camera, such as `http://192.168.0.20`, or of its device service.
+        user: name of a user; None for a camera without users.
+        password: the user's password, which is sent as a digest.
+        timeout: seconds to wait for an answer.
+
+    Raises:
+        InputError: the address is none of `http` or `https`.
+    """
+
+    def __init__(self, address: str, user: str | None = None, password: str = "", timeout: float = 5.0) -> None:
+        parts = urlsplit(address)
+        is_address = parts.scheme in ("http", "https") and bool(parts.netloc)
+        check(is_address, "address", "the address of a camera, such as http://192.168.0.20", repr(address))
+        check_number(timeout, "timeout", 1e-3, 1e6)
+        self.address = address if parts.path.strip("/") else f"{address.rstrip('/')}/onvif/device_service"
+        self.user = user
+        self.password = password
+        self.timeout = timeout
+
+    def services(self) -> dict[str, str]:
+        """Ask for the addresses of the services `PTZ` and `Media`."""
+        body = f'<GetCapabilities xmlns="{_DEVICE}"><Category>All</Category></GetCapabilities>'
+        answer = self.call(self.address, body)
+        found = {}
+        for name in ("PTZ", "Media"):
+            element = answer.find(f".//{{{_TYPES}}}{name}/{{{_TYPES}}}XAddr")
+            if element is None or not element.text:
+                raise DataError(f"camera: expected a camera with the service {name}, got one without it")
+            # A camera behind a router gives its own address, at which it cannot be reached from here.
+            found[name] = urlunsplit(urlsplit(self.address)[:2] + urlsplit(element.text.strip())[2:])
+        return found
+
+    def call(self, address: str, body: str) -> XML.Element:
+        """Send a message.
+
+        Args:
+            address: of the service.
+            body: XML of the command.
+
+        Returns:
+            The answer.
+
+        Raises:
+            DataError: the camera does not answer, refuses the command, or answers what is no message.
+        """
+        head = "" if self.user is None else self._credentials(self.user)
+        text = f'<s:Envelope xmlns:s="{_SOAP}"><s:Header>{head}</s:Header><s:Body>{body}</s:Body></s:Envelope>'
+        request = Request(address, text.encode(), {"Content-Type": "application/soap+xml; charset=utf-8"})
+        try:
+            with urlopen(request, timeout=self.timeout) as answer:
+                return _parsed(answer.read(_MOST_BYTES + 1))
+        except HTTPError as error:
+            raise DataError(f"camera: it refuses a command: {_reason(error)}") from None
+        except (URLError, HTTPException, OSError) as error:
+            raise DataError(f"camera: no answer from {address} ({error}); check the address") from None
+
+    def _credentials(self, user: str) -> str:
+        """Make the header that names a user, with a digest of the password for this message alone."""
+        nonce = os.urandom(16)
+        created = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        digest = base64.b64encode(hashlib.sha1(nonce + created.encode() + self.password.encode()).digest()).decode()
+        secext, utility = f"{_SECURITY}wssecurity-secext-1.0.xsd", f"{_SECURITY}wssecurity-utility-1.0.xsd"
+        kind = f"{_SECURITY}username-token-profile-1.0#PasswordDigest"
+        return (
+            f'<w:Security xmlns:w="{secext}" s:mustUnderstand="1"><w:UsernameToken>'
+            f'<w:Username>{escape(user)}</w:Username><w:Password Type="{kind}">{digest}</w:Password>'
+            f"<w:Nonce>{base64.b64encode(nonce).decode()}</w:Nonce>"
+            f'<u:Created xmlns:u="{utility}">{created}</u:Created></w:UsernameToken></w:Security>'
+        )
+
+
+def _parsed(data: bytes) -> XML.Element:
+    """Read an XML message, of a limited size and without a document type."""
+    if len(data) > _MOST_BYTES:
+        raise DataError(f"camera: expected a message of at most {_MOST_BYTES} bytes, got a longer one")
+    try:
+        return XML.fromstring(data, XML.XMLParser(target=_Builder()))
+    except (XML.ParseError, ValueError, LookupError) as error:
+        raise DataError(f"camera: expected an XML message, got none that can be read ({error})") from None
+
+
+def _reason(error: HTTPError) -> str:
+    """Take the reason from the answer to a refused command."""
+    try:
+        reason = _parsed(error.read(_MOST_BYTES + 1)).find(f".//{{{_SOAP}}}Reason/{{{_SOAP}}}Text")
+    except (DataError, OSError):
+        reason = None
+    return f"{error.code} {error.reason}" if reason is None or not reason.text else reason.text.strip()
+
+
+class OnvifCamera(PanTiltCamera):
+    """A pan-tilt-zoom camera that speaks ONVIF, with frames from a video or a function of your own.
+
+    ONVIF counts pan and tilt from -1 to 1 and zoom from 0 to 1. Here -1 and 1 are the limits of pan and tilt, and
+    angles lie between them in equal steps. 0 and 1 are the widest and the narrowest field of view, with equal steps of
+    the focal length.
+
+    Args:
+        client: sends commands to the camera.
+        frame: gives the newest frame when it is called, such as `lambda: video.read()[1]`.
+        size: `(width, height)` of a frame in pixels.
+        pan: the camera's largest turns to the left and to the right, in degrees.
+        tilt: its largest turns down and up, in degrees.
+        fields: fields of view across to use, in degrees, narrowest first: the first and the last are those of the ends
+            of the zoom. One is used for a camera that does not zoom.
+        speeds: of the motors; `settle` is waited for after each movement.
+        rate: rate at which what was seen is forgotten, per second (`PanTiltCamera`).
+        relative: whether to turn by relative moves, for cameras that know no absolute ones.
+        profile: token of a media profile; None takes the first one with pan and tilt.
+        patience: largest number of seconds of a movement.
+
+    Raises:
+        InputError: an argument is out of range.
+        DataError: the camera does not answer, or cannot turn.
+
+    Example::
+
+        video = cv2.VideoCapture("rtsp://192.168.0.20/stream1")
+        client = OnvifClient("http://192.168.0.20", "user", "password")
+        camera = OnvifCamera(client, lambda: video.read()[1], (1280, 720), pan=(-170, 170), tilt=(-30, 90))
+        path = agent.search(camera, "cup", color="bgr")
+    """
+
+    def __init__(
+        self,
+        client: OnvifClient,
+        frame: Callable[[], ImageLike],
+        size: tuple[int, int],
+        *,
+        pan: tuple[float, float] = (-180.0, 180.0),
+        tilt: tuple[float, float] = (-90.0, 90.0),
+        fields: tuple[float, ...] = (60.0,),
+        speeds: Speeds | None = None,
+        rate: float = 0.0,
+        relative: bool = False,
+        profile: str | None = None,
+        patience: float = 20.0,
+    ) -> None:
+        check(callable(frame), "frame", "a function that gives the newest frame", type(frame).__name__)
+        check_number(patience, "patience", 0, 1e6)
+        for name, limits in (("pan", pan), ("tilt", tilt)):
+            check(limits[0] < limits[1], name, "two different limits in degrees, the lower one first", limits)
+            check_degrees(name, limits)
+        self.client = client
+        self.frame = frame
+        self.size = size
+        self.pan, self.tilt = pan, tilt
+        self.fields = check_fields(fields)
+        self._zooms = len(self.fields) > 1
+        self.speeds = Speeds(eye_start=0.0, eye=0.0, settle=0.3) if speeds is None else speeds
+        self.rate = rate
+        self.relative = relative
+        self.patience = patience
+        services = client.services()
+        self._ptz = services["PTZ"]
+        self._profile = self._first_profile(services["Media"]) if profile is None else profile
+
+    def look_at(self, direction: tuple[float, float], field: float) -> CameraFrame:
+        """Turn to a direction, wait until the camera stands still, and take a frame."""
+        goal = self.position_of(direction, field)
+        if self.relative:
+            here = self.where()
+            way = Position(goal.pan - here.pan, goal.tilt - here.tilt, goal.zoom - here.zoom)
+            self._move("RelativeMove", "Translation", way)
+        else:
+            self._move("AbsoluteMove", "Position", goal)
+        self._wait(goal)
+        time.sleep(self.speeds.settle)
+        position = self.where()
+        frame = self.frame()
+        return CameraFrame(frame, *self.direction_of(position))
+
+    def position_of(self, direction: tuple[float, float], field: float) -> Position:
+        """Convert a direction and a field of view in degrees to the units of ONVIF."""
+        left, right = self.pan
+        down, up = self.tilt
+        pan = 2 * (direction[0] - left) / (right - left) - 1
+        tilt = 2 * (direction[1] - down) / (up - down) - 1
+        wide, narrow = _focal(self.fields[-1]), _focal(self.fields[0])
+        zoom = (_focal(field) - wide) / (narrow - wide) if narrow > wide else 0.0
+        return Position(pan, tilt, zoom)
+
+    def direction_of(self, position: Position) -> tuple[tuple[float, float], float]:
+        """Convert a position in the units of ONVIF to a direction and a field of view in degrees."""
+        left, right = self.pan
+        down, up = self.tilt
+        pan = left + (position.pan + 1) / 2 * (right - left)
+        tilt = down + (position.tilt + 1) / 2 * (up - down)
+        wide, narrow = _focal(self.fields[-1]), _focal(self.fields[0])
+        return (pan, tilt), 2 * math.degrees(math.atan(1 / (wide + position.zoom * (narrow - wide))))
+
+    def where(self) -> Position:
+        """Ask for the present position."""
+        return self._status()[0]
+
+    def _status(self) -> tuple[Position, bool | None]:
+        """Ask for the position, and whether the camera moves; None where it does not say."""
+        answer = self._command("GetStatus")
+        turned = answer.find(f".//{{{_TYPES}}}PanTilt[@x]")
+        zoomed = answer.find(f".//{{{_TYPES}}}Zoom[@x]")
+        if turned is None:
+            raise DataError("camera: expected its position, got a status without pan and tilt")
+        zoom = 0.0 if zoomed is None else _number(zoomed, "x")
+        states = [element.text for element in answer.findall(f".//{{{_TYPES}}}MoveStatus/*")]
+        known = [state for state in states if state in ("IDLE", "MOVING")]
+        moves = "MOVING" in known if known else None
+        return Position(_number(turned, "x"), _number(turned, "y"), zoom), moves
+
+    def _wait(self, goal: Position) -> None:
+        """Wait until the camera stands still at a position."""
+        until = time.monotonic() + self.patience
+        while True:
+            position, moves = self._status()
+            off = max(abs(position.pan - goal.pan), abs(position.tilt - goal.tilt))
+            if self._zooms:
+                off = max(off, abs(position.zoom - goal.zoom))
+            # A camera that was just told to move may not have begun.
+            if off <= _NEAR and not moves:
+                return
+            if time.monotonic() > until:
+                raise DataError(f"camera: expected it at {goal} within {self.patience:g} s, got {position}")
+            time.sleep(_POLL)
+
+    def _move(self, command: str, name: str, to: Position) -> None:
+        """Send a movement."""
+        zoom = f'<t:Zoom x="{to.zoom:.6f}"/>' if self._zooms else ""
+        turn = f'<t:PanTilt x="{to.pan:.6f}" y="{to.tilt:.6f}"/>'
+        self._command(command, f'<{name} xmlns:t="{_TYPES}">{turn}{zoom}</{name}>')
+
+    def _command(self, command: str, content: str = "") -> XML.Element:
+        profile = f"<ProfileToken>{escape(self._profile)}</ProfileToken>"
+        return self.client.call(self._ptz, f'<{command} xmlns="{_PTZ}">{profile}{content}</{command}>')
+
+    def _first_profile(self, media: str) -> str:
+        """Ask for the first media profile of which pan and tilt can be set."""
+        answer = self.client.call(media, f'<GetProfiles xmlns="{_MEDIA}"/>')
+        for profile in answer.iter(f"{{{_MEDIA}}}Profiles"):
+            if profile.find(f"{{{_TYPES}}}PTZConfiguration") is not None:
+                return profile.get("token", "")
+        raise DataError("camera: expected a media profile with pan and tilt, got none; set it up in the camera")
+
+
+def _focal(field: float) -> float:
+    """Focal length in halves of the width of a frame."""
+    return 1 / math.tan(math.radians(field) / 2)
+
+
+def _number(element: XML.Element, name: str) -> float:
+    """Read a number from an attribute."""
+    try:
+        value = float(element.get(name, ""))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise DataError(f"camera: expected a number, got {element.get(name)!r}")
+    return value
