@@ -21,6 +21,12 @@ class EnvState:
         gazes: the episodes.
         randoms: copies of the generators of random numbers, one for each episode.
         over: how the episodes have ended, as the environment keeps it.
+
+    Example::
+
+        state = env.save_state()
+        env.step(3)
+        env.restore(state)
     """
 
     scenery: Scenery | ZoomScenery

@@ -2,6 +2,7 @@
 
 from semfov.head.camera import CameraFrame, PanTiltCamera, open_scene
 from semfov.head.gain import ExploreGain, PerSecond, SearchGain
+from semfov.head.onvif import OnvifCamera, OnvifClient
 from semfov.head.panoramas import Panoramas
 from semfov.head.scenes import Flat, Panorama
 from semfov.head.speeds import Speeds
@@ -10,6 +11,8 @@ __all__ = [
     "CameraFrame",
     "ExploreGain",
     "Flat",
+    "OnvifCamera",
+    "OnvifClient",
     "PanTiltCamera",
     "Panorama",
     "Panoramas",

@@ -59,6 +59,9 @@ class OnvifClient:
 
     Raises:
         InputError: the address is none of `http` or `https`.
+
+    >>> OnvifClient("http://192.168.0.20").address
+    'http://192.168.0.20/onvif/device_service'
     """
 
     def __init__(self, address: str, user: str | None = None, password: str = "", timeout: float = 5.0) -> None:
@@ -72,7 +75,14 @@ class OnvifClient:
         self.timeout = timeout
 
     def services(self) -> dict[str, str]:
-        """Ask for the addresses of the services `PTZ` and `Media`."""
+        """Ask for the addresses of the services `PTZ` and `Media`.
+
+        Returns:
+            The addresses by name.
+
+        Raises:
+            DataError: the camera does not answer, or lacks one of them.
+        """
         body = f'<GetCapabilities xmlns="{_DEVICE}"><Category>All</Category></GetCapabilities>'
         answer = self.call(self.address, body)
         found = {}
@@ -210,7 +220,18 @@ class OnvifCamera(PanTiltCamera):
         self._profile = self._first_profile(services["Media"]) if profile is None else profile
 
     def look_at(self, direction: tuple[float, float], field: float) -> CameraFrame:
-        """Turn to a direction, wait until the camera stands still, and take a frame."""
+        """Turn to a direction, wait until the camera stands still, and take a frame.
+
+        Args:
+            direction: pan and tilt in degrees, between the limits.
+            field: field of view across, in degrees, one of `fields`.
+
+        Returns:
+            The frame, with the direction and the field of view that the camera tells.
+
+        Raises:
+            DataError: the camera does not answer, refuses to turn, or does not arrive.
+        """
         goal = self.position_of(direction, field)
         if self.relative:
             here = self.where()
@@ -225,7 +246,15 @@ class OnvifCamera(PanTiltCamera):
         return CameraFrame(frame, *self.direction_of(position))
 
     def position_of(self, direction: tuple[float, float], field: float) -> Position:
-        """Convert a direction and a field of view in degrees to the units of ONVIF."""
+        """Convert a direction and a field of view to the units of ONVIF.
+
+        Args:
+            direction: pan and tilt in degrees.
+            field: in degrees.
+
+        Returns:
+            The position.
+        """
         left, right = self.pan
         down, up = self.tilt
         pan = 2 * (direction[0] - left) / (right - left) - 1
@@ -235,7 +264,14 @@ class OnvifCamera(PanTiltCamera):
         return Position(pan, tilt, zoom)
 
     def direction_of(self, position: Position) -> tuple[tuple[float, float], float]:
-        """Convert a position in the units of ONVIF to a direction and a field of view in degrees."""
+        """Convert a position in the units of ONVIF to degrees.
+
+        Args:
+            position: the position.
+
+        Returns:
+            Pan and tilt, and the field of view.
+        """
         left, right = self.pan
         down, up = self.tilt
         pan = left + (position.pan + 1) / 2 * (right - left)
@@ -244,7 +280,14 @@ class OnvifCamera(PanTiltCamera):
         return (pan, tilt), 2 * math.degrees(math.atan(1 / (wide + position.zoom * (narrow - wide))))
 
     def where(self) -> Position:
-        """Ask for the present position."""
+        """Ask for the present position.
+
+        Returns:
+            The position, in the units of ONVIF.
+
+        Raises:
+            DataError: the camera does not answer, or does not tell it.
+        """
         return self._status()[0]
 
     def _status(self) -> tuple[Position, bool | None]:

@@ -34,6 +34,22 @@ DEFINITIONS = {
         "step": "uint32",
         "data": "sequence<uint8>",
     },
+    "sensor_msgs/JointState": {
+        "header": "std_msgs/Header",
+        "name": "sequence<string>",
+        "position": "sequence<double>",
+    },
+    "builtin_interfaces/Duration": {"sec": "int32", "nanosec": "uint32"},
+    "trajectory_msgs/JointTrajectoryPoint": {
+        "positions": "sequence<double>",
+        "time_from_start": "builtin_interfaces/Duration",
+    },
+    "trajectory_msgs/JointTrajectory": {
+        "header": "std_msgs/Header",
+        "joint_names": "sequence<string>",
+        "points": "sequence<trajectory_msgs/JointTrajectoryPoint>",
+    },
+    "control_msgs/FollowJointTrajectory_Goal": {"trajectory": "trajectory_msgs/JointTrajectory"},
 }
 PLAIN = {"string": str, "double": float, "int32": int, "uint32": int, "uint8": int}
 
