@@ -20,10 +20,12 @@ from semfov.belief.belief import Belief
 from semfov.belief.observers import LearnedMap, Target
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
 from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import DataError, check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
+from semfov.head.closer import CloserLooks
 from semfov.head.episode import Detect, HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.panoramas import Panoramas
@@ -155,13 +157,20 @@ class HeadRun(SceneRun):
             return lambda action: tight(detect(action))
 
         looks = RememberedLooks(open_scene, store, lambda: self.scenes.digest(index))
+        closely = open_scene()
+        lattice = views.lattice * views.cells
+
+        def detect(action: int) -> Detections:
+            """Detect, or remember; closer looks have other numbers in each run."""
+            return looks(action) if action < lattice else closely(action)
+
         watch.lap("scene")
         try:
             with torch.inference_mode():
-                records = self._searches(index, views, looks)
+                records = self._searches(index, views, detect)
                 watch.lap("search")
                 if config.explore:
-                    records += self._explorations(index, views, looks)
+                    records += self._explorations(index, views, detect)
                 watch.lap("exploration")
         finally:
             looks.save()  # even when the run is stopped
@@ -206,7 +215,8 @@ class HeadRun(SceneRun):
                 continue  # no search starts on its target
             for name, acquire in self.ways(gain, start).items():
                 steps, found = list[HeadStep](), False
-                for step in self._steps(views, looks, observer, acquire, start, target, index):
+                closer = self._closer(name, gain, target)
+                for step in self._steps(views, looks, observer, acquire, start, target, index, closer):
                     steps.append(step)
                     found = bool(_rests_on(views, step.action, target_places).any())
                     if found:
@@ -226,11 +236,15 @@ class HeadRun(SceneRun):
                 )
         return records
 
-    def _steps(self, views, looks, observer, acquire, start, target, index):  # type: ignore[no-untyped-def]
+    def _closer(self, way: str, gain: LookGain, target: int | None) -> CloserLooks | None:
+        """What offers closer looks to our own way where the head zooms."""
+        return CloserLooks(gain, self.config.speeds, target) if way == OURS and len(gain.views.fields) > 1 else None
+
+    def _steps(self, views, looks, observer, acquire, start, target, index, closer):  # type: ignore[no-untyped-def]
         config = self.config
         return look_around(
-            views, looks, observer, acquire, start, target=target, passes=config.passes, duration=config.seconds,
-            seed=[config.seed, index, target or 0],
+            views, looks, observer, acquire, start, target=target, closer=closer,
+            passes=config.passes, duration=config.seconds, seed=[config.seed, index, target or 0],
         )  # fmt: skip
 
     def _explorations(self, index: int, views: Views, looks: Detect) -> list[ResultRecord]:
@@ -245,7 +259,8 @@ class HeadRun(SceneRun):
         start, records = self.start(index, views, 0), list[ResultRecord]()
         for name, acquire in self.ways(gain, start).items():
             seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()
-            for step in self._steps(views, looks, observer, acquire, start, None, index):
+            closer = self._closer(name, gain, None)
+            for step in self._steps(views, looks, observer, acquire, start, None, index, closer):
                 # A cell that was never seen gets no answer, even if the prior favours a class.
                 probabilities = step.belief.class_probabilities().masked_fill(step.belief.owner[..., None] < 0, 0.0)
                 right = (right_cells(probabilities, answers)[0] * area).sum() / area.sum()

@@ -5,12 +5,14 @@ from itertools import chain
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from semfov.belief import Belief, MapEvidence
 from semfov.belief.observers.base import own
 from semfov.errors import InputError
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief
+from semfov.head.scenes import World
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 
@@ -20,6 +22,23 @@ FORESIGHT = 0.5  # weight of the gain in sharpness over the cells of a view (`Se
 PRIOR = 0.03  # prior probability that a cell that was never seen holds the target of a search
 UNSEEN = 1.0  # expected fraction of cells that an exploration classifies correctly when it first fixates them
 OUT = -1e6  # value of actions that must not be chosen
+
+
+def was_fixated(belief: SceneBelief, world: World) -> Tensor:
+    """Tell which cells a search has fixated, or a neighbour that is as probable, which shows the same object.
+
+    Args:
+        belief: about a target.
+        world: the scene.
+
+    Returns:
+        `(S,)`, boolean.
+    """
+    chance = belief.probability(0)[0]
+    fixated = torch.where(belief.examined[0], chance, 0.0).view(1, 1, world.scene.rows, world.scene.columns)
+    # In a panorama the first and the last column are neighbours.
+    around = F.pad(fixated, (1, 1, 0, 0), mode="circular" if world.closed else "constant")
+    return F.max_pool2d(F.pad(around, (0, 0, 1, 1)), 3, 1).flatten() >= chance
 
 
 class LookGain(nn.Module):
@@ -48,10 +67,13 @@ class SearchGain(LookGain):
 
     .. math:: G(h, f) = P(t \in f) + c \sum_x |x| \, P(t \in x) \, [a(d_{h,f}(x)) - a(d^*(x))]_+
 
-    The first term is the probability that the fixated cell f holds the target; it is 0 where the cell was fixated
-    before. The second term is the expected area of the target that is seen more sharply than before. |x| is the area of
-    a cell, :math:`d^*` the distance of its closest fixation so far, and a the acuity of the fovea (`Views.acuity`),
-    which is 0 where a cell was never seen. One formula thus gives the value of a saccade and of a turn of the head.
+    The first term is the probability that the fixated cell f holds the target. It is 0 where the cell was fixated
+    before, and beside a fixated cell that is as probable, which shows the same object. The head thus turns on once the
+    most probable place was fixated, also where the target is not certain enough to be found.
+
+    The second term is the expected area of the target that is seen more sharply than before. |x| is the area of a cell,
+    :math:`d^*` the distance of its closest fixation so far, and a the acuity of the fovea (`Views.acuity`), which is 0
+    where a cell was never seen. One formula thus gives the value of a saccade and of a turn of the head.
 
     Args:
         views: the possible views and fixations.
@@ -86,7 +108,7 @@ class SearchGain(LookGain):
         chance = belief.probability(0)[0]
         sharpness = views.acuity(belief.closest[0])
         weighted = chance * views.world.area
-        found = torch.where(belief.examined[0], 0.0, chance)[views.gaze_cell]
+        found = torch.where(was_fixated(belief, views.world), 0.0, chance)[views.gaze_cell]
         gains = torch.zeros_like(found)
         for pose in poses:
             cells = views.visible[pose]

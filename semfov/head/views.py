@@ -138,9 +138,9 @@ class Views:
 
     @cached_property
     def reachable(self) -> Tensor:
-        """Cells of the scene that at least one view of the lattice shows, `(S,)` boolean."""
+        """Cells of the scene that the views that tile it show, `(S,)` boolean."""
         reachable = torch.zeros(len(self.world.scene), dtype=torch.bool)
-        reachable[torch.cat(self.visible[: self.lattice])] = True
+        reachable[torch.cat([self.visible[pose] for row in self.tiling for pose in row])] = True
         return reachable
 
     def spread(self, values: Tensor, pose: int) -> Tensor:

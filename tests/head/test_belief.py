@@ -1,6 +1,7 @@
 """The world of a head and the belief about it: views, panoramas, speeds, and cells of several looks."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -115,15 +116,24 @@ def test_turning_the_world_turns_the_belief(eye, models, panorama):
     torch.testing.assert_close(beliefs[0].roll(30, -1), beliefs[1], atol=1e-4, rtol=0)
 
 
+def neighbours(views, cell):
+    """A cell of a panorama and those around it, across the seam."""
+    row, column = divmod(cell, 60)
+    around = [(row + down, (column + right) % 60) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    return [60 * y + x for y, x in around if 0 <= y < 30]
+
+
 def test_search_gain_equals_brute_force(views, eye, models):
     pose = pose_ahead(views)
     belief = episode(views, eye, SceneObserver(Target(models[0]), views), [pose * 100 + 55, pose * 100 + 12], 2)[-1]
     gains = SearchGain(views, 0.7)(belief, pose, range(len(views)))
     chance, fovea = belief.probability(2)[0], 100 / 640
-    for action in (pose * 100 + 55, pose * 100 + 89, 3, 1234):
+    beside = int((views.gaze_cell == views.gaze_cell[pose * 100 + 55] + 1).nonzero()[0, 0])
+    for action in (pose * 100 + 55, pose * 100 + 44, pose * 100 + 89, beside, 3, 1234):
         place, cell = divmod(action, 100)
         here = int(views.gaze_cell[action])
-        value = 0.0 if belief.examined[0, here] else float(chance[here])
+        fixated = [each for each in neighbours(views, here) if belief.examined[0, each]]
+        value = 0.0 if any(chance[each] >= chance[here] for each in fixated) else float(chance[here])
         points, inside = views.world.to_view(views.world.centres, views.poses[place])
         for x in inside.nonzero()[:, 0].tolist():
             distance = float(torch.linalg.vector_norm(points[x] - views.view_grid.centres[cell])) / 64
@@ -131,6 +141,23 @@ def test_search_gain_equals_brute_force(views, eye, models):
             more = 1 / (1 + distance / fovea) - 1 / (1 + closest / fovea)
             value += 0.7 * float(views.world.area[x]) * float(chance[x]) * max(more, 0.0)
         assert float(gains[action]) == pytest.approx(value, rel=1e-4, abs=1e-5)
+
+
+def test_the_gaze_leaves_an_object_whose_most_probable_cell_was_fixated(views, models):
+    """And goes on to a neighbour that is more probable than what was fixated; also across the seam."""
+    gain = SearchGain(views, 0.0)
+    start = SceneObserver(Target(models[0]), views, prior=0.01).start(1, views.grid, torch.zeros(1))
+    for cell in (60 * 15 + 30, 60 * 15):
+        blob = neighbours(views, cell)
+        values = torch.full_like(start.values, 0.01)
+        values[0, blob] = 0.4
+        values[0, blob[3]] = 0.6
+        for fixated, remaining in ((cell, {blob[3]}), (blob[3], {blob[2], blob[5], blob[8]})):
+            examined = torch.zeros_like(start.examined)
+            examined[0, fixated] = True
+            gains = gain(replace(start, values=values, examined=examined), 0, range(len(views)))
+            found = {int(views.gaze_cell[action]) for action in (gains >= 0.4).nonzero()[:, 0]}
+            assert found == remaining
 
 
 def test_gain_per_second_by_hand(views, eye, models):
