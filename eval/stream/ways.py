@@ -10,7 +10,7 @@ from semfov.agents.window_episode import WindowStream
 from semfov.detection.objects import Objects
 from semfov.motion import CameraMotion, CameraStep
 from semfov.zoom.carrying import inside_frame
-from semfov.zoom.episode import KeptLook
+from semfov.zoom.episode import KeptLook, carry_along
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import LiveWindowLooks, Window
@@ -89,8 +89,7 @@ class RoundRobin(Way):
         if camera.motion is None:
             self.kept = []
         else:
-            for look in self.kept:
-                look.carry(camera.motion, lattice)
+            carry_along(self.kept, camera.motion, lattice)
 
 
 class Live(Way):

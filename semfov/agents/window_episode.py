@@ -37,7 +37,7 @@ from semfov.zoom.blank import blank_cells
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import USUAL_WINDOW, closer_window, look_closely
 from semfov.zoom.decision import DecisionsByScore, WindowDecisions, decisions_of
-from semfov.zoom.episode import KeptLook, WindowStep, find_everything, look_by_look, search_windows
+from semfov.zoom.episode import KeptLook, WindowStep, carry_along, find_everything, look_by_look, search_windows
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
@@ -193,8 +193,7 @@ class WindowSession:
         if motion is None:
             self._closer_looks = []
         else:
-            for look in self._closer_looks:
-                look.carry(motion, self.source.lattice)
+            carry_along(self._closer_looks, motion, self.source.lattice)
         self.decisions.follow(motion)
 
     @property

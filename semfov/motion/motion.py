@@ -130,12 +130,12 @@ class Motion:
         Returns:
             `(...)`, positive.
         """
-        # The determinant of the map's derivative at a point is det(M) / w³.
-        weight = points.double() @ torch.from_numpy(self.matrix[2, :2].copy()) + 1.0
-        return (abs(float(np.linalg.det(self.matrix))) / weight.abs() ** 3).sqrt().to(points)
+        matrix = torch.from_numpy(self.matrix)
+        weight = points.double() @ matrix[2, :2] + 1.0
+        return _local_scale(matrix, weight).to(points)
 
     def boxes(self, boxes: Tensor) -> Tensor:
-        """Map boxes: their centres move, and their sides are scaled; they stay upright.
+        """Map boxes (`moved_boxes`).
 
         Args:
             boxes: `(..., 4)`, `(x1, y1, x2, y2)` in pixels of the first frame.
@@ -143,9 +143,40 @@ class Motion:
         Returns:
             `(..., 4)` in pixels of the second frame.
         """
-        top_left = boxes[..., :2]
-        bottom_right = boxes[..., 2:]
-        centre = (top_left + bottom_right) / 2
-        half_size = (bottom_right - top_left) / 2 * self.scale_at(centre)[..., None]
-        moved_centre = self.points(centre)
-        return torch.cat([moved_centre - half_size, moved_centre + half_size], -1)
+        return moved_boxes(torch.from_numpy(self.matrix), boxes)[0]
+
+
+def _local_scale(matrices: Tensor, weight: Tensor) -> Tensor:
+    """Compute the root of the ratio of areas; the determinant of a map's derivative is det(M) / w³."""
+    return (torch.linalg.det(matrices).abs() / weight.abs() ** 3).sqrt()
+
+
+def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Map boxes, each by a motion of its own: their centres move, and their sides are scaled; they stay upright.
+
+    The local scale is the root of the ratio of areas at the centre c, the determinant of the map's derivative:
+
+    .. math:: s(c) = \sqrt{|\det M| / |w(c)|^3}
+
+    Args:
+        matrices: `(..., 3, 3)`, of motions (`Motion.matrix`).
+        boxes: `(..., 4)`, `(x1, y1, x2, y2)` in pixels of the first frames.
+
+    Returns:
+        The boxes in pixels of the second frames, and the scales `(...)`, pixels of these for one of the first.
+
+    >>> matrix = torch.from_numpy(Motion.similarity(shift=(10, 0), scale=2.0).matrix)
+    >>> moved_boxes(matrix, torch.tensor([0.0, 0.0, 4.0, 2.0]))
+    (tensor([10.,  0., 18.,  4.]), tensor(2.))
+    """
+    exact = boxes.double()
+    top_left = exact[..., :2]
+    bottom_right = exact[..., 2:]
+    centre = (top_left + bottom_right) / 2
+    mapped = (matrices[..., :2] @ centre[..., None])[..., 0] + matrices[..., 2]
+    weight = mapped[..., 2:]
+    scale = _local_scale(matrices, weight[..., 0])
+    moved_centre = mapped[..., :2] / weight
+    half_size = (bottom_right - top_left) / 2 * scale[..., None]
+    moved = torch.cat([moved_centre - half_size, moved_centre + half_size], -1)
+    return moved.to(boxes), scale.to(boxes)

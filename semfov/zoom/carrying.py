@@ -6,36 +6,52 @@
 A look is carried from the frame in which it was taken, by the motion since then, so that nothing is resampled twice.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.detection.detections import Detections
-from semfov.motion import Motion
+from semfov.motion import Motion, moved_boxes
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, nearest_cells
 
 
-def carried(look: WindowLook, motion: Motion, lattice: Lattice) -> WindowLook:
-    """Carry a look to another frame.
+def carried(looks: Sequence[WindowLook], motions: Sequence[Motion], lattice: Lattice) -> list[WindowLook]:
+    """Carry looks to another frame.
 
     Args:
-        look: the look, as it was taken.
-        motion: maps pixels of the frame in which it was taken to those of the other frame.
+        looks: the looks, as they were taken.
+        motions: for each, the map from pixels of the frame in which it was taken to those of the other frame.
         lattice: lattice of the frames.
 
     Returns:
-        The look in pixels of the other frame; its window and its boxes may lie beyond the frame. Its window is none of
+        The looks in pixels of the other frame; windows and boxes may lie beyond the frame. Their windows are none of
         the lattice's any more.
     """
-    window = _carried_window(look.window, motion, lattice)
-    detections = look.detections
-    boxes = Detections(motion.boxes(detections.boxes), detections.scores, detections.mask)
+    if not looks:
+        return []
+    # The boxes of all looks are moved together: one at a time costs more than the detector saves.
+    regions = torch.tensor([look.window.region(lattice) for look in looks], dtype=torch.float64)
+    matrices = torch.from_numpy(np.stack([motion.matrix for motion in motions]))
+    moved_regions, scales = moved_boxes(matrices, regions)
+    counts = torch.tensor([look.detections.boxes.shape[1] for look in looks])
+    boxes = torch.cat([look.detections.boxes[0] for look in looks])
+    moved, _ = moved_boxes(matrices.repeat_interleave(counts, 0), boxes)
+    places = zip(moved_regions.tolist(), scales.tolist(), moved.split(counts.tolist()), strict=True)
+    return [
+        _carried_look(look, motion, lattice, _window_at(look.window, region, scale, lattice), boxes)
+        for look, motion, (region, scale, boxes) in zip(looks, motions, places, strict=True)
+    ]
+
+
+def _carried_look(look: WindowLook, motion: Motion, lattice: Lattice, window: Window, boxes: Tensor) -> WindowLook:
+    """Carry a look to a window with moved boxes `(n, 4)`; its hints are resampled."""
+    detections = replace(look.detections, boxes=boxes[None])
     gist = None if look.gist is None else _carried_gist(look.gist, motion, lattice)
-    return replace(look, window=window, detections=boxes, gist=gist)
+    return replace(look, window=window, detections=detections, gist=gist)
 
 
 def inside_frame(boxes: Tensor, size: tuple[int, int]) -> Tensor:
@@ -69,12 +85,9 @@ def share_shown(window: Window, lattice: Lattice) -> float:
     return across * down / (width * height)
 
 
-def _carried_window(window: Window, motion: Motion, lattice: Lattice) -> Window:
-    """Carry a window to another frame: an upright box about its moved centre."""
-    region = torch.tensor(window.region(lattice), dtype=torch.float64)
-    centre = (region[:2] + region[2:]) / 2
-    scale = float(motion.scale_at(centre))
-    x1, y1, x2, y2 = motion.boxes(region).tolist()
+def _window_at(window: Window, region: Sequence[float], scale: float, lattice: Lattice) -> Window:
+    """Make the window of another frame that shows a region `x1 y1 x2 y2`, whose pixels are scaled."""
+    x1, y1, x2, y2 = region
     fixation = (x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, window.fixation[2] / scale
     box = x1, y1, x2, y2
     return Window(fixation, window.level, nearest_cells(lattice, box), box)

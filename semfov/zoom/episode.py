@@ -48,10 +48,23 @@ class KeptLook:
         self.seconds = seconds
         self._motion: Motion | None = None  # of the camera since the look; None as long as it has stood still
 
-    def carry(self, motion: Motion, lattice: Lattice) -> None:
-        """Carry the look along with the camera, to the next frame."""
+    def moved(self, motion: Motion) -> Motion:
+        """Take a motion of the camera to the next frame, and return that since the look."""
         self._motion = motion if self._motion is None else self._motion.then(motion)
-        self.current = carried(self.original, self._motion, lattice)
+        return self._motion
+
+
+def carry_along(looks: Sequence[KeptLook], motion: Motion, lattice: Lattice) -> None:
+    """Carry looks along with the camera, to the next frame.
+
+    Args:
+        looks: the looks.
+        motion: how the camera moved.
+        lattice: lattice of the frames.
+    """
+    motions = [look.moved(motion) for look in looks]
+    for look, current in zip(looks, carried([look.original for look in looks], motions, lattice), strict=True):
+        look.current = current
 
 
 class WindowStep(Generic[_Belief]):
@@ -141,20 +154,16 @@ class _Recent(Generic[_Belief]):
     def follow(self, camera: CameraStep) -> None:
         """Carry the looks along with the camera, or set them aside where the frame fits none before."""
         if camera.motion is not None:
-            self._carry(self.kept, camera.motion)
+            carry_along(self.kept, camera.motion, self.source.lattice)
         else:
             self.aside = self.aside or self.kept
             self.kept = []
         if camera.recovered is not None:
-            self._carry(self.aside, camera.recovered)
+            carry_along(self.aside, camera.recovered, self.source.lattice)
             self.kept = [*self.aside, *self.kept]
         if camera.recovered is not None or not camera.waits:
             self.aside = []
         self._believe_anew()
-
-    def _carry(self, looks: Sequence[KeptLook], motion: Motion) -> None:
-        for look in looks:
-            look.carry(motion, self.source.lattice)
 
     def _believe_anew(self) -> None:
         """Make the belief of the looks that count."""

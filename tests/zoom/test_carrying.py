@@ -30,14 +30,26 @@ def look_at(action, boxes=((300.0, 200.0, 340.0, 260.0),)):
     hints = torch.rand(rows, columns, 3, generator=torch.Generator().manual_seed(0))
     gist = Gist(action[0], action[1:], 1, hints, hints[..., 0] * 5, hints > 0.5)
     count = len(boxes)
-    detections = Detections(torch.tensor([boxes]), torch.full((1, count, 4), 0.25), torch.ones(1, count).bool())
+    places = torch.tensor(boxes).reshape(1, -1, 4)
+    detections = Detections(places, torch.full((1, count, 4), 0.25), torch.ones(1, count).bool())
     return WindowLook(window, detections, torch.zeros(count).bool(), torch.ones(3), gist)
+
+
+def moved_by(motion, look, lattice):
+    """The look after a motion; that of another look beside it changes nothing."""
+    alone = carried([look], [motion], lattice)
+    others = [look_at((2, 4, 4), ()), look_at((1, 2, 2), [(1.0, 2.0, 3.0, 4.0)] * 3)]
+    far = Motion.similarity(shift=(7, -9), turn=5, scale=1.1)
+    beside = carried([others[0], look, others[1]], [far, motion, far.inverse()], lattice)
+    assert beside[1].window == alone[0].window
+    torch.testing.assert_close(beside[1].detections.boxes, alone[0].detections.boxes)
+    return alone[0]
 
 
 def test_a_shift_by_whole_cells_shifts_the_hints():
     wide, high = LATTICE.pitch
     look = look_at((1, 8, 4))
-    moved = carried(look, Motion.similarity(shift=(3 * wide, -2 * high)), LATTICE)
+    moved = moved_by(Motion.similarity(shift=(3 * wide, -2 * high)), look, LATTICE)
     assert moved.gist.first == (11, 2)
     rows, columns = moved.gist.scores.shape[:2]
     assert torch.equal(moved.gist.scores, look.gist.scores[:rows, :columns])
@@ -49,7 +61,7 @@ def test_a_shift_by_whole_cells_shifts_the_hints():
 
 def test_hints_of_the_whole_fill_the_frame_with_those_of_the_border():
     look = look_at((0, 0, 0))
-    moved = carried(look, Motion.similarity(shift=(5 * LATTICE.pitch[0], 0)), LATTICE)
+    moved = moved_by(Motion.similarity(shift=(5 * LATTICE.pitch[0], 0)), look, LATTICE)
     assert moved.gist.scores.shape == look.gist.scores.shape
     assert torch.equal(moved.gist.scores[:, 5:], look.gist.scores[:, :-5])
     assert torch.equal(moved.gist.scores[:, :5], look.gist.scores[:, :1].expand(-1, 5, -1))
@@ -61,19 +73,19 @@ def test_a_turn_by_a_right_angle_turns_the_hints():
     look = replace(look_at((0, 0, 0)), gist=Gist(0, (0, 0), 1, hints, hints[..., 0], hints > 0.5))
     middle = square.size[0] / 2
     about = Motion.similarity(shift=(-middle, -middle)).then(Motion.similarity(turn=90))
-    moved = carried(look, about.then(Motion.similarity(shift=(middle, middle))), square)
+    moved = moved_by(about.then(Motion.similarity(shift=(middle, middle))), look, square)
     assert torch.equal(moved.gist.scores, hints.rot90(-1, (0, 1)))
 
 
 def test_magnification_falls_as_the_picture_grows():
     look = look_at((2, 4, 4))
-    moved = carried(look, Motion.similarity(scale=2.0), LATTICE)
+    moved = moved_by(Motion.similarity(scale=2.0), look, LATTICE)
     assert moved.window.fixation[2] == pytest.approx(look.window.fixation[2] / 2)
     torch.testing.assert_close(moved.detections.boxes, look.detections.boxes + torch.tensor([300.0, 200, 340, 260]))
 
 
 def test_a_look_that_has_left_the_frame_has_no_hints():
-    moved = carried(look_at((1, 0, 0)), Motion.similarity(shift=(5000, 0)), LATTICE)
+    moved = moved_by(Motion.similarity(shift=(5000, 0)), look_at((1, 0, 0)), LATTICE)
     assert moved.gist is None
     assert share_shown(moved.window, LATTICE) == 0
     assert not inside_frame(moved.detections.boxes, LATTICE.size).any()
@@ -82,7 +94,7 @@ def test_a_look_that_has_left_the_frame_has_no_hints():
 def test_shares_of_the_frame():
     whole = Window.overview(LATTICE)
     assert share_shown(whole, LATTICE) == 1
-    half = carried(look_at((0, 0, 0)), Motion.similarity(shift=(512, 0)), LATTICE).window
+    half = moved_by(Motion.similarity(shift=(512, 0)), look_at((0, 0, 0)), LATTICE).window
     assert share_shown(half, LATTICE) == pytest.approx(0.5)
 
 
