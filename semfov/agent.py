@@ -29,6 +29,7 @@ from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
+from semfov.kinds import KindName
 from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
@@ -39,7 +40,6 @@ from semfov.settings import (
     ExploreSettings,
     FindSettings,
     How,
-    KindName,
     LookSettings,
     OnLook,
     SearchSettings,
@@ -573,6 +573,6 @@ class ActivePerception(nn.Module):
         self, opened: OpenedPicture, settings: LookSettings, *, every: bool = False, foveal: bool = False
     ) -> KindOfLook:
         """Choose the kind of look at a picture (`kind_of_look`), and check that the settings suit it."""
-        kind = KINDS_OF_LOOK[self.kind_of_look(opened, settings.how, every=every, foveal=foveal)]
-        kind.check_settings(settings)
-        return kind(self)
+        looks = KINDS_OF_LOOK[self.kind_of_look(opened, settings.how, every=every, foveal=foveal)]
+        settings.check_suitable(looks.kind)
+        return looks(self)

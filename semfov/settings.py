@@ -20,8 +20,9 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 from torch import Tensor
 
 from semfov.data.inputs import Color
-from semfov.errors import check, lookup
+from semfov.errors import InputError, check, lookup
 from semfov.io.ranges import CheckedSettings, Form, Probability, Range, Seconds, Seed, Shifts, Weight
+from semfov.kinds import KindName, LookKind
 
 __all__ = [
     "DecisionSettings",
@@ -33,13 +34,7 @@ __all__ = [
     "StreamSettings",
 ]
 
-KindName = Literal["fovea", "windows", "head"]
-"""Name of a kind of look (`semfov.agents.kinds`): fixations of a photograph, windows of a picture, views of a scene."""
-
-Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
-"""Figure that can be drawn of an episode."""
-
-How = Literal["auto", "fovea", "windows", "head"]
+How = Literal["auto", KindName]
 """Kind of look, or `auto` for the one that suits the picture."""
 
 Start = int | tuple[int, int] | None
@@ -99,6 +94,21 @@ class LookSettings(CheckedSettings):
         super().__post_init__()
         lookup(self.how, get_args(How), "kind of look")
         check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
+
+    def check_suitable(self, kind: LookKind) -> None:
+        """Raise `InputError` for a setting that means nothing to a kind of look, with what to use instead.
+
+        Args:
+            kind: the kind of look.
+        """
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            kinds, instead = suitable_kinds(setting)
+            if value is not None and kind.name not in kinds:
+                raise InputError(
+                    f"{setting.name}: expected none for a picture that is looked at by {kind.looks_by}, got {value}; "
+                    f"use {instead}, or how={kinds[0]!r}"
+                )
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,10 @@ import torch
 
 from examples.look_graph import OPSET
 from semfov import FovealObservationModel
+from semfov.agents.fovea import RATE as FOVEA_RATE
 from semfov.agents.head import _CONFIRM
-from semfov.agents.kinds import FoveaKind, WindowKind
 from semfov.agents.window_episode import LIKELY
+from semfov.agents.windows import RATE as WINDOW_RATE
 from semfov.belief import Verification
 from semfov.data.inputs import FRAME
 from semfov.decision import MOST_CLOSER
@@ -187,8 +188,8 @@ KNOWN = {
         f"at least {LIKELY} are listed": "code",
         f"{MOST_CLOSER} by default": "code",
         "for 15 s": "code, tested with a stream that breaks off",
-        f"{log(2) / WindowKind.usual_rate:.1f} s by default": "code",
-        f"rate, {FoveaKind.usual_rate}, is {FoveaKind.usual_rate * FRAME:g} a frame at {1 / FRAME:.0f} frames": "code",
+        f"{log(2) / WINDOW_RATE:.1f} s by default": "code",
+        f"rate, {FOVEA_RATE}, is {FOVEA_RATE * FRAME:g} a frame at {1 / FRAME:.0f} frames": "code",
         f"1/{1 / FRAME:.0f} s is taken": "code",
         "of 16 bits": "a type",
     },

@@ -19,10 +19,10 @@ ROOT = PACKAGE.parent
 
 # A subpackage imports only from itself and from the subpackages before it.
 SUBPACKAGES = [
-    "version", "words", "errors", "threads", "io", "data", "settings", "motion", "sensor", "detection", "observation",
-    "dirichlet", "belief", "observers", "gaze", "acquisition", "policies", "saliency", "eye", "episode", "decision",
-    "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets", "agent", "metrics", "viz",
-    "report", "runs", "cli", "__main__", "baselines", "human", "fit", "envs",
+    "version", "words", "errors", "threads", "io", "data", "kinds", "settings", "motion", "sensor", "detection",
+    "observation", "dirichlet", "belief", "observers", "gaze", "acquisition", "policies", "saliency", "eye",
+    "episode", "decision", "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
+    "agent", "metrics", "viz", "report", "runs", "cli", "__main__", "baselines", "human", "fit", "envs",
 ]  # fmt: skip
 # Others' models for comparison, what is known of people, the fits with their stored looks and protocols, and the
 # environments stand on all other rooms, which work without them. A command imports them when it is run.

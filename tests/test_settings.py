@@ -15,10 +15,10 @@ from semfov.cli.main import main
 from semfov.cli.options import ExploreOptions, FindOptions, LiveOptions, SearchOptions
 from semfov.errors import InputError
 from semfov.io.ranges import Range
+from semfov.kinds import KindName
 from semfov.settings import (
     ExploreSettings,
     FindSettings,
-    KindName,
     LookSettings,
     SearchSettings,
     StreamSettings,
@@ -126,9 +126,9 @@ def test_settings_do_not_change_and_boxes_do_not_count_where_they_are_compared()
     ids=str,
 )  # fmt: skip
 def test_settings_of_another_kind_of_look_are_refused_with_what_to_use(settings, kind, message):
-    refused(f"^{message}", KINDS_OF_LOOK[kind].check_settings, settings)
+    refused(f"^{message}", settings.check_suitable, KINDS_OF_LOOK[kind].kind)
     (suggested,) = re.findall(r"how='(\w+)'", message)
-    KINDS_OF_LOOK[suggested].check_settings(settings)
+    settings.check_suitable(KINDS_OF_LOOK[suggested].kind)
 
 
 def test_every_kind_of_look_has_its_object():

@@ -1,30 +1,25 @@
-"""The kinds of look as objects: what each opens of a picture, the episodes of its tasks, and the settings it takes."""
+"""The kinds of look of an agent: what each opens of a picture, and the episodes of its tasks."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Protocol
 
 from semfov.agents.episode import StreamEpisode, without_none
-from semfov.agents.fovea import RATE as FOVEA_RATE
 from semfov.agents.fovea import FoveaAgent
 from semfov.agents.head import HeadAgent
 from semfov.agents.picture import OpenedPicture
-from semfov.agents.windows import RATE as WINDOW_RATE
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.observers.any_of import TargetLike
 from semfov.errors import InputError, check
+from semfov.kinds import FOVEA, HEAD, WINDOWS, LookKind
 from semfov.paths import Record
 from semfov.settings import (
-    Drawing,
     ExploreSettings,
     FindSettings,
-    KindName,
-    LookSettings,
     SearchSettings,
     Start,
     StreamSettings,
-    suitable_kinds,
 )
 from semfov.strategy import classes_named
 
@@ -45,21 +40,17 @@ class AgentParts(Protocol):
 class KindOfLook(ABC):
     """A kind of look of an agent: it opens a picture in its own form, and runs the episode of each task.
 
-    A subclass is registered under its `name` by being defined (`KINDS_OF_LOOK`).
+    A subclass is registered under the name of its `kind` by being defined (`KINDS_OF_LOOK`).
 
     Attributes:
-        name: name of the kind, as `how=` has it.
-        described: what looks at a picture, in words.
-        drawings: figures that can be drawn of its records.
+        kind: what is known of the kind without an agent.
     """
 
-    name: ClassVar[KindName]
-    described: ClassVar[str]
-    drawings: ClassVar[tuple[Drawing, ...]] = ("scanpath", "animation")
+    kind: ClassVar[LookKind]
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        KINDS_OF_LOOK[cls.name] = cls
+        KINDS_OF_LOOK[cls.kind.name] = cls
 
     def __init__(self, parts: AgentParts) -> None:
         self.parts = parts
@@ -92,20 +83,8 @@ class KindOfLook(ABC):
         """
         raise InputError(
             "how: expected 'fovea', 'windows' or 'auto' for a stream; for a camera that turns use search, and for a "
-            f"panoramic frame search or find_all of semfov.Panorama(frame), got {self.name}"
+            f"panoramic frame search or find_all of semfov.Panorama(frame), got {self.kind.name}"
         )
-
-    @classmethod
-    def check_settings(cls, settings: LookSettings) -> None:
-        """Raise `InputError` for a setting that means nothing to this kind of look, with what to use instead."""
-        for setting in fields(settings):
-            value = getattr(settings, setting.name)
-            kinds, instead = suitable_kinds(setting)
-            if value is not None and cls.name not in kinds:
-                raise InputError(
-                    f"{setting.name}: expected none for a picture that is looked at by {cls.described}, got {value}; "
-                    f"use {instead}, or how={kinds[0]!r}"
-                )
 
 
 KINDS_OF_LOOK: dict[str, type[KindOfLook]] = {}
@@ -115,11 +94,7 @@ KINDS_OF_LOOK: dict[str, type[KindOfLook]] = {}
 class FoveaKind(KindOfLook):
     """Looks of a fovea that moves over the cells of a photograph."""
 
-    name = "fovea"
-    described = "a fovea"
-    drawings = ("scanpath", "views", "belief", "belief_bars", "animation")
-    usual_rate = FOVEA_RATE
-    """Default rate at which the belief fades in a stream, per second."""
+    kind = FOVEA
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
         fovea = self.parts.fovea
@@ -144,10 +119,7 @@ class FoveaKind(KindOfLook):
 class WindowKind(KindOfLook):
     """Looks at windows of a picture of any size, the first of them the whole picture."""
 
-    name = "windows"
-    described = "windows"
-    usual_rate = WINDOW_RATE
-    """Default rate at which looks are forgotten in a stream, per second: a look counts for 0.9 s."""
+    kind = WINDOWS
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
         return self.parts.zoom.search(
@@ -176,8 +148,7 @@ class WindowKind(KindOfLook):
 class HeadKind(KindOfLook):
     """Looks of an eye in a head that turns in a scene."""
 
-    name = "head"
-    described = "a head that turns"
+    kind = HEAD
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
         return self.parts.head.search(

@@ -19,8 +19,9 @@ from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
 from semfov.errors import InputError, SemfovError, check, lookup
 from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import World
+from semfov.kinds import KindName
 from semfov.paths import Record
-from semfov.settings import How, KindName
+from semfov.settings import How
 from semfov.zoom.lattice import Lattice
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera

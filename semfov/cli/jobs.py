@@ -33,10 +33,11 @@ from semfov.io.files import check_writable, sha256
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.io.ranges import CheckedSettings
+from semfov.kinds import Drawing
 from semfov.paths import Record
 from semfov.report.template import page_path
 from semfov.runs.config import WHERE
-from semfov.settings import Drawing, ExploreSettings, FindSettings, SearchSettings
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 
 _Options = TypeVar("_Options", bound=PictureOptions)
 
@@ -178,7 +179,7 @@ class PictureJob(ABC, Generic[_Options]):
                 kind = self.agent.kind_of_look(source.picture(), self.options.how, every=self.every)
             except Exception:
                 continue  # it is told when the picture is looked at
-            possible = [drawing for drawing in KINDS_OF_LOOK[kind].drawings if drawing in self.drawings]
+            possible = [drawing for drawing in KINDS_OF_LOOK[kind].kind.drawings if drawing in self.drawings]
             impossible = ", ".join(drawing for drawing in self.options.draw or () if drawing not in possible)
             expected = f"{' or '.join(possible)} for {source.name}, which is looked at by {kind!r}"
             check(not impossible, "draw", expected, impossible)

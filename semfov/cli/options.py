@@ -11,10 +11,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from semfov.data.tone import White
 from semfov.errors import InputError
 from semfov.io.ranges import Count, Form, Range, Seed, Whole, Workers
+from semfov.kinds import Drawing
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 from semfov.settings import (
-    Drawing,
     ExploreSettings,
     FindSettings,
     LookSettings,

@@ -20,10 +20,10 @@ from semfov.cli.truth import Truth
 from semfov.decision import Decision
 from semfov.detection.objects import box_text
 from semfov.io.files import plain_name
+from semfov.kinds import Drawing
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import CONFIDENT, RecordedLook, detections_in_words
 from semfov.report.episode import jpeg
-from semfov.settings import Drawing
 from semfov.viz import plot_belief, plot_belief_bars, plot_foveated_strip, save_figure
 from semfov.viz.semantic import named_regions, plot_semantic_map
 

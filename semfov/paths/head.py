@@ -20,10 +20,10 @@ from semfov.head.scenes import Flat, Panorama, Sphere, World
 from semfov.head.views import Views
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Text
 from semfov.io.tables import pixels
+from semfov.kinds import HEAD
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS
 from semfov.paths.files import POSITIVE, Format
-from semfov.paths.kinds import HEAD
 from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST

@@ -18,9 +18,9 @@ from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import LEAST, Objects
 from semfov.errors import check
+from semfov.kinds import LookKind
 from semfov.observation.matching import box_iou
 from semfov.paths.files import Ending
-from semfov.paths.kinds import LookKind
 from semfov.paths.look import RecordedLook
 from semfov.paths.merging import distances_to, merge_fixations
 
@@ -77,7 +77,7 @@ class Outcome(ABC):
     @property
     def how(self) -> str:
         """Name of the kind of look: `fovea`, `windows` or `head`."""
-        return self.kind.how
+        return self.kind.name
 
     @property
     def fixated(self) -> tuple[RecordedLook, ...]:

@@ -15,10 +15,10 @@ from semfov.decision import Decision
 from semfov.episode import STAGES
 from semfov.errors import InputError, check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Text
+from semfov.kinds import FOVEA
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.fovea import FoveaLook, FoveaLooks, moment_look
-from semfov.paths.kinds import FOVEA
 from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import LookView
 from semfov.paths.stimulus import Stimulus

@@ -13,9 +13,9 @@ from semfov.data.classes import plural
 from semfov.detection import Objects
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
+from semfov.kinds import WINDOWS
 from semfov.paths.base import Moment, Record
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
-from semfov.paths.kinds import WINDOWS
 from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import Box, RecordedLook
 from semfov.paths.words import MomentWords, Words
