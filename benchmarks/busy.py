@@ -24,6 +24,7 @@ from semfov.data.images import to_bytes
 from semfov.data.mosaics import Mosaics
 from semfov.detection.scores import Candidates
 from semfov.paths import ZoomPath
+from semfov.settings import SearchSettings
 
 TEXT = "Written by `python -m benchmarks.busy`: milliseconds by the clock, medians (quartiles)."
 
@@ -56,7 +57,7 @@ def large_search() -> Run:
         return candidates[-1]
 
     def search() -> ZoomPath:
-        return agent.search(picture, "person", passes=16, confirm=1.0, give_up=0.0, closer=0)
+        return agent.search(picture, "person", SearchSettings(passes=16, confirm=1.0, give_up=0.0, closer=0))
 
     vars(detector)["propose_bytes"] = remembered
     search()

@@ -39,6 +39,7 @@ from semfov.io.files import write_text
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.looks import one_thread
+from semfov.settings import FindSettings
 from semfov.viz.style import COLOURS, make_figure, save_figure, styled
 from semfov.zoom.episode import Order, WindowStep, look_by_look
 from semfov.zoom.eye import WindowEye
@@ -216,7 +217,7 @@ def _slicer(run: ZoomRun, side: int, pixels: _Pixels) -> tuple[Objects, int]:
 
 def _chosen(run: ZoomRun, passes: int, pixels: _Pixels) -> tuple[Objects, int]:
     """Objects that `find_all` finds in a picture `(H, W, 3)` with so many passes, and the passes that it took."""
-    path = ZoomAgent(run.eye, run.evidence).find_all(pixels, run.target, passes=passes, worth=0.0)
+    path = ZoomAgent(run.eye, run.evidence).find_all(pixels, run.target, FindSettings(passes=passes, worth=0.0))
     return path.candidates, path.passes
 
 

@@ -8,6 +8,7 @@ import argparse
 import semfov
 from semfov import HeadAgent
 from semfov.head import Panoramas
+from semfov.settings import ExploreSettings, SearchSettings
 
 
 def main() -> None:
@@ -29,9 +30,9 @@ def main() -> None:
         image = Panoramas(scenes, width=2048, count=1, seed=arguments.seed)[0].image
 
     if arguments.target is None:
-        path = agent.explore(semfov.Panorama(image), duration=arguments.seconds)
+        path = agent.explore(semfov.Panorama(image), ExploreSettings(duration=arguments.seconds))
     else:
-        path = agent.search(semfov.Panorama(image), arguments.target, duration=arguments.seconds)
+        path = agent.search(semfov.Panorama(image), arguments.target, SearchSettings(duration=arguments.seconds))
 
     for number, seconds in enumerate(path.seconds):
         yaw, pitch, _ = path.pose(number).tolist()

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 
 import torch
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ from semfov.episode import Forgetting
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.motion import Motion
 from semfov.paths import Ending, Moment, Record, RecordedLook
-from semfov.settings import MOST_PASSES, OnLook
+from semfov.settings import MOST_PASSES, LookSettings, OnLook
 
 _Module = TypeVar("_Module", bound=nn.Module)
 _Record = TypeVar("_Record", bound=Record)
@@ -43,6 +43,20 @@ class EpisodeLimits:
         if self.seconds is not None:
             check_number(self.seconds, "seconds", 0, float("inf"))
         check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
+
+    @classmethod
+    def of(cls, settings: LookSettings, usual: int | None = None) -> Self:
+        """Begin the time of an episode with the limits of its settings.
+
+        Args:
+            settings: the settings of its task.
+            usual: largest number of passes where the settings have none; None for no limit.
+
+        Returns:
+            The limits.
+        """
+        passes = usual if settings.passes is None else settings.passes
+        return cls(passes, settings.seconds, settings.on_look)
 
     def reached(self, passes: int, record: Callable[[], Any]) -> Literal["stopped", "passes", "seconds"] | None:
         """Find the limit that is reached after a look. Call it once after each look."""
@@ -231,11 +245,6 @@ class StreamEpisode(Episode[_Moment]):
 def no_frame_yet() -> InputError:
     """Make the error of a stream that is asked for its moment before its first frame."""
     return InputError("moment: expected a frame before it, got none; call step with a frame first")
-
-
-def without_none(**values: Any) -> dict[str, Any]:
-    """Select the arguments that are not None."""
-    return {name: value for name, value in values.items() if value is not None}
 
 
 def on_cpu(module: _Module) -> _Module:

@@ -15,7 +15,7 @@ from semfov.decision.stopping import AtDetection, AtGoal, LittleGain, StoppingCr
 from semfov.errors import InputError, check, check_finite, check_shape, check_whole
 from semfov.gaze.acquisition import ExpectedGain
 from semfov.paths import GazePrediction, Scanpath
-from semfov.settings import ExploreSettings, FindSettings, LookSettings, SearchSettings, StreamSettings
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 
 _WORTH = 0.1  # default for the least gain of a look by a learned map, in cells that are classified correctly
 RATE = 2.5  # default rate at which the belief fades in a stream, per second
@@ -36,7 +36,7 @@ class FoveaAgent(GazeParts):
         Returns:
             The record, with its decision.
         """
-        limits = _limits(settings)
+        limits = EpisodeLimits.of(settings)
         strategy, index, weights = self.searching.sought(target, ("background", *self.eye.detector.classes))
         plan = GazePlan(
             self,
@@ -68,7 +68,7 @@ class FoveaAgent(GazeParts):
         Returns:
             The record.
         """
-        limits = _limits(settings)
+        limits = EpisodeLimits.of(settings)
         observer = on_cpu(self.exploring.observer)
         worth, policy = settings.worth, settings.policy
         if worth and not isinstance(observer, LearnedMap):
@@ -101,7 +101,7 @@ class FoveaAgent(GazeParts):
         Returns:
             The record, with its objects.
         """
-        limits = _limits(settings)
+        limits = EpisodeLimits.of(settings)
         one = targets[0] if len(targets) == 1 else None
         plan = GazePlan(self, one, shifts=_shifts(settings.shifts, 20, limits))
         episode = FoveaEpisode(plan, image, limits, lambda grid: StoppingCriterion())
@@ -124,11 +124,6 @@ class FoveaAgent(GazeParts):
         rate = RATE if settings.rate is None else settings.rate
         plan = GazePlan(self, target, start=settings.start, seed=settings.seed, decisions=settings, rate=rate)
         return FoveaStream(plan, settings.color)
-
-
-def _limits(settings: LookSettings) -> EpisodeLimits:
-    """Begin the time of an episode, and take its limits from the settings."""
-    return EpisodeLimits(settings.passes, settings.seconds, settings.on_look)
 
 
 def _shifts(shifts: int | None, usual: int, limits: EpisodeLimits) -> int:

@@ -17,7 +17,7 @@ from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color
 from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
 from semfov.detection.load import load_detector
-from semfov.errors import check_number, check_whole
+from semfov.errors import InputError, check_number, check_whole
 from semfov.eye import Eye
 from semfov.head.belief import SceneObserver
 from semfov.head.camera import SceneLike, open_scene
@@ -27,11 +27,12 @@ from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond,
 from semfov.head.views import Views
 from semfov.io.compatibility import learned_for
 from semfov.io.pretrained import shipped_model
+from semfov.kinds import HEAD
 from semfov.paths import Ending, HeadPath
 from semfov.paths.head import HeadLook, head_look
 from semfov.paths.stimulus import reduced_copy
 from semfov.sensor.foveation import Foveation
-from semfov.settings import MOST_PASSES, OnLook
+from semfov.settings import MOST_PASSES, ExploreSettings, FindSettings, LookSettings, SearchSettings, StartSettings
 
 _SIGMA = 100.0  # width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels
 _PASSES = 40  # default of the largest number of looks
@@ -104,81 +105,61 @@ class HeadAgent(nn.Module):
         self,
         scene: SceneLike,
         target: str | int,
+        settings: SearchSettings | None = None,
         *,
-        passes: int | None = None,
-        seconds: float | None = None,
-        duration: float = _DURATION,
-        on_look: OnLook | None = None,
-        start: int | None = None,
-        confirm: float | None = None,
-        give_up: float | None = None,
-        prior: float | None = None,
         foresight: float = FORESIGHT,
         chance: float = PRIOR,
-        seed: int = 0,
         color: Color = "rgb",
     ) -> HeadPath:
         """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerSecond`).
 
-        The target is found when the gaze is on a cell that holds it with a probability of at least `confirm`. It is
-        absent if every cell that the views show was fixated, it or an equally probable neighbour, or is less probable
-        than `give_up`, and no cell holds it with a probability of one half. Both end the search. A search that a limit
-        ends is undecided (`semfov.decision.settle`).
+        The target is found when the gaze is on a cell that holds it with a probability of at least `confirm` (None:
+        0.7). It is absent if every cell that the views show was fixated, it or an equally probable neighbour, or is
+        less probable than `give_up` (None: than a cell that was never seen), and no cell holds it with a probability of
+        one half. Both end the search. A search that a limit ends is undecided (`semfov.decision.settle`).
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
             target: name or index (1..K) of the class.
-            passes: largest number of looks; None takes 40.
-            seconds: time in seconds that looks may take on this machine; None for no limit.
-            duration: time limit of the scene in seconds, for the movements of eye and head and the looks, as its
-                `speeds` have it; a look that would end later is not taken.
-            on_look: called after each look with the record so far; returning False ends the search.
-            start: first action (`Views`); None looks straight ahead (`Views.ahead`).
-            confirm: probability at which the search ends as found; None takes 0.7.
-            give_up: probability below which a cell is not worth a look; None takes that of a cell that was never seen.
-            prior: how often the target is there, as a share of the scenes that are searched; None: as often as in the
-                searches of the fit.
+            settings: the settings of the search; None for the usual ones. A look that would end after `duration`, as
+                the `speeds` of the scene have it, is not taken.
             foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
             chance: probability that a cell that was never seen holds the target, without a `prior`.
-            seed: of the generator that breaks ties.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
         Returns:
             The record of the search, with its decision.
 
         Raises:
-            InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
+            InputError: the class is unknown (the nearest names are suggested), or a setting is not for a head.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
+        settings = SearchSettings() if settings is None else settings
+        settings.check_suitable(HEAD)
         index = class_index(target, self.classes[1:], "target")
-        check_thresholds(confirm, give_up)
+        check_thresholds(settings.confirm, settings.give_up)
         check_number(foresight, "foresight", 0, 1e6)
-        limits = EpisodeLimits(_PASSES if passes is None else passes, seconds, on_look)
+        limits = EpisodeLimits.of(settings, _PASSES)
         views = self.views(scene, color)
         evidence = on_cpu(self.target_evidence)  # where the geometry of the scene is
-        known = Prior.of(prior, evidence.shares, index)
+        known = Prior.of(settings.prior, evidence.shares, index)
         never_seen = known(chance)
         gain = SearchGain(views, foresight)
         observer = SceneObserver(Target(evidence, prior=known), views, prior=never_seen)
-        sure = _CONFIRM if confirm is None else confirm
-        thresholds = Thresholds(sure, never_seen if give_up is None else give_up, sure)
+        sure = _CONFIRM if settings.confirm is None else settings.confirm
+        thresholds = Thresholds(sure, never_seen if settings.give_up is None else settings.give_up, sure)
         return HeadEpisode(
             self, observer, gain, index,
-            thresholds=thresholds, limits=limits, start=start, duration=duration, seed=seed, prior=prior,
+            thresholds=thresholds, limits=limits, start=_first_action(settings), duration=_duration(settings),
+            seed=settings.seed, prior=settings.prior,
         ).run()  # fmt: skip
 
     def find_all(
         self,
         scene: SceneLike,
         target: str | int | Sequence[str | int] | None = None,
+        settings: FindSettings | None = None,
         *,
-        passes: int | None = None,
-        seconds: float | None = None,
-        duration: float = _DURATION,
-        on_look: OnLook | None = None,
-        worth: float = 0.0,
-        start: int | None = None,
-        seed: int = 0,
         color: Color = "rgb",
     ) -> HeadPath:
         """Find all objects of a class, of several, or of all: an exploration whose record is about them.
@@ -186,48 +167,77 @@ class HeadAgent(nn.Module):
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
             target: name or index (1..K) of the class, or several of them; None for all classes.
-            passes: largest number of looks; None takes 40.
-            seconds: time in seconds that looks may take on this machine; None for no limit.
-            duration: time limit of the scene in seconds, as for `search`.
-            on_look: called after each look with the record so far; returning False ends it.
-            worth: least expected number of additional correct cells, of average area, for which a look is worth it.
-            start: first action (`Views`); None looks straight ahead (`Views.ahead`).
-            seed: of the generator that breaks ties.
+            settings: the settings of the task; None for the usual ones.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
         Returns:
             The record, with the objects.
 
         Raises:
-            InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
+            InputError: the class is unknown (the nearest names are suggested), or a setting is not for a head.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
         indices = class_numbers(target, self.classes[1:], "target")
-        limits = EpisodeLimits(_PASSES if passes is None else passes, seconds, on_look)
-        views = self.views(scene, color)
-        check_number(worth, "worth", 0, float("inf"))
-        evidence = on_cpu(self.map_evidence)
-        gain, observer = ExploreGain(views, evidence), SceneObserver(LearnedMap(evidence), views)
-        return HeadEpisode(
-            self, observer, gain, None, indices,
-            worth=worth, limits=limits, start=start, duration=duration, seed=seed,
-        ).run()  # fmt: skip
+        return self._look_around(scene, indices, FindSettings() if settings is None else settings, color)
 
-    def explore(self, scene: SceneLike, **options: Any) -> HeadPath:
+    def explore(self, scene: SceneLike, settings: ExploreSettings | None = None, *, color: Color = "rgb") -> HeadPath:
         """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerSecond`).
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
-            options: arguments of `find_all`, except for the target.
+            settings: the settings of the exploration; None for the usual ones.
+            color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
         Returns:
             The record of the exploration.
 
         Raises:
-            InputError: an argument is out of range.
+            InputError: a setting is not for a head.
             DataError: a file cannot be read, or the camera gives no frame from the right direction.
         """
-        return self.find_all(scene, None, **options)
+        settings = ExploreSettings() if settings is None else settings
+        return self._look_around(scene, (), settings, color, _first_action(settings), settings.seed)
+
+    def _look_around(
+        self,
+        scene: SceneLike,
+        targets: tuple[int, ...],
+        settings: FindSettings | ExploreSettings,
+        color: Color,
+        start: int | None = None,
+        seed: int = 0,
+    ) -> HeadPath:
+        """Look for all objects of classes 1..K, or of all classes, by the expected gain of the map."""
+        settings.check_suitable(HEAD)
+        limits = EpisodeLimits.of(settings, _PASSES)
+        views = self.views(scene, color)
+        evidence = on_cpu(self.map_evidence)
+        path = HeadEpisode(
+            self,
+            SceneObserver(LearnedMap(evidence), views),
+            ExploreGain(views, evidence),
+            None,
+            targets,
+            worth=0.0 if settings.worth is None else settings.worth,
+            limits=limits,
+            start=start,
+            duration=_duration(settings),
+            seed=seed,
+        ).run()
+        return path if settings.least is None else replace(path, least=settings.least)
+
+
+def _duration(settings: LookSettings) -> float:
+    """Take the time limit of a scene, or the usual one."""
+    return _DURATION if settings.duration is None else settings.duration
+
+
+def _first_action(settings: StartSettings) -> int | None:
+    """Take the first action of a head, which has no columns and rows."""
+    start = settings.start
+    if isinstance(start, tuple):
+        raise InputError(f"start: expected the number of an action for a head (semfov.head.views.Views), got {start}")
+    return start
 
 
 class HeadEpisode(PictureEpisode[HeadPath]):

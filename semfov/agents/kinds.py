@@ -1,11 +1,10 @@
 """The kinds of look of an agent: what each opens of a picture, and the episodes of its tasks."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol
 
-from semfov.agents.episode import StreamEpisode, without_none
+from semfov.agents.episode import StreamEpisode
 from semfov.agents.fovea import FoveaAgent
 from semfov.agents.head import HeadAgent
 from semfov.agents.picture import OpenedPicture
@@ -18,7 +17,6 @@ from semfov.settings import (
     ExploreSettings,
     FindSettings,
     SearchSettings,
-    Start,
     StreamSettings,
 )
 from semfov.strategy import classes_named
@@ -122,24 +120,13 @@ class WindowKind(KindOfLook):
     kind = WINDOWS
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
-        return self.parts.zoom.search(
-            picture.large,
-            _one_class(target),
-            passes=settings.passes,
-            seconds=settings.seconds,
-            on_look=settings.on_look,
-            confirm=settings.confirm,
-            give_up=settings.give_up,
-            closer=settings.closer,
-            prior=settings.prior,
-        )
+        return self.parts.zoom.search(picture.large, _one_class(target), settings)
 
     def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
-        target = targets[0] if len(targets) == 1 else list(targets) or None
-        return self.parts.zoom.find_all(picture.large, target, batch=settings.batch, **_of_objects(settings))
+        return self.parts.zoom.find_all(picture.large, targets or None, settings)
 
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
-        return self.parts.zoom.explore(picture.large, **_of_objects(settings))
+        return self.parts.zoom.explore(picture.large, settings)
 
     def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
         return self.parts.zoom.stream(target, targets, settings)
@@ -151,67 +138,18 @@ class HeadKind(KindOfLook):
     kind = HEAD
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
-        return self.parts.head.search(
-            picture.world,
-            _one_class(target),
-            passes=settings.passes,
-            seconds=settings.seconds,
-            on_look=settings.on_look,
-            start=_first_action(settings.start),
-            confirm=settings.confirm,
-            give_up=settings.give_up,
-            prior=settings.prior,
-            seed=settings.seed,
-            **without_none(duration=settings.duration),
-        )
+        return self.parts.head.search(picture.world, _one_class(target), settings)
 
     def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
-        chosen = without_none(worth=settings.worth, duration=settings.duration)
-        record = self.parts.head.find_all(
-            picture.world,
-            targets or None,
-            passes=settings.passes,
-            seconds=settings.seconds,
-            on_look=settings.on_look,
-            **chosen,
-        )
-        return _counted_from(record, settings.least)
+        return self.parts.head.find_all(picture.world, targets or None, settings)
 
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
-        chosen = without_none(worth=settings.worth, duration=settings.duration)
-        record = self.parts.head.explore(
-            picture.world,
-            passes=settings.passes,
-            seconds=settings.seconds,
-            on_look=settings.on_look,
-            start=_first_action(settings.start),
-            seed=settings.seed,
-            **chosen,
-        )
-        return _counted_from(record, settings.least)
+        return self.parts.head.explore(picture.world, settings)
 
 
 def _counted_from(record: Record, least: float | None) -> Record:
     """Count the objects of a record from a probability or score on; None leaves the record as it is."""
     return record if least is None else replace(record, least=least)
-
-
-def _of_objects(settings: FindSettings | ExploreSettings) -> Mapping[str, Any]:
-    """List the settings of windows that look for all objects."""
-    return without_none(
-        passes=settings.passes,
-        seconds=settings.seconds,
-        on_look=settings.on_look,
-        worth=settings.worth,
-        least=settings.least,
-    )
-
-
-def _first_action(start: Start) -> int | None:
-    """Take the first action of a head, which has no columns and rows."""
-    if isinstance(start, tuple):
-        raise InputError(f"start: expected the number of an action for a head (semfov.head.views.Views), got {start}")
-    return start
 
 
 def _one_class(target: TargetLike) -> str | int:

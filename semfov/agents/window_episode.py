@@ -58,8 +58,8 @@ class WindowTask:
         evidence: predicts from a look what closer looks will find; None looks at slices in the order of the overview's
             scores, and then nothing is `absent`.
         decisions: settings of the decision of a search.
-        worth: an exploration ends when no look is expected to find more new objects than this. In a photograph, and
-            without evidence, all slices are looked at, and it means nothing.
+        worth: an exploration ends when no look is expected to find more new objects than this; None for the usual
+            number. In a photograph, and without evidence, all slices are looked at, and it means nothing.
         batch: number of windows that are chosen jointly and pass the detector together; in a photograph one.
         least: probability, without evidence score, from which on objects count; None for the usual one.
         detector: name of the detector; None if it is not known.
@@ -68,7 +68,7 @@ class WindowTask:
     goal: Goal
     evidence: GlimpseEvidence | None = None
     decisions: DecisionSettings = field(default_factory=DecisionSettings)
-    worth: float = NEW_OBJECTS
+    worth: float | None = None
     batch: int = 1
     least: float | None = None
     detector: str | None = None
@@ -152,9 +152,8 @@ class WindowSession:
             belief = ZoomBelief(source.lattice, evidence, goal.target, source.blank)
             self.decisions = decisions_of(belief, self._close_up, task.decisions, self.forgetting)
             return search_windows(source, belief, forgetting=self.forgetting)
-        return find_everything(
-            source, evidence, goal.target, batch=task.batch, worth=task.worth, forgetting=self.forgetting
-        )
+        worth = NEW_OBJECTS if task.worth is None else task.worth
+        return find_everything(source, evidence, goal.target, batch=task.batch, worth=worth, forgetting=self.forgetting)
 
     def look(self) -> KeptLook | None:
         """Look at the next window, or closely at a place that seems to hold the target; None if no window is left."""

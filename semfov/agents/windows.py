@@ -6,14 +6,15 @@ from typing import Any, Self
 from torch import nn
 
 from semfov.agents.episode import EpisodeLimits, Goal, on_cpu
-from semfov.agents.window_episode import NEW_OBJECTS, PASSES, WindowEpisode, WindowStream, WindowTask
+from semfov.agents.window_episode import PASSES, WindowEpisode, WindowStream, WindowTask
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.windowed import LargePicture
 from semfov.detection.load import load_detector, loader_options
-from semfov.errors import check, check_number, check_options, check_whole
+from semfov.errors import check, check_options
+from semfov.kinds import WINDOWS
 from semfov.paths import ZoomPath
-from semfov.settings import MOST_PASSES, DecisionSettings, OnLook, StreamSettings
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.looks import LiveWindowLooks
@@ -44,7 +45,7 @@ class ZoomAgent(nn.Module):
     Example::
 
         agent = ZoomAgent.recommended("yolox-nano")
-        path = agent.find_all("harbour.tif", "person", passes=16)
+        path = agent.find_all("harbour.tif", "person", FindSettings(passes=16))
         print(path.objects.boxes, path.passes)
     """
 
@@ -78,114 +79,81 @@ class ZoomAgent(nn.Module):
         eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
         return cls(eye, GlimpseEvidence.from_pretrained(eye.detector.name)).eval().requires_grad_(False)
 
-    def search(
-        self,
-        picture: _Picture,
-        target: str | int,
-        *,
-        passes: int | None = None,
-        seconds: float | None = None,
-        on_look: OnLook | None = None,
-        confirm: float | None = None,
-        give_up: float | None = None,
-        closer: int | None = None,
-        prior: float | None = None,
-    ) -> ZoomPath:
+    def search(self, picture: _Picture, target: str | int, settings: SearchSettings | None = None) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one.
 
         The recommended agent looks closely at places that seem to hold the class before it says `found`
-        (`semfov.zoom.closer`).
+        (`semfov.zoom.closer`). Without evidence the search is found at a detection with a score of at least `confirm`
+        (None: 0.5), and without evidence that fits verification it decides without closer looks.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class.
-            passes: largest number of passes of the detector, closer looks included; None takes 24.
-            seconds: longest time in seconds on this machine.
-            on_look: called after each look with the record so far; returning False ends the search.
-            confirm: the class counts as found when the probability reaches this value: with closer looks, that it is at
-                the place; otherwise, that the picture holds it. None takes the threshold of the evidence. Without
-                evidence it is the least score of a detection; None takes 0.5.
-            give_up: the search ends when no look shows the class with a probability of at least this value; None takes
-                the threshold of the evidence.
-            closer: largest number of closer looks, 0 to 100; None takes 3 in a photograph, and in a larger picture as
-                many as there are passes for. 0 decides without them, as does evidence without fitted verification.
-            prior: how often the class is there, as a share of the pictures that are searched; None: as often as in the
-                fit.
+            settings: the settings of the search; None for the usual ones.
 
         Returns:
             The looks, the objects of the class, and the decision.
 
         Raises:
-            InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
+            InputError: the class is unknown (the nearest names are suggested), or a setting is not for windows.
             DataError: the file cannot be read.
         """
-        decisions = DecisionSettings(confirm, give_up, closer, prior)
-        limits = EpisodeLimits(PASSES if passes is None else passes, seconds, on_look)
+        settings = SearchSettings() if settings is None else settings
+        settings.check_suitable(WINDOWS)
+        limits = EpisodeLimits.of(settings, PASSES)
         index = class_index(target, self.classes[1:], "target")
-        return self.episode(picture, self.task(index, decisions=decisions), limits).run()
+        return self.episode(picture, self.task(index, decisions=settings), limits).run()
 
     def find_all(
         self,
         picture: _Picture,
         target: str | int | Sequence[str | int] | None = None,
-        *,
-        passes: int | None = None,
-        seconds: float | None = None,
-        on_look: OnLook | None = None,
-        batch: int = 1,
-        worth: float = NEW_OBJECTS,
-        least: float | None = None,
+        settings: FindSettings | None = None,
     ) -> ZoomPath:
         """Find all objects of a class, of several or of all classes.
 
         With fitted evidence the scores of objects are the probabilities that box and class are right
-        (`semfov.zoom.certainty`).
+        (`semfov.zoom.certainty`), and those from 0.5 on count. Without evidence they are the detector's, and count from
+        0.3 on. In a photograph, and without evidence, slices are looked at, and `worth` and `batch` mean nothing.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class, several in a list, or None for all. Windows for several classes
                 are chosen as for all classes.
-            passes: largest number of passes of the detector; None takes 24.
-            seconds: longest time in seconds on this machine.
-            on_look: called after each look with the record so far; returning False ends the exploration.
-            batch: number of windows that are chosen jointly and pass the detector together. In a photograph, which is
-                looked at by slices, it means nothing, as without evidence.
-            worth: the exploration ends when no look is expected to find more new objects than this. In a photograph,
-                and without evidence, all slices are looked at that there are passes for.
-            least: probability from which on objects count; None takes 0.5. Without evidence it is their score, and None
-                takes 0.3.
+            settings: the settings of the task; None for the usual ones.
 
         Returns:
             The looks and the objects.
 
         Raises:
-            InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
+            InputError: the class is unknown (the nearest names are suggested), or a setting is not for windows.
             DataError: the file cannot be read.
         """
+        settings = FindSettings() if settings is None else settings
+        settings.check_suitable(WINDOWS)
+        limits = EpisodeLimits.of(settings, PASSES)
         targets = class_numbers(target, self.classes[1:], "target")
-        limits = EpisodeLimits(PASSES if passes is None else passes, seconds, on_look)
-        check_whole(batch, "batch", 1, MOST_PASSES)
-        check_number(worth, "worth", 0, float("inf"))
-        if least is not None:
-            check_number(least, "least", 0, 1)
-        task = self.task(None, targets, worth=worth, batch=batch, least=least)
+        task = self.task(targets=targets, worth=settings.worth, batch=settings.batch, least=settings.least)
         return self.episode(picture, task, limits).run()
 
-    def explore(self, picture: _Picture, **options: Any) -> ZoomPath:
+    def explore(self, picture: _Picture, settings: ExploreSettings | None = None) -> ZoomPath:
         """Find all objects of all classes.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
-            options: arguments of `find_all`, except for the target.
+            settings: the settings of the exploration; None for the usual ones.
 
         Returns:
             The looks and the objects.
 
         Raises:
-            InputError: an argument does not fit.
+            InputError: a setting is not for windows.
             DataError: the file cannot be read.
         """
-        return self.find_all(picture, None, **options)
+        settings = ExploreSettings() if settings is None else settings
+        settings.check_suitable(WINDOWS)
+        limits = EpisodeLimits.of(settings, PASSES)
+        return self.episode(picture, self.task(worth=settings.worth, least=settings.least), limits).run()
 
     def task(self, target: int | None = None, targets: tuple[int, ...] = (), **settings: Any) -> WindowTask:
         """Say what is looked for, with the evidence of the agent.

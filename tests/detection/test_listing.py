@@ -15,6 +15,7 @@ from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_heads import HEADS
 from semfov.paths import Record
 from semfov.paths.look import detections_in_words
+from semfov.settings import FindSettings
 from semfov.zoom import WindowEye
 from semfov.zoom.looks import Window
 from tests.detection.test_conformance import ADAPTERS, photographs
@@ -229,7 +230,7 @@ def test_every_detector_is_listed_with_its_own_scores(random):
     """Against torchvision's suppression of what the head proposes."""
     agent = ZoomAgent(WindowEye(random))
     image = photographs(1, *random.input_size[::-1])[0]
-    record = agent.find_all(image, passes=1, least=0.3)
+    record = agent.find_all(image, settings=FindSettings(passes=1, least=0.3))
     view = agent.eye.open(image)
     canvas, _ = agent.eye.glimpse(view, torch.tensor([Window.overview(view.lattice).fixation]))
     proposed = random.propose(canvas)

@@ -34,7 +34,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.config import DataConfig
 from semfov.runs.progress import WholeBar
-from semfov.settings import DecisionSettings
+from semfov.settings import DecisionSettings, FindSettings
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
@@ -442,7 +442,7 @@ def test_as_many_objects_are_expected_as_are_right(fitted):
     agent, expected, right = ZoomAgent(eye, model.eval()), 0.0, 0
     for index in range(COUNT):
         for passes in (1, 5):
-            record = agent.find_all(Photographs()[index].image, passes=passes)
+            record = agent.find_all(Photographs()[index].image, settings=FindSettings(passes=passes))
             assert record.passes == passes
             assert record.unseen == (0.0, 0.0)
             expected += float(record.candidates.scores.sum())

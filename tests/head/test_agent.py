@@ -21,6 +21,7 @@ from semfov.head.scenes import Sphere
 from semfov.head.views import Views
 from semfov.paths import HeadPath
 from semfov.sensor.sphere import Regions
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from tests.refusals import refused, unusable
 from tests.small import Coloured, rand
 
@@ -35,7 +36,7 @@ def test_boxes_are_returned_as_directions_in_the_scene(agent, panorama):
     world = Panorama(panorama)
     views = agent.views(world)
     behind = int((views.poses - torch.tensor([-180.0, 0, 60])).abs().sum(-1).argmin())
-    path = agent.search(world, "red", start=behind * 100 + 55, passes=1)
+    path = agent.search(world, "red", SearchSettings(start=behind * 100 + 55, passes=1))
     places, labels, scores = path.places(0, 0.5)
     assert isinstance(places, Regions)
     assert len(places) > 0
@@ -50,22 +51,22 @@ def test_boxes_are_returned_as_directions_in_the_scene(agent, panorama):
 
 def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     world = Panorama(panorama)
-    path = agent.search(world, "blue", passes=5, confirm=1.0)
+    path = agent.search(world, "blue", SearchSettings(passes=5, confirm=1.0))
     assert len(path) == len(path.seconds) == len(path.maps) == len(path.detections) == 5
     assert path.maps.shape[-1] == len(world.scene)
     assert not path.found
     assert path.gaze(0).shape == (3,)
-    same = agent.search(world, "blue", passes=5, confirm=1.0)
+    same = agent.search(world, "blue", SearchSettings(passes=5, confirm=1.0))
     assert same.actions == path.actions
-    found = agent.search(world, "blue", passes=5, confirm=0.0)
+    found = agent.search(world, "blue", SearchSettings(passes=5, confirm=0.0))
     assert found.found
     assert len(found) == 1
     assert repr(found).startswith("HeadPath: blue: found (")
-    explored = agent.explore(world, passes=3)
+    explored = agent.explore(world, ExploreSettings(passes=3))
     assert explored.target is None
     assert len(explored) == 3
     assert explored.detector == agent.eye.detector.name
-    limited = agent.explore(world, duration=1.0)
+    limited = agent.explore(world, ExploreSettings(duration=1.0))
     assert limited.seconds[-1] <= 1.0
     assert limited.why_it_ended() == "The next look would end after the time limit of the scene, 1 s (duration)."
 
@@ -77,7 +78,7 @@ def test_a_prior_scales_all_cells_of_a_view_as_it_changes_the_presence(agent, pa
     agent.target_evidence.judge[-1].bias.fill_(1.0)  # no cell is more probable than the view
 
     def look(prior=None):
-        path = agent.search(Panorama(panorama), "blue", passes=1, prior=prior, chance=chance)
+        path = agent.search(Panorama(panorama), "blue", SearchSettings(passes=1, prior=prior), chance=chance)
         assert (path.prior, path.assumed) == (prior, None)
         refused("record: expected a search by models", path.probability_at, 0.5)
         return path.maps[0].double()
@@ -99,7 +100,7 @@ def test_a_prior_scales_all_cells_of_a_view_as_it_changes_the_presence(agent, pa
 
 def test_detections_of_a_path_equal_those_of_the_eye(agent, panorama):
     world = Panorama(panorama)
-    path = agent.search(world, "blue", passes=2, confirm=1.0)
+    path = agent.search(world, "blue", SearchSettings(passes=2, confirm=1.0))
     detect = live(agent.eye, path.views)
     for action, seen in zip(path.actions, path.detections, strict=True):
         assert torch.equal(detect(action).boxes, seen.boxes)
@@ -108,17 +109,20 @@ def test_detections_of_a_path_equal_those_of_the_eye(agent, panorama):
 def test_boxes_of_a_flat_scene_are_in_pixels_of_the_picture(agent):
     image = torch.zeros(3, 480, 640)
     image[1, 200:240, 500:540] = 1
-    path = agent.search(Flat(image, degree=4), "green", passes=4, confirm=1.0)
+    path = agent.search(Flat(image, degree=4), "green", SearchSettings(passes=4, confirm=1.0))
     seen = [path.places(look, 0.5)[0] for look in range(len(path))]
     boxes = torch.cat([places.boxes for places in seen])
     assert ((boxes[:, 0] > 470) & (boxes[:, 2] < 570) & (boxes[:, 1] > 170) & (boxes[:, 3] < 270)).all()
     # It lies around the object, whatever view it was found in, and is the box of a confirmed object.
     image = torch.zeros(3, 480, 640)
     image[1, 200:240, 500:540] = 1
-    first = agent.search(Flat(image, degree=4), "green", passes=1, confirm=1.0)
+    first = agent.search(Flat(image, degree=4), "green", SearchSettings(passes=1, confirm=1.0))
     assert first.page_data()["looks"][0]["turned"].startswith("pan 0°, tilt 0°, ")  # and not -0°
     seen = [n for n, gaze in enumerate(first.views.gaze) if (gaze - torch.tensor([519.5, 219.5])).abs().max() < 30]
-    paths = [agent.search(Flat(image, degree=4), "green", passes=1, confirm=0.0, start=start) for start in seen]
+    paths = [
+        agent.search(Flat(image, degree=4), "green", SearchSettings(passes=1, confirm=0.0, start=start))
+        for start in seen
+    ]
     boxes = torch.stack([path.decision.box for path in paths if path.decision.box is not None])
     assert len({tuple(path.pose(0).tolist()) for path in paths}) > 1
     assert ((boxes[:, :2] > torch.tensor([470.0, 170])) & (boxes[:, 2:] < torch.tensor([570.0, 270]))).all()
@@ -128,26 +132,24 @@ def test_boxes_of_a_flat_scene_are_in_pixels_of_the_picture(agent):
 
 
 def test_a_head_that_zooms_uses_only_the_given_fields_of_view(agent, panorama):
-    path = agent.explore(Panorama(panorama, fields=(40.0, 80.0)), passes=4)
+    path = agent.explore(Panorama(panorama, fields=(40.0, 80.0)), ExploreSettings(passes=4))
     assert {float(path.views.poses[action // 100, 2]) for action in path.actions} <= {40.0, 80.0}
 
 
 def test_arguments_are_checked(agent, panorama):
     world = Panorama(panorama)
-    for arguments, message in (
-        ({"target": "blu"}, "target"),
-        ({"target": "blue", "passes": 0}, "passes"),
-        ({"target": "blue", "start": 10**6}, "start"),
-        ({"target": "blue", "confirm": 2.0}, "confirm"),
-        ({"target": "blue", "foresight": -1.0}, "foresight"),
-    ):
-        refused(message, agent.search, world, **arguments)
+    refused("target", agent.search, world, "blu")
+    refused("start", agent.search, world, "blue", SearchSettings(start=10**6))
+    refused("start: expected the number of an action", agent.explore, world, ExploreSettings(start=(5, 5)))
+    refused("closer: expected none for .* a head that turns", agent.search, world, "blue", SearchSettings(closer=1))
+    refused("shifts: expected none for .* a head that turns", agent.find_all, world, "blue", FindSettings(shifts=1))
+    refused("foresight", agent.search, world, "blue", foresight=-1.0)
 
 
 def test_a_search_is_found_by_the_cell_at_the_gaze_and_says_so_in_its_decision(agent, panorama):
     world = Panorama(panorama)
     for target, confirm in (("blue", 0.0), ("blue", 0.2), ("red", 0.05), ("green", 1.0)):
-        path = agent.search(world, target, passes=6, confirm=confirm)
+        path = agent.search(world, target, SearchSettings(passes=6, confirm=confirm))
         at_the_gaze = [float(path.maps[n, path.views.gaze_cell[a]]) for n, a in enumerate(path.actions)]
         assert [chance >= confirm for chance in at_the_gaze] == [False] * (len(path) - 1) + [path.found]
         assert path.found == (path.decision.outcome == "found")
@@ -160,7 +162,7 @@ def test_a_search_is_found_by_the_cell_at_the_gaze_and_says_so_in_its_decision(a
             # Most of the scene was not seen yet.
             assert path.decision.outcome == "undecided"
             assert (path.decision.cell, path.decision.box) == (None, None)
-    assert agent.explore(world, passes=1).decision is None
+    assert agent.explore(world, ExploreSettings(passes=1)).decision is None
 
 
 @pytest.mark.parametrize(
@@ -200,21 +202,21 @@ def test_every_limit_ends_an_episode_and_a_search_has_a_decision_all_the_same(ag
         "stopped": {"on_look": lambda path: seen.append(len(path)) or len(path) < 3},
     }
     for ending, limit in endings.items():
-        path = agent.search(world, "green", confirm=1.0, **limit)
+        path = agent.search(world, "green", SearchSettings(confirm=1.0, **limit))
         assert (path.ending, path.decision.outcome) == (ending, "undecided")
-        explored = agent.explore(world, **limit)
+        explored = agent.explore(world, ExploreSettings(**limit))
         assert (explored.ending, explored.decision) == (ending, None)
     assert seen == [1, 2, 3] * 2
-    assert agent.explore(world, worth=1e6).ending == "worth"
-    whole = agent.explore(world, passes=10)
-    gains = agent.explore(world, passes=10, worth=1e-6)
+    assert agent.explore(world, ExploreSettings(worth=1e6)).ending == "worth"
+    whole = agent.explore(world, ExploreSettings(passes=10))
+    gains = agent.explore(world, ExploreSettings(passes=10, worth=1e-6))
     assert gains.actions == whole.actions
 
 
 def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
-    whole = agent.search(Panorama(panorama), "green", chance=0.3, confirm=1.0, passes=8)
+    whole = agent.search(Panorama(panorama), "green", SearchSettings(confirm=1.0, passes=8), chance=0.3)
     sure = [float(chances.max()) < 0.5 for chances in whole.maps]
-    path = agent.search(Panorama(panorama), "green", chance=0.3, give_up=0.99, confirm=1.0, passes=8)
+    path = agent.search(Panorama(panorama), "green", SearchSettings(give_up=0.99, confirm=1.0, passes=8), chance=0.3)
     assert [*sure, True].index(True) == len(path) - 1 if any(sure) else len(path) == 8
     assert path.decision.outcome == ("absent" if any(sure) else "undecided")
 
@@ -226,17 +228,18 @@ def test_the_agent_for_any_picture_finds_all_classes_with_a_head(agent, panorama
     )
     whole = ActivePerception(agent.eye, *strategies)
     path = whole.find_all(Panorama(panorama), passes=2)
-    assert path.actions == agent.find_all(Panorama(panorama), passes=2).actions
+    assert path.actions == agent.find_all(Panorama(panorama), settings=FindSettings(passes=2)).actions
     assert (path.target, path.targets) == (None, ())
 
 
 @pytest.mark.slow
 def test_finding_all_is_an_exploration_about_the_targets(agent, panorama):
     world = Panorama(panorama)
-    everything = agent.find_all(world, passes=16)
-    both = agent.find_all(world, ["red", "blue"], passes=16)
-    blue = agent.find_all(world, "blue", passes=16)
-    assert everything.actions == both.actions == blue.actions == agent.explore(world, passes=16).actions
+    everything = agent.find_all(world, settings=FindSettings(passes=16))
+    both = agent.find_all(world, ["red", "blue"], FindSettings(passes=16))
+    blue = agent.find_all(world, "blue", FindSettings(passes=16))
+    explored = agent.explore(world, ExploreSettings(passes=16))
+    assert everything.actions == both.actions == blue.actions == explored.actions
     assert (both.target, both.targets, blue.target) == (None, (1, 3), 3)
     assert both.decision is None
     assert set(both.objects.labels.tolist()) == {1, 3}
@@ -284,16 +287,17 @@ def middle_of(path, look=-1):
 def test_a_camera_needs_a_size_and_a_way_to_look(exact, panorama):
     camera = Own(panorama)
     start = towards_blue(exact, camera)
-    path = exact.search(camera, "blue", confirm=0.0, color="bgr", start=start)
+    path = exact.search(camera, "blue", SearchSettings(confirm=0.0, start=start), color="bgr")
     assert path.found
     assert middle_of(path) == pytest.approx(BLUE, abs=1)
-    assert exact.explore(camera, passes=1, start=start).detections[0].labels[0, 0] == 1  # blue is taken for red
+    explored = exact.explore(camera, ExploreSettings(passes=1, start=start))
+    assert explored.detections[0].labels[0, 0] == 1  # blue is taken for red
     assert camera.asked == [(30.0, 0.0)] * 2
 
 
 def test_every_look_at_a_camera_takes_a_new_frame(agent, panorama):
     camera = Own(panorama)
-    path = agent.search(camera, "green", passes=6, confirm=1.0)
+    path = agent.search(camera, "green", SearchSettings(passes=6, confirm=1.0))
     assert camera.asked == [tuple(path.pose(number)[:2].tolist()) for number in range(6)]
 
 
@@ -306,7 +310,8 @@ def test_objects_are_where_they_are_though_the_camera_is_a_little_off(exact, pan
         for reports in (True, False):
             camera = SimulatedCamera(world, noise=noise, delay=0.0, reports=reports, seed=seed)
             start = towards_blue(exact, camera)
-            found = middle_of(exact.search(camera, "blue", passes=1, confirm=1.0, color="bgr", start=start))
+            settings = SearchSettings(passes=1, confirm=1.0, start=start)
+            found = middle_of(exact.search(camera, "blue", settings, color="bgr"))
             if reports:
                 assert found == pytest.approx(BLUE, abs=0.5)
             else:
@@ -319,7 +324,7 @@ def test_the_eye_fixates_the_same_direction_from_a_pose_nearby(agent, panorama):
     beliefs = []
     for noise in (0.0, 1.0):
         camera = SimulatedCamera(Panorama(panorama), noise=noise, delay=0.0, seed=3)
-        path = agent.search(camera, "blue", passes=4, confirm=1.0, color="bgr", start=0)
+        path = agent.search(camera, "blue", SearchSettings(passes=4, confirm=1.0, start=0), color="bgr")
         beliefs.append(path.maps[-1])
     torch.testing.assert_close(*beliefs, atol=0.06, rtol=0)
 
@@ -334,7 +339,7 @@ def test_frames_from_before_the_camera_arrived_are_not_used(agent, panorama):
         return given[-1][1]
 
     camera.look_at = watched
-    path = agent.explore(camera, passes=12, color="bgr")
+    path = agent.explore(camera, ExploreSettings(passes=12), color="bgr")
     assert path.turns >= 1
     late = [frame for direction, frame in given if frame.direction != pytest.approx(direction, abs=6)]
     assert late
@@ -351,7 +356,7 @@ def test_fewer_turns_are_made_when_settling_takes_long(agent, panorama):
     turns = []
     for settle in (0.0, 5.0):
         world = Panorama(panorama, speeds=Speeds(settle=settle))
-        turns.append(agent.explore(world, passes=12, duration=math.inf).turns)
+        turns.append(agent.explore(world, ExploreSettings(passes=12, duration=math.inf)).turns)
     assert turns[1] < turns[0]
 
 
@@ -428,9 +433,9 @@ def test_wrong_cameras_are_refused_with_the_remedy(agent, panorama):
 def test_a_picture_is_a_panorama_if_it_is_twice_as_wide_as_high(agent, panorama, tmp_path):
     pixels = panorama.mul(255).byte().permute(1, 2, 0).numpy()
     Image.fromarray(pixels).save(tmp_path / "around.png")
-    whole = agent.explore(Panorama(panorama), passes=3)
+    whole = agent.explore(Panorama(panorama), ExploreSettings(passes=3))
     for picture, color in ((tmp_path / "around.png", "rgb"), (pixels[..., ::-1], "bgr"), (panorama, "rgb")):
-        path = agent.explore(picture, passes=3, color=color)
+        path = agent.explore(picture, ExploreSettings(passes=3), color=color)
         assert isinstance(path.views.world, Panorama)
         torch.testing.assert_close(path.maps, whole.maps)
     flat = open_scene(torch.rand(3, 300, 400))
@@ -441,7 +446,7 @@ def test_a_picture_is_a_panorama_if_it_is_twice_as_wide_as_high(agent, panorama,
 def test_the_record_of_a_camera_shows_what_it_saw_and_is_stored(agent, panorama, tmp_path):
     world = Panorama(panorama)
     camera = SimulatedCamera(world, noise=0.0, delay=0.0)
-    path = agent.explore(camera, passes=8, color="bgr")
+    path = agent.explore(camera, ExploreSettings(passes=8), color="bgr")
     small = path.image
     assert small.shape[-1] == 2 * small.shape[-2]
     points = path.views.world.pixels_of(torch.stack([path.gaze(look) for look in range(8)]))
@@ -466,7 +471,7 @@ def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_pat
     file = tmp_path / "around.png"
     Image.fromarray(panorama.mul(255).byte().permute(1, 2, 0).numpy()).save(file)
     limits = {"passes": 4, "duration": 20.0}
-    expected = head.search(Panorama(panorama), "blue", confirm=1.0, **limits)
+    expected = head.search(Panorama(panorama), "blue", SearchSettings(confirm=1.0, **limits))
     for picture, how in ((Panorama(panorama), "auto"), (file, "head"), (panorama, "head")):
         path = one.search(picture, "blue", how=how, confirm=1.0, **limits)
         assert isinstance(path, HeadPath)

@@ -9,6 +9,7 @@ from semfov.belief.observers import LearnedMap, Target
 from semfov.head import ExploreGain, Panorama, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.views import Views
+from semfov.settings import ExploreSettings
 from tests.base_tester import BaseTester
 from tests.small import Blobs, detections, evidence, look, mapping, rand
 
@@ -83,4 +84,5 @@ class TestHeadAgent(BaseTester):
 
     @staticmethod
     def call(module, image):
-        return module.explore(Panorama(image, (64, 48)), passes=2).maps.clone()  # a copy outside inference mode
+        path = module.explore(Panorama(image, (64, 48)), ExploreSettings(passes=2))
+        return path.maps.clone()  # a copy outside inference mode

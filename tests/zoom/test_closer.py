@@ -14,7 +14,7 @@ from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
 from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
-from semfov.settings import StreamSettings
+from semfov.settings import FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, SearchLook, closer_window, look_closely
@@ -188,7 +188,7 @@ def test_improbable_places_are_examined_only_at_the_end():
 
 def test_a_search_looks_closely_before_it_finds(detector, picture):
     agent = ZoomAgent(WindowEye(detector), evidence())
-    plain = agent.search(picture, "red", closer=0)
+    plain = agent.search(picture, "red", SearchSettings(closer=0))
     assert (plain.decision.outcome, plain.decision.place, plain.closer) == ("found", None, ())
     path = agent.search(picture, "red")
     (look,) = path.closer
@@ -203,9 +203,9 @@ def test_a_search_looks_closely_before_it_finds(detector, picture):
     assert max(y1, 320) < min(y2, 352)
     assert path.why_it_ended() == "A closer look confirmed the target."
     # It costs one of the passes.
-    short = agent.search(picture, "red", passes=plain.passes)
+    short = agent.search(picture, "red", SearchSettings(passes=plain.passes))
     assert [look.number for look in short.closer] == [plain.passes - 1]
-    assert agent.search(picture, "red", passes=1).closer == ()
+    assert agent.search(picture, "red", SearchSettings(passes=1)).closer == ()
 
 
 def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
@@ -213,8 +213,8 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     image = 0.03 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(0))  # ground that is not blank
     image[:, 320:344, 640:664] = torch.tensor([0.0, 1, 0])[:, None, None]
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
-    assert agent.search(image, "red", closer=0).decision.outcome == "found"
-    path = agent.search(image, "red", closer=2)
+    assert agent.search(image, "red", SearchSettings(closer=0)).decision.outcome == "found"
+    path = agent.search(image, "red", SearchSettings(closer=2))
     assert path.decision.outcome == "absent"
     assert path.decision.box is None
     assert len(path.closer) == 2
@@ -222,7 +222,7 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     # As long as nothing is found the search goes on. Where a square lies on the cells decides how green it looks, so
     # here no look is sure enough.
     looked = []
-    path = agent.search(image, "red", confirm=1.0, on_look=lambda record: looked.append(record.passes))
+    path = agent.search(image, "red", SearchSettings(confirm=1.0, on_look=lambda record: looked.append(record.passes)))
     assert len(path.closer) > 2
     assert path.decision.outcome != "found"
     assert looked == [*range(1, path.passes + 1)]
@@ -230,11 +230,10 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
 
 def test_the_limits_of_a_search_hold(detector, picture):
     agent = ZoomAgent(WindowEye(detector), evidence())
-    assert len(agent.search(picture, "red", confirm=1.0, closer=1).closer) == 1
+    assert len(agent.search(picture, "red", SearchSettings(confirm=1.0, closer=1)).closer) == 1
     for passes in (1, 2, 3):
-        path = agent.search(picture, "red", passes=passes, confirm=1.0, give_up=0.0)
+        path = agent.search(picture, "red", SearchSettings(passes=passes, confirm=1.0, give_up=0.0))
         assert path.passes <= passes
-    refused("closer: expected a whole number from 0 to 100", agent.search, picture, "red", closer=-1)
 
 
 def test_evidence_without_verification_decides_as_before(detector, picture):
@@ -243,7 +242,7 @@ def test_evidence_without_verification_decides_as_before(detector, picture):
     without.load_state_dict({name: value for name, value in with_model.state_dict().items() if "verif" not in name})
     unfitted = evidence()
     unfitted.verification.thresholds = None
-    expected = ZoomAgent(WindowEye(detector), with_model).search(picture, "red", closer=0)
+    expected = ZoomAgent(WindowEye(detector), with_model).search(picture, "red", SearchSettings(closer=0))
     for other in (without, unfitted):
         path = ZoomAgent(WindowEye(detector), other).search(picture, "red")
         assert path.closer == ()
@@ -466,7 +465,7 @@ def test_the_window_of_a_closer_look_shows_other_places_too():
 def test_evidence_says_how_large_the_window_of_a_closer_look_is(detector, photograph, window):
     model = own_evidence()
     model.photograph.window = window
-    path = ZoomAgent(WindowEye(detector), model).search(photograph, "red", closer=1)
+    path = ZoomAgent(WindowEye(detector), model).search(photograph, "red", SearchSettings(closer=1))
     whole, closer = path.window_looks
     box = whole.detections.boxes[0, whole.detections.scores[0, :, 1].argmax()]
     side = float((box[2:] - box[:2]).max())
@@ -501,7 +500,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     shown = replace(nothing, looks=looks)
     assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.
-    made = [agent.search(photograph, "red", confirm=least, give_up=0.0) for least in (0.01, 0.9)]
+    made = [agent.search(photograph, "red", SearchSettings(confirm=least, give_up=0.0)) for least in (0.01, 0.9)]
     assert len(made[0].closer) == len(made[1].closer) > max(len(path.closer), 2)
     for each in made:
         assert len({window_look.window for window_look in each.window_looks}) == each.passes < 1 + len(each.closer)
@@ -523,24 +522,24 @@ def evidence_with_shares(**thresholds):
 def test_a_prior_changes_the_log_odds_of_a_search_by_that_of_the_fit(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
     for number, target in enumerate(("red", "green", "blue")):
-        usual = agent.search(photograph, target, closer=0).decision.probability
+        usual = agent.search(photograph, target, SearchSettings(closer=0)).decision.probability
         for prior in (0.05, 0.6, float(SHARES[number])):
-            rare = agent.search(photograph, target, closer=0, prior=prior).decision.probability
+            rare = agent.search(photograph, target, SearchSettings(closer=0, prior=prior)).decision.probability
             expected = usual / (1 - usual) * (prior / (1 - prior)) / (SHARES[number] / (1 - SHARES[number]))
             assert rare / (1 - rare) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_a_record_says_what_its_probability_assumes_and_gives_others(detector, photograph, picture):
     agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
-    usual = agent.search(photograph, "green", closer=0)
+    usual = agent.search(photograph, "green", SearchSettings(closer=0))
     assert (usual.prior, usual.assumed) == (None, pytest.approx(0.4))
     for share in (0.05, 0.5, 0.9):
-        searched = agent.search(photograph, "green", closer=0, prior=share)
+        searched = agent.search(photograph, "green", SearchSettings(closer=0, prior=share))
         assert (searched.prior, searched.assumed) == (share, share)
         assert usual.probability_at(share) == pytest.approx(searched.decision.probability, rel=1e-4)
         assert searched.probability_at(0.4) == pytest.approx(usual.decision.probability, rel=1e-4)
     assert usual.probability_at(usual.assumed) == usual.decision.probability
-    assert agent.search(picture, "green", passes=1, closer=0).assumed == 0.5
+    assert agent.search(picture, "green", SearchSettings(passes=1, closer=0)).assumed == 0.5
     assert ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "green").assumed is None
     moment = agent.stream(2, (), StreamSettings(prior=0.2), follows=False).step(photograph)
     assert (moment.prior, moment.assumed) == (0.2, 0.2)
@@ -549,7 +548,7 @@ def test_a_record_says_what_its_probability_assumes_and_gives_others(detector, p
 def test_closer_looks_read_the_probabilities_of_the_fit_and_give_those_of_the_prior(detector, photograph):
     model, share = evidence_with_shares(give_up=0.0), 0.1
     agent = ZoomAgent(WindowEye(detector), model)
-    usual, rare = agent.search(photograph, "red"), agent.search(photograph, "red", prior=share)
+    usual, rare = agent.search(photograph, "red"), agent.search(photograph, "red", SearchSettings(prior=share))
     prior = Prior(share, float(SHARES[0]))
     assert len(usual.closer) == len(rare.closer) > 1
     for before, after in zip(usual.closer, rare.closer, strict=True):
@@ -562,28 +561,28 @@ def test_closer_looks_read_the_probabilities_of_the_fit_and_give_those_of_the_pr
 def test_thresholds_are_compared_with_the_probability_for_the_prior(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
     assert agent.search(photograph, "red").decision.outcome == "found"
-    rare = agent.search(photograph, "red", prior=1e-6)
+    rare = agent.search(photograph, "red", SearchSettings(prior=1e-6))
     # No place is worth a pass where hardly any photograph holds the class.
     assert (rare.passes, rare.decision.outcome) == (1, "absent")
 
 
 def test_a_prior_in_a_large_picture_is_compared_with_one_half(detector, picture):
     agent = ZoomAgent(WindowEye(detector), evidence(0.4))
-    usual, rare = (agent.search(picture, "red", passes=1, closer=0, prior=prior).decision for prior in (None, 0.1))
+    usual, rare = (
+        agent.search(picture, "red", SearchSettings(passes=1, closer=0, prior=prior)).decision for prior in (None, 0.1)
+    )
     assert rare.probability == pytest.approx(Prior(0.1, 0.5)(usual.probability), rel=1e-5)
 
 
 def test_a_prior_needs_the_shares_of_the_fit(detector, photograph):
     for models in (own_evidence(), None):
         agent = ZoomAgent(WindowEye(detector), models)
-        refused("prior: expected None for models", agent.search, photograph, "red", prior=0.2)
-    agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
-    refused("prior: expected a share above 0 and below 1", agent.search, photograph, "red", prior=1.0)
+        refused("prior: expected None for models", agent.search, photograph, "red", SearchSettings(prior=0.2))
 
 
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), own_evidence())
-    path = agent.search(photograph, "red", give_up=0.0)
+    path = agent.search(photograph, "red", SearchSettings(give_up=0.0))
     assert path.passes < 1 + len(path.closer)  # some places are in one window
     live = agent.stream(1, (), StreamSettings(rate=0.0, give_up=0.0), follows=False)
     for _ in range(path.passes):
@@ -595,14 +594,14 @@ def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph
     assert moment.examined.number == path.passes - 1
     assert [look.number for look in moment.closer] == [look.number for look in path.closer]
     assert [look.box.tolist() for look in moment.closer] == [look.box.tolist() for look in path.closer]
-    path = ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "red", closer=0)
+    path = ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "red", SearchSettings(closer=0))
     assert path.passes == 1
     assert not path.closer
 
 
 def test_all_objects_of_a_photograph_are_those_of_the_whole_and_of_slices(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), own_evidence())
-    one, all_ = (agent.find_all(photograph, "red", passes=passes) for passes in (1, 5))
+    one, all_ = (agent.find_all(photograph, "red", FindSettings(passes=passes)) for passes in (1, 5))
     assert [look.window for look in all_.window_looks[:1]] == [look.window for look in one.window_looks]
     assert {look.window for look in all_.window_looks[1:]} == set(usual_slices(all_.lattice))
     assert len(all_.objects) >= len(one.objects)

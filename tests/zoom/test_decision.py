@@ -25,6 +25,7 @@ from semfov.fit.windows_decisions import WindowSearches, fit_judge, judge_search
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import calibration_error
 from semfov.paths import ZoomPath
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty
 from semfov.zoom.decision import SearchFacts
@@ -115,10 +116,10 @@ def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
     path = agent.search(picture, "red")
     assert path.decision.outcome == "found"
     assert path.decision.probability >= 0.3
-    longer = agent.search(picture, "red", confirm=1.0, give_up=0.0, passes=path.passes + 2)
+    longer = agent.search(picture, "red", SearchSettings(confirm=1.0, give_up=0.0, passes=path.passes + 2))
     assert longer.passes > path.passes
     assert longer.decision.outcome == "undecided"
-    assert agent.search(picture, "green", give_up=1.0).passes == 1
+    assert agent.search(picture, "green", SearchSettings(give_up=1.0)).passes == 1
 
 
 def synthetic(count, seed):
@@ -148,7 +149,9 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
             ended = int(settle(*state, thresholds))
             if ended or passes == most:
                 break
-        path = ZoomAgent(eye, evidence).search(picture, target, passes=most, confirm=confirm, give_up=give_up)
+        path = ZoomAgent(eye, evidence).search(
+            picture, target, SearchSettings(passes=most, confirm=confirm, give_up=give_up)
+        )
     assert path.passes == passes
     assert path.decision.outcome == OUTCOMES[ended]
     assert path.decision.probability == presence
@@ -350,7 +353,9 @@ def test_the_spread_is_fitted_on_the_numbers_of_records():
     assert sought.held == int((annotation.labels[~annotation.crowd] == sought.target).sum())
     assert torch.equal(sought.objects[sought.looks][1], right)
     for passes in (2, 4):
-        record = ZoomAgent(eye, evidence).find_all(mosaics[0].image, sought.target, passes=passes, worth=0.0)
+        record = ZoomAgent(eye, evidence).find_all(
+            mosaics[0].image, sought.target, FindSettings(passes=passes, worth=0.0)
+        )
         (expected,), (error,) = record.expected.values(), replace(record, spread=0.0).expected_error.values()
         assert sought.number(certainty, passes) == pytest.approx((expected, error**2), rel=1e-5)
     assert sought.number(replace(certainty, offset=-9.0), 4) is None
@@ -402,7 +407,7 @@ def path(detector, picture):
     torch.manual_seed(0)
     weights = (1.0, *[0.0] * (len(FACTS) - 1))
     evidence = GlimpseEvidence(3, 8, certainty=Certainty(3.0, weights, scale=0.5, strength=2.0))
-    return ZoomAgent(WindowEye(detector), evidence).eval().find_all(picture, None, passes=4)
+    return ZoomAgent(WindowEye(detector), evidence).eval().find_all(picture, None, FindSettings(passes=4))
 
 
 def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
@@ -434,7 +439,6 @@ def test_evidence_of_earlier_versions_has_probabilities_by_the_score_alone():
 
 def test_the_least_probability_can_be_chosen(detector, picture):
     agent = ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
-    assert agent.find_all(picture, "red", passes=2).least == 0.3  # scores, without a certainty
-    assert agent.find_all(picture, "red", passes=2, least=0.7).least == 0.7
-    assert agent.explore(picture, passes=2, least=0.6).least == 0.6
-    refused("least", agent.find_all, picture, "red", least=1.5)
+    assert agent.find_all(picture, "red", FindSettings(passes=2)).least == 0.3  # scores, without a certainty
+    assert agent.find_all(picture, "red", FindSettings(passes=2, least=0.7)).least == 0.7
+    assert agent.explore(picture, ExploreSettings(passes=2, least=0.6)).least == 0.6

@@ -18,6 +18,7 @@ from semfov.data.large import open_large
 from semfov.detection import Candidates
 from semfov.detection.detector import FAINT
 from semfov.sensor.glimpse import glimpse, windows_at
+from semfov.settings import FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells
@@ -205,7 +206,9 @@ def test_windows_come_in_the_order_of_the_summed_scores(agent):
     """By a loop over the cells of the overview's hints."""
     source = LiveWindowLooks(agent.eye, agent.eye.open(picture((900, 600, 90, "green"), (100, 100, 60, "red"))))
     windows = usual_slices(source.lattice)
-    (overview,) = source.see([path.window for path in agent.find_all(picture(), passes=1).window_looks])
+    (overview,) = source.see(
+        [path.window for path in agent.find_all(picture(), settings=FindSettings(passes=1)).window_looks]
+    )
     hints = overview.gist
     for targets in ([], [1], [2], [1, 2]):
         sums = []
@@ -245,11 +248,13 @@ def test_limits_and_several_classes(agent):
     assert sorted(both.objects.labels.tolist()) == [1, 2]
     assert both.targets == (1, 2)
     assert set(agent.find_all(scene, "red").objects.labels.tolist()) == {1}
-    assert agent.find_all(scene, "red", passes=3).ending == "passes"
+    assert agent.find_all(scene, "red", FindSettings(passes=3)).ending == "passes"
     seen = []
-    stopped = agent.find_all(scene, on_look=lambda record: seen.append(record.passes) or len(seen) < 2)
+    stopped = agent.find_all(
+        scene, settings=FindSettings(on_look=lambda record: seen.append(record.passes) or len(seen) < 2)
+    )
     assert (stopped.ending, seen, stopped.passes) == ("stopped", [1, 2], 2)
-    assert agent.search(picture(), "red", seconds=0).ending == "seconds"
+    assert agent.search(picture(), "red", SearchSettings(seconds=0)).ending == "seconds"
     refused("seconds", EpisodeLimits, seconds=-1)
     assert torch.equal(both.candidates.boxes, agent.find_all(scene, [1, 2]).candidates.boxes)
 

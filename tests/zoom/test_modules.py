@@ -3,6 +3,7 @@
 import torch
 
 from semfov.agents import ZoomAgent
+from semfov.settings import ExploreSettings
 from semfov.zoom import GlimpseEvidence, WindowEye
 from tests.base_tester import BaseTester, TensorTester
 from tests.small import Blobs, rand
@@ -51,4 +52,4 @@ class TestZoomAgent(BaseTester):
 
     @staticmethod
     def call(module, picture):
-        return module.explore(picture, passes=3, worth=0.0).candidates.boxes
+        return module.explore(picture, ExploreSettings(passes=3, worth=0.0)).candidates.boxes

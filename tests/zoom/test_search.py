@@ -15,7 +15,7 @@ from semfov.agents.picture import OpenedPicture
 from semfov.agents.window_objects import without_replaced
 from semfov.data.images import to_bytes
 from semfov.data.large import open_large
-from semfov.settings import StreamSettings
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from tests.refusals import refused
@@ -30,7 +30,7 @@ def test_search_finds_a_target_in_the_picture_and_ends_without_one(agent, pictur
     assert max(x1, 640) < min(x2, 672)
     assert max(y1, 320) < min(y2, 352)
     assert path.passes == len(path.window_looks)
-    path = agent.search(picture, "green", passes=7)
+    path = agent.search(picture, "green", SearchSettings(passes=7))
     assert path.decision.outcome in ("absent", "undecided")
     assert path.passes <= 7
     assert path.decision.box is None
@@ -41,53 +41,56 @@ def test_a_record_keeps_its_reduced_picture_and_the_file(agent, picture, tmp_pat
     file = tmp_path / "squares.png"
     to_pil_image(torch.nn.functional.pad(picture, (0, 976))).save(file)
     for given in (file, str(file), open_large(file)):
-        path = agent.find_all(given, "blue", passes=2)
+        path = agent.find_all(given, "blue", FindSettings(passes=2))
         assert path.source == str(file)
         assert path.image.shape == (3, 492, 1280)
         assert path.plot().axes[0].images
-    assert agent.search(picture, "red", passes=2).source is None
+    assert agent.search(picture, "red", SearchSettings(passes=2)).source is None
 
 
 def test_the_records_of_each_look_have_the_picture(agent, picture):
     """So that they can be drawn while the episode runs."""
-    for look in (partial(agent.search, picture, "green"), partial(agent.explore, picture)):
+    for look, settings in (
+        (partial(agent.search, picture, "green"), SearchSettings),
+        (partial(agent.explore, picture), ExploreSettings),
+    ):
         seen = []
-        whole = look(passes=2, on_look=seen.append)
+        whole = look(settings(passes=2, on_look=seen.append))
         assert len(seen) == 2
         assert all(torch.equal(record.photograph, whole.photograph) for record in seen)
         assert seen[1].plot().axes[0].images
 
 
 def test_find_all_finds_one_class_and_explore_finds_all(agent, picture):
-    path = agent.find_all(picture, "blue", passes=12, worth=0.0)
+    path = agent.find_all(picture, "blue", FindSettings(passes=12, worth=0.0))
     assert path.target == 3
     assert (path.objects.labels == 3).all()
     assert len(path.objects.above(0.3))
-    everything = agent.explore(picture, passes=24, batch=3, worth=0.0)
+    everything = agent.find_all(picture, settings=FindSettings(passes=24, batch=3, worth=0.0))
     assert set(everything.objects.above(0.3).labels.tolist()) == {1, 3}
     assert everything.target is None
     assert everything.passes <= 24
-    assert agent.find_all(picture, "blue", worth=1e9).passes == 1
+    assert agent.find_all(picture, "blue", FindSettings(worth=1e9)).passes == 1
 
 
 def test_a_path_tells_why_it_ended(agent, picture):
     found = agent.search(picture, "red")
     assert (found.ending, found.decision.outcome) == ("decision", "found")
     # The last pass decides, too.
-    again = agent.search(picture, "red", passes=found.passes)
+    again = agent.search(picture, "red", SearchSettings(passes=found.passes))
     assert (again.ending, again.why_it_ended()) == ("decision", found.why_it_ended())
-    early = agent.search(picture, "red", passes=found.passes - 1)
+    early = agent.search(picture, "red", SearchSettings(passes=found.passes - 1))
     assert early.decision.outcome == "undecided"
     assert (early.ending, early.why_it_ended()) == ("passes", f"All {early.passes} passes were used.")
-    hopeless = agent.search(picture, "green", give_up=1.0)
+    hopeless = agent.search(picture, "green", SearchSettings(give_up=1.0))
     assert (hopeless.passes, hopeless.ending) == (1, "decision")
     # Without a limit to what is worth a look, a search looks at everything.
-    everything = agent.search(picture, "green", passes=10_000, confirm=1.0, give_up=0.0)
+    everything = agent.search(picture, "green", SearchSettings(passes=10_000, confirm=1.0, give_up=0.0))
     assert (everything.ending, everything.decision.outcome) == ("windows", "undecided")
     assert everything.why_it_ended() == "No window is left that can show more."
-    assert agent.explore(picture, passes=1).why_it_ended() == "The only pass was used."
-    assert agent.find_all(picture, "blue", worth=1e9).ending == "worth"
-    assert agent.find_all(picture, "blue", passes=3, worth=0.0).ending == "passes"
+    assert agent.explore(picture, ExploreSettings(passes=1)).why_it_ended() == "The only pass was used."
+    assert agent.find_all(picture, "blue", FindSettings(worth=1e9)).ending == "worth"
+    assert agent.find_all(picture, "blue", FindSettings(passes=3, worth=0.0)).ending == "passes"
     assert replace(found, ending=None).why_it_ended() == ""
 
 
@@ -100,17 +103,9 @@ def test_zooming_pays_only_for_large_pictures(agent, picture):
 
 def test_invalid_arguments_are_refused(agent, picture, detector):
     refused("did you mean 'red'", agent.search, picture, "rad")
-    refused("passes: expected a whole number from 1", agent.explore, picture, passes=0)
-    refused("batch: expected a whole number from 1", agent.find_all, picture, 1, batch=0)
-    for wrong, message in (
-        ({"passes": 2.5}, "passes: expected a whole number"),
-        ({"passes": True}, "passes: expected a whole number"),
-        ({"confirm": 1.5}, "confirm: expected a probability from 0 to 1, got 1.5"),
-        ({"give_up": float("nan")}, "give_up: expected a probability from 0 to 1"),
-    ):
-        refused(message, agent.search, picture, "red", **wrong)
-    for worth in (-1, float("nan"), "much"):
-        refused("worth: expected a number", agent.explore, picture, worth=worth)
+    refused("shifts: expected none for .* by windows", agent.search, picture, "red", SearchSettings(shifts=3))
+    refused("duration: expected none for .* by windows", agent.find_all, picture, "red", FindSettings(duration=1.0))
+    refused("policy: expected none for .* by windows", agent.explore, picture, ExploreSettings(policy="people"))
     for target in (0, 4, 1.0, True, [], [1, 4]):
         with pytest.raises(
             InputError, match=r"target: expected a (name, or a whole number from 1 to 3|class, several)"
@@ -193,7 +188,10 @@ def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, m
     for cores in (torch.get_num_threads(), torch.get_num_threads() + 1):
         monkeypatch.setattr("semfov.threads.available_cores", lambda cores=cores: cores)
         assert not prepared
-        paths[cores] = agent.search(picture, "green", passes=6), agent.explore(picture, passes=6, worth=0.0)
+        paths[cores] = (
+            agent.search(picture, "green", SearchSettings(passes=6)),
+            agent.explore(picture, ExploreSettings(passes=6, worth=0.0)),
+        )
     for alone, helped in zip(*paths.values(), strict=True):
         assert [look.window for look in alone.window_looks] == [look.window for look in helped.window_looks]
         assert alone.values == helped.values
@@ -205,13 +203,17 @@ def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, m
 
 
 @pytest.mark.parametrize(
-    ("task", "settings"), [("search", {"confirm": 1.0, "give_up": 0.0}), ("find_all", {"worth": 0.0})]
+    ("task", "settings"),
+    [
+        ("search", SearchSettings(passes=16, confirm=1.0, give_up=0.0)),
+        ("find_all", FindSettings(passes=16, worth=0.0)),
+    ],
 )
 def test_a_second_thread_knows_the_window_after_a_look_of_the_last_level(agent, picture, monkeypatch, task, settings):
     small, prepared = picture[:, :400, 300:800], []
     monkeypatch.setattr(LiveWindowLooks, "prepare", lambda self, window: prepared.append(window))
     monkeypatch.setattr("semfov.threads.available_cores", lambda: torch.get_num_threads() + 1)
-    path = getattr(agent, task)(small, "green", passes=16, **settings)
+    path = getattr(agent, task)(small, "green", settings)
     windows, last = [look.window for look in path.window_looks], path.lattice.levels - 1
     # Nothing is prepared during the overview.
     known = [window == prepared[n] for n, window in enumerate(windows[2:]) if windows[n + 1].level == last]
@@ -234,7 +236,7 @@ def same_looks(moments, path):
 
 @pytest.mark.parametrize("target", [None, 3, [1, 3]])
 def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, picture, target, one_thread):
-    path = agent.find_all(picture, target, passes=9)
+    path = agent.find_all(picture, target, FindSettings(passes=9))
     targets = {None: (), 3: (3,)}.get(target) if not isinstance(target, list) else tuple(target)
     live = agent.stream(None, targets, StreamSettings(rate=0), follows=False)
     moments = [live.step(picture) for _ in path.window_looks]
@@ -268,7 +270,7 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
     image[1, 320:344, 640:664] = 1
     image[:, [0, 0, -1, -1], [0, -1, 0, -1]] = 0.02  # no blank ground
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
-    path = agent.search(image, "red", closer=2)
+    path = agent.search(image, "red", SearchSettings(closer=2))
     live = agent.stream(1, (), StreamSettings(rate=0, closer=2), follows=False)
     moments = [live.step(image) for _ in path.window_looks]
     same_looks(moments, path)
@@ -420,9 +422,12 @@ def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once(agent, pict
 
 
 def test_a_record_of_a_look_that_is_read_later_is_the_one_that_is_read_at_once(agent, picture, one_thread):
-    for look in (partial(agent.search, picture, "red"), partial(agent.explore, picture, worth=0.0)):
+    for look, settings in (
+        (partial(agent.search, picture, "red"), SearchSettings(passes=4)),
+        (partial(agent.explore, picture), ExploreSettings(passes=4, worth=0.0)),
+    ):
         at_once = []
         kept = []
-        look(passes=4, on_look=lambda record, told_so_far=at_once: told_so_far.append(told(record)))
-        look(passes=4, on_look=kept.append)
+        look(replace(settings, on_look=lambda record, told_so_far=at_once: told_so_far.append(told(record))))
+        look(replace(settings, on_look=kept.append))
         assert [told(record) for record in kept] == at_once
