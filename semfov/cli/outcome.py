@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
@@ -21,14 +20,11 @@ from semfov.decision import Decision
 from semfov.detection.objects import box_text
 from semfov.io.files import plain_name
 from semfov.kinds import Drawing
-from semfov.paths import Record, Scanpath
+from semfov.paths import Record
 from semfov.paths.look import CONFIDENT, RecordedLook, detections_in_words
+from semfov.paths.regions import Region
 from semfov.report.episode import jpeg
-from semfov.viz import plot_belief, plot_belief_bars, plot_foveated_strip, save_figure
-from semfov.viz.semantic import named_regions, plot_semantic_map
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from semfov.viz import save_figure
 
 _OBJECTS_LISTED = 20  # largest number of objects that are listed
 
@@ -48,8 +44,7 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
     if assumption:
         lines.append(f"  {assumption}")
     if decision is None:
-        if isinstance(record, Scanpath) and record.target is None:
-            lines += _regions_lines(record)
+        lines += _regions_lines(record)
         lines += _objects_lines(record)
     return "\n".join(lines)
 
@@ -85,19 +80,19 @@ def _objects_lines(record: Record) -> list[str]:
     return lines
 
 
-def _regions_lines(scanpath: Scanpath) -> list[str]:
+def _regions_lines(record: Record) -> list[str]:
     """Write a line for each class that was looked for and that the final map names, with its most probable cell."""
-    by_class: dict[str, list[int]] = {}
-    for label, cells, _ in named_regions(scanpath):
-        if not scanpath.targets or scanpath.classes.index(label) in scanpath.targets:
-            by_class.setdefault(label, []).extend(cells)
+    by_class: dict[str, list[Region]] = {}
+    for region in record.regions():
+        if not record.targets or record.classes.index(region.name) in record.targets:
+            by_class.setdefault(region.name, []).append(region)
+    counts = {name: sum(len(region.cells) for region in regions) for name, regions in by_class.items()}
     lines = []
-    for label, cells in sorted(by_class.items(), key=lambda item: -len(item[1])):
-        probabilities = scanpath.probabilities[-1, cells, scanpath.classes.index(label)]
-        x, y = scanpath.grid.centres[cells[int(probabilities.argmax())]].tolist()
-        count = f"{len(cells)} cell{'s' if len(cells) != 1 else ''}"
-        highest = f"p up to {float(probabilities.max()):.2f} around ({x:.0f}, {y:.0f})"
-        lines.append(f"  map: {label} in {count}, {highest}")
+    for name in sorted(counts, key=lambda name: -counts[name]):
+        best = max(by_class[name], key=lambda region: region.probability)
+        x, y = best.place
+        cells = f"{counts[name]} cell{'s' if counts[name] != 1 else ''}"
+        lines.append(f"  map: {name} in {cells}, p up to {best.probability:.2f} around ({x:.0f}, {y:.0f})")
     return lines
 
 
@@ -240,14 +235,7 @@ def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawi
     """Draw those figures and the animation that a record of this kind has; returns the files by name."""
     if not drawings:
         return {}
-    figures: dict[str, Callable[[], Figure]] = {"scanpath": partial(record.plot, boxes=boxes)}
-    if isinstance(record, Scanpath):
-        figures["views"] = partial(plot_foveated_strip, record)
-        if record.target is not None:
-            figures["belief"] = partial(plot_belief, record, None)
-            figures["belief_bars"] = partial(plot_belief_bars, record)
-        else:
-            figures["map"] = partial(plot_semantic_map, record)
+    figures = record.figures(boxes)
     # The belief of an exploration is the map of what is where.
     names = ["map" if name == "belief" and "map" in figures else name for name in drawings]
     with tempfile.TemporaryDirectory() as folder:

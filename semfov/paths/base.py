@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -25,6 +26,7 @@ from semfov.errors import DataError, InputError, check
 from semfov.paths.conversion import Conversion, Values
 from semfov.paths.files import Format
 from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
+from semfov.paths.regions import Region
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,6 +117,28 @@ class Record(Conversion):
             windows.
         """
         return None
+
+    def regions(self, number: int = -1) -> Sequence[Region]:
+        """Find the regions of the map of what is where, as an exploration with a fovea makes it.
+
+        Args:
+            number: number of the look after which the map is read; -1 is the last.
+
+        Returns:
+            Regions of adjacent cells with the same class, the largest first; none without such a map.
+        """
+        return ()
+
+    def figures(self, boxes: Tensor | None = None) -> dict[str, Callable[[], Figure]]:
+        """List the figures of the record, each of which is drawn when it is called.
+
+        Args:
+            boxes: `(M, 4)`, true boxes of the target, drawn dashed.
+
+        Returns:
+            Functions by the name of the figure.
+        """
+        return {"scanpath": partial(self.plot, boxes=boxes)}
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
         """Go through what the looks showed, as sharp as the detector saw it.

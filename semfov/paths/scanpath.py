@@ -1,9 +1,11 @@
 """The records of looks of a fovea at cells: an episode in a photograph, and a frame of a stream."""
 
-from collections.abc import Iterator, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, ClassVar
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,8 +23,12 @@ from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.fovea import FoveaLook, FoveaLooks, moment_look
 from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import LookView
+from semfov.paths.regions import Region, named_regions
 from semfov.paths.stimulus import Stimulus
 from semfov.paths.words import MomentWords, Words
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _GRID: dict[str, Json] = {"grid": Array(Number(low=1, high=10_000, whole=True), 2), "size": Array(POSITIVE, 2)}
 """JSON values of a grid in a file."""
@@ -118,7 +124,7 @@ class _CellRecord(Record):
 class ScanpathWords(Words):
     """Words for a search or an exploration with a fovea."""
 
-    record: "Scanpath"
+    record: Scanpath
 
     @property
     def decided_by(self) -> str:
@@ -260,6 +266,22 @@ class Scanpath(_CellRecord):
         posterior = self.probabilities[..., self.target] if self.posterior is None else self.posterior
         return self.grid, posterior[fixation]
 
+    def regions(self, number: int = -1) -> Sequence[Region]:
+        """Find the regions of the map of what is where after a look of an exploration; a search has none."""
+        if self.target is not None:
+            return ()
+        return named_regions(self.grid, self.probabilities[self.fixation_after(number)], self.classes)
+
+    def figures(self, boxes: Tensor | None = None) -> dict[str, Callable[[], Figure]]:
+        """List the path, the foveated views, and the belief of a search or the map of an exploration."""
+        from semfov.viz import plot_belief, plot_belief_bars, plot_foveated_strip
+        from semfov.viz.semantic import plot_semantic_map
+
+        figures = {**super().figures(boxes), "views": partial(plot_foveated_strip, self)}
+        if self.target is None:
+            return {**figures, "map": partial(plot_semantic_map, self)}
+        return {**figures, "belief": partial(plot_belief, self, None), "belief_bars": partial(plot_belief_bars, self)}
+
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
         """Show foveated views, and of closer looks the enlarged windows; without the stimulus parts of the picture."""
         parts = super().look_views(source)
@@ -358,7 +380,7 @@ _FOVEA = Format(
 class FoveaMomentWords(MomentWords):
     """Words for one frame that a fovea looks at."""
 
-    record: "FoveaMoment"
+    record: FoveaMoment
 
     def describe(self) -> str:
         """Describe belief and decision at the frame in a few words."""

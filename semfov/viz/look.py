@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.large import open_large
 from semfov.errors import check
-from semfov.paths import Record, RecordedLook, Scanpath
+from semfov.paths import Record, RecordedLook
 from semfov.paths.look import LookView, confident_detections
 from semfov.viz.drawing import (
     check_fixation,
@@ -159,7 +159,7 @@ class LookFigure:
         self.view = view_axes.imshow(picture_array(view.pixels), interpolation="bilinear")
         view_axes.set(xticks=[], yticks=[], title="what the eye sees")
         # An exploration with a fovea has a map of all classes, in which regions are named.
-        self._semantic = record if isinstance(record, Scanpath) and record.target is None else None
+        self._names_regions = record.kind.grid and record.target is None
         if believed is not None:
             self._draw_belief(image, *believed)
         lay_out(self.figure)
@@ -174,7 +174,7 @@ class LookFigure:
         axes = self.axes[2]
         draw_image(axes, image, grid, grey=True)
         self.belief = draw_cells(axes, grid, chances)
-        if self._semantic is not None:
+        if self._names_regions:
             draw_grid(axes, grid)
         draw_scale(axes, self.belief, "probability")
 
@@ -220,8 +220,8 @@ class LookFigure:
         self.belief.set_data(chances.detach().cpu().reshape(grid.rows, grid.columns).numpy())
         drawn = draw_cross(axes, self.record.looks[number].fixation)
         title = f"p({self.record.target_name or 'any object'}) up to {float(chances.max()):.2f}"
-        if self._semantic is not None:
+        if self._names_regions:
             title = f"semantic map after fixation {number}"
-            drawn += write_names(axes, self._semantic, number)
+            drawn += write_names(axes, grid, self.record.regions(number))
         axes.set_title(title, parse_math=False)
         return drawn

@@ -27,7 +27,7 @@ from semfov.viz.objects import (
     object_marks,
 )
 from semfov.viz.path import GazePath, LookPath
-from semfov.viz.semantic import draw_semantic_map, write_names
+from semfov.viz.semantic import draw_semantic_map, regions_after, write_names
 from semfov.viz.style import GAZE, lay_out, make_figure, only, root, styled
 
 if TYPE_CHECKING:
@@ -221,7 +221,7 @@ def plot_episode(
     LookPath(path_axes, scanpath)
     if scanpath.target is None:
         for below, fixation in zip(panels[1], fixations, strict=True):
-            write_names(below, scanpath, fixation)
+            write_names(below, scanpath.grid, regions_after(scanpath, fixation))
     return root(path_axes)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.paths import Scanpath
+from semfov.paths.regions import Region, named_regions
 from semfov.viz.drawing import (
     check_fixation,
     check_foveal,
@@ -77,8 +78,13 @@ def plot_semantic_map(
     drawn = _draw_entropy(entropy_axes, scanpath, number, image)
     draw_scale(entropy_axes, drawn, "entropy (bits)")
     lay_out(figure)
-    write_names(map_axes, scanpath, number)
+    write_names(map_axes, scanpath.grid, regions_after(scanpath, number))
     return figure
+
+
+def regions_after(scanpath: Scanpath, fixation: int) -> list[Region]:
+    """Find the named regions of the map after a fixation."""
+    return named_regions(scanpath.grid, scanpath.probabilities[fixation], scanpath.classes)
 
 
 def _draw_entropy(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor | None) -> AxesImage:
@@ -105,29 +111,27 @@ def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tens
     return drawn
 
 
-def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
+def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artist]:
     """Draw borders and names of regions, each name on a cell where it covers no other; the figure must be laid out."""
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
-    grid = scanpath.grid
-    regions = named_regions(scanpath, fixation)
-    borders = LineCollection([side for _, cells, _ in regions for side in _borders(grid, cells)], colors="white")
+    borders = LineCollection([side for region in regions for side in _borders(grid, region.cells)], colors="white")
     borders.set(linewidths=1.3, zorder=3)
     drawn: list[Artist] = [axes.add_collection(borders, autolim=False)]
     candidates = []
     sizes = []
-    for name, cells, _ in regions:
+    for region in regions:
         # The name stands on a cell of the region, as near as there is room to the middle.
-        centres = grid.centres[cells] + 0.5
+        centres = grid.centres[region.cells] + 0.5
         order = (centres - centres.mean(0)).norm(dim=-1).argsort(stable=True)
-        width, height = text_size(axes, name, _NAME_POINTS)
+        width, height = text_size(axes, region.name, _NAME_POINTS)
         candidates.append([(x - width / 2, y - height / 2) for x, y in centres[order].tolist()])
         sizes.append((width, height))
     frame_width, frame_height = grid.extent.tolist()
     places = place_within(candidates, sizes, (frame_width, frame_height))
-    for (name, _, _), (x1, y1, x2, y2) in zip(regions, places, strict=True):
-        text = axes.text((x1 + x2) / 2, (y1 + y2) / 2, name, color="black", fontsize=_NAME_POINTS, clip_on=True)
+    for region, (x1, y1, x2, y2) in zip(regions, places, strict=True):
+        text = axes.text((x1 + x2) / 2, (y1 + y2) / 2, region.name, color="black", fontsize=_NAME_POINTS, clip_on=True)
         text.set(ha="center", va="center", parse_math=False)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         drawn.append(text)
@@ -153,72 +157,3 @@ def _borders(grid: Grid, region: Sequence[int]) -> list[_Line]:
         ]
         lines += [side for neighbour, side in neighbours if neighbour not in cells]
     return lines
-
-
-class Region(NamedTuple):
-    """Region of adjacent cells with one class: its name, the cells, and its highest probability in them."""
-
-    name: str
-    cells: list[int]
-    probability: float
-
-
-def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[Region]:
-    """Find the regions of adjacent cells with one class that is more probable than background.
-
-    The class must also have a probability of 3 / K, or 0.5 where that is more, so that a map without knowledge, in
-    which all classes are equally probable, has no regions.
-
-    Args:
-        scanpath: the episode.
-        fixation: number of the fixation; -1 is the last.
-
-    Returns:
-        The regions, the largest first.
-    """
-    grid = scanpath.grid
-    probabilities = scanpath.probabilities[fixation].detach().cpu()
-    objects, label = probabilities[:, 1:].max(-1)
-    least = min(0.5, 3 / len(scanpath.classes))
-    best = torch.where(objects > probabilities[:, 0].clamp(min=least), label + 1, 0)
-    regions = [
-        Region(scanpath.classes[int(best[cells[0]])], cells, float(objects[cells].max()))
-        for cells in _regions(best.reshape(grid.rows, grid.columns))
-    ]
-    return sorted(regions, key=lambda region: -len(region.cells))
-
-
-def _regions(labels: Tensor) -> list[list[int]]:
-    """Find the regions of cells that touch at a side and share a label other than 0.
-
-    Args:
-        labels: `(Y, X)`.
-
-    Returns:
-        The cells of each region in their order.
-    """
-    rows, columns = labels.shape
-    flat = labels.flatten().tolist()
-    visited: set[int] = set()
-    regions = []
-    for first, label in enumerate(flat):
-        if label == 0 or first in visited:
-            continue
-        region = []
-        waiting = [first]
-        visited.add(first)
-        while waiting:
-            cell = waiting.pop()
-            region.append(cell)
-            new = {other for other in _neighbours(cell, rows, columns) - visited if flat[other] == label}
-            visited |= new
-            waiting += new
-        regions.append(sorted(region))
-    return regions
-
-
-def _neighbours(cell: int, rows: int, columns: int) -> set[int]:
-    """List the cells that share a side with a cell."""
-    row, column = divmod(cell, columns)
-    places = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
-    return {y * columns + x for y, x in places if 0 <= y < rows and 0 <= x < columns}

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from semfov import Grid
 from semfov.cli.outcome import _regions_lines
+from semfov.paths.regions import _regions, named_regions
 from semfov.viz import plot_semantic_map
 from semfov.viz.labels import place_labels, place_numbers, place_within
-from semfov.viz.semantic import _borders, _regions, cell_entropy, named_regions
+from semfov.viz.semantic import _borders, cell_entropy
 from tests import small
 
 CLASSES = ("background", "cat", "cup", "dog")
@@ -73,11 +74,17 @@ def test_named_regions_equal_a_loop(count, marginal):
                 (classes[label], cells, max(float(probabilities[fixation, c, label]) for c in cells))
                 for label, cells in labelled(table.reshape(6, 7))
             }
-            named = named_regions(scanpath, fixation)
-            assert {(name, tuple(cells), chance) for name, cells, chance in named} == expected
-            sizes = [len(cells) for _, cells, _ in named]
+            named = named_regions(scanpath.grid, probabilities[fixation], classes)
+            assert {(region.name, tuple(region.cells), region.probability) for region in named} == expected
+            sizes = [len(region.cells) for region in named]
             assert sizes == sorted(sizes, reverse=True)
-        assert named_regions(scanpath) == named_regions(scanpath, 1)
+            assert scanpath.regions(fixation) == named
+            for region in named:
+                place = scanpath.grid.centres.tolist().index([*region.place])
+                assert place in region.cells
+                assert float(probabilities[fixation, place, classes.index(region.name)]) == region.probability
+        assert scanpath.regions() == scanpath.regions(1)
+        assert replace(scanpath, target=1, posterior=probabilities[..., 1]).regions() == ()
 
 
 def marginal_map():
