@@ -30,11 +30,12 @@ from semfov.eye import Eye
 from semfov.gaze.choice import select_fixation
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency import VOCUS2, cell_saliency
+from semfov.io.ranges import Shifts, Side
 from semfov.observation.matching import box_iou
 from semfov.paths.look import confident_detections
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig, SensorConfig
-from semfov.runs.settings import Settings, Shifts, Side
+from semfov.runs.settings import Settings
 from semfov.runs.setup import make_eye, make_observation
 from semfov.runs.store import look_everywhere
 from semfov.sensor.named import SensorName, named_sensor

@@ -31,6 +31,7 @@ from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.protocols import choose_classes
 from semfov.fit.zoom_store import StoredWindowLooks
+from semfov.io.ranges import Count, Seed, Share, Whole
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.command import command
@@ -38,7 +39,6 @@ from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, finish
 from semfov.runs.seeds import generator_for
-from semfov.runs.settings import Count, Seed, Share, Whole
 from semfov.runs.setup import check_sources, make_detector, make_scenes
 from semfov.runs.tables import plus_minus, share, table
 from semfov.settings import DecisionSettings

@@ -31,12 +31,12 @@ from semfov.fit.looking import CellLooks, Looking
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.files import write_text
+from semfov.io.ranges import Positive, Share
 from semfov.runs.command import command
 from semfov.runs.config import BeliefConfig, DetectorConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.seeds import noise_for
-from semfov.runs.settings import Positive, Share
 from semfov.runs.store import RememberedLooks
 from semfov.runs.tables import table
 from semfov.sensor import MultiScaleFovea

@@ -34,6 +34,7 @@ from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.fit.protocols import choose_classes
 from semfov.io.files import plain_name, write_text
+from semfov.io.ranges import Count, Whole
 from semfov.metrics.episodes import area_under_roc
 from semfov.observation import FovealObservationModel
 from semfov.observation.matching import box_iou
@@ -41,7 +42,6 @@ from semfov.runs.command import command
 from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import one_thread
 from semfov.runs.scene_run import finish
-from semfov.runs.settings import Count, Whole
 from semfov.runs.tables import percent, plus_minus, table
 from train.fit_fom import FitFomConfig, fit_fom
 from train.outputs import model_path

@@ -37,13 +37,13 @@ from semfov.fit.through_belief import (
 )
 from semfov.fit.training import split
 from semfov.io.files import write_text
+from semfov.io.ranges import Count, Positive, Range, Share, Weight, Whole
 from semfov.io.tables import csv_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.observation import MissCounts, fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
 from semfov.runs.command import command
-from semfov.runs.settings import Count, Positive, Range, Share, Weight, Whole
 from semfov.runs.tables import table
 from semfov.version import __version__
 from semfov.viz import plot_reliability

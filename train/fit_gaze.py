@@ -21,9 +21,9 @@ from typing import ClassVar
 
 from semfov.detection.load import load_detector
 from semfov.fit.gaze_model import GazeModelFit, fit_gaze_model, gaze_report, summaries
+from semfov.io.ranges import SingleName
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig
-from semfov.runs.settings import SingleName
 from semfov.runs.setup import detector_options
 from semfov.runs.workers import prepare_worker
 from train.outputs import model_path, write_outputs

@@ -25,9 +25,9 @@ from semfov.eye import Eye
 from semfov.fit.samples import Samples
 from semfov.fit.settings import FitOnCellsConfig
 from semfov.fit.tempering import EXPONENTS, hit_rates, mean_hits
+from semfov.io.ranges import Count, Positive, Range, Share, Whole
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
-from semfov.runs.settings import Count, Positive, Range, Share, Whole
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from train.outputs import write_outputs

@@ -24,10 +24,10 @@ from semfov.fit.searches import open_photographs
 from semfov.fit.training import training_of
 from semfov.fit.verification import VerificationConfig, fit_in_folds
 from semfov.fit.verification_report import verification_report
+from semfov.io.ranges import Count
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.settings import Count
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import cell_store
 from train.outputs import model_path, write_outputs

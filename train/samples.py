@@ -21,7 +21,7 @@ from semfov.fit.samples import Samples, all_cells
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.config import EyeSettings
 from semfov.runs.looks import LOOK_SOURCES, one_thread
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes
@@ -47,20 +47,8 @@ def _look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
         return Detections.stack([eye.look(view, point[None]) for point in points])
 
 
-class SamplerSettings(Protocol):
+class SamplerSettings(EyeSettings, Protocol):
     """Settings of looks from random fixations, as those of `train.fit_fom` and `train.fit_tempering`."""
-
-    @property
-    def data(self) -> DataConfig:
-        """The photographs."""
-
-    @property
-    def detector(self) -> DetectorConfig:
-        """The detector."""
-
-    @property
-    def sensor(self) -> SensorConfig:
-        """The sensor."""
 
     @property
     def fixations(self) -> int:

@@ -8,7 +8,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
 from semfov.fit.windows import MosaicFit, crowded
 from semfov.fit.windows_settings import FitMosaicsConfig
-from semfov.runs.settings import Count
+from semfov.io.ranges import Count
 from train.scattered import Scattered
 
 RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "spread", "photograph"]

@@ -12,8 +12,8 @@ from torch import Tensor
 from benchmarks.fuzz.runner import Case, Draw
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Scanpath, observers, policies
 from semfov.detection import Candidates, Detector, Selection
+from semfov.io.ranges import Range
 from semfov.runs import config as settings
-from semfov.runs.settings import Range
 
 CLASSES = ("cat", "cup", "person")
 BOXES = ("ordinary", "outside", "inverted", "pointlike", "infinite", "NaN")

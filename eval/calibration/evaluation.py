@@ -16,10 +16,10 @@ from eval.search.run import SearchConfig
 from semfov.eye import Eye
 from semfov.fit.samples import Samples
 from semfov.io.files import write_text
+from semfov.io.ranges import Count, Seed, Share, Side
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.runs.config import BeliefConfig, DataConfig, EyeConfig, ProtocolConfig
 from semfov.runs.scene_run import finish
-from semfov.runs.settings import Count, Seed, Share, Side
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import table
 from semfov.viz import plot_reliability

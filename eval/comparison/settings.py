@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from semfov.gaze.saliency.cells import Reduction
+from semfov.io.ranges import Weight
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import RunConfig, SensorConfig
-from semfov.runs.settings import Settings, Weight
+from semfov.runs.settings import Settings
 
 
 @dataclass(frozen=True)

@@ -35,12 +35,12 @@ from semfov.fit.protocols import DrawnSearch, choose_searches, search_steps
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.gaze.policies import Policy
+from semfov.io.ranges import Range, Share
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looks import photograph_looks
 from semfov.runs.results import ResultRecord
-from semfov.runs.settings import Range, Share
 from semfov.runs.setup import make_learned, make_observation
 from semfov.runs.store import RememberedLooks
 from semfov.settings import DecisionSettings

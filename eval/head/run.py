@@ -32,12 +32,12 @@ from semfov.head.panoramas import Panoramas
 from semfov.head.scenes import Flat, Panorama, World
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
+from semfov.io.ranges import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.metrics.episodes import right_cells
 from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
-from semfov.runs.settings import Count, Positive, Range, Seed, Share, Weight, Whole
 from semfov.runs.setup import make_eye, make_learned, make_scenes
 from semfov.runs.store import DetectionStore, RememberedLooks
 from semfov.sensor.sphere import Boxes

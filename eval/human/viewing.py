@@ -32,10 +32,10 @@ from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.io.code import modules_digest
 from semfov.io.files import write_text
+from semfov.io.ranges import Range, Whole
 from semfov.metrics.episodes import standard_error
 from semfov.metrics.scanpath import cluster_labels, multimatch, scanmatch, sequence_score, time_delay_embedding
 from semfov.runs.config import DetectorConfig
-from semfov.runs.settings import Range, Whole
 from semfov.runs.setup import detector_options
 from semfov.runs.tables import plus_minus, table
 from semfov.runs.workers import prepare_worker

@@ -26,9 +26,9 @@ from semfov.detection.detector import Detector
 from semfov.errors import DataError
 from semfov.fit.settings import FitConfig
 from semfov.fit.training import training_of
+from semfov.io.ranges import Range
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig
-from semfov.runs.settings import Range
 from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker

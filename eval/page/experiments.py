@@ -12,6 +12,7 @@ from eval.comparison.thresholds import ThresholdLooksConfig
 from eval.decide.run import DecideConfig
 from eval.explore.run import ExploreConfig
 from eval.search.run import SearchConfig
+from semfov.io.ranges import Count, Workers
 from semfov.runs.config import (
     BeliefConfig,
     DataConfig,
@@ -21,7 +22,7 @@ from semfov.runs.config import (
     Scores,
     SensorConfig,
 )
-from semfov.runs.settings import Count, Settings, Workers
+from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 
 DETECTORS = {"nano": "YOLOX-nano", "tiny": "YOLOv3-tiny"}

@@ -13,10 +13,10 @@ from semfov.episode import StoredLooks
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.protocols import Trial, episodes_of, run_episodes
 from semfov.gaze.acquisition.base import Task
+from semfov.io.ranges import Whole
 from semfov.runs.config import PolicyConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.seeds import noise_for
-from semfov.runs.settings import Whole
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,11 @@ from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.fit.window_looking import right_boxes
+from semfov.io.ranges import Count, Positive, Range, Seed, Whole
 from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.progress import track
 from semfov.runs.results import ResultRecord
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Whole
+from semfov.runs.settings import Settings
 from semfov.runs.setup import check_sources, make_detector, make_scenes
 from semfov.settings import StreamSettings
 from semfov.zoom.evidence import GlimpseEvidence

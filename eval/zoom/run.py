@@ -33,10 +33,10 @@ from semfov.fit.window_looking import (
     found_in,
     right_boxes,
 )
+from semfov.io.ranges import Count, Range
 from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
-from semfov.runs.settings import Count, Range
 from semfov.zoom.decision import CLOSER
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.hints import DETECTION_SCORE

@@ -23,10 +23,10 @@ from semfov.fit.settings import FitOnLooksConfig
 from semfov.fit.thresholds import choose_thresholds
 from semfov.fit.training import Fit, descend, split, training_of
 from semfov.gaze.acquisition import TargetPosterior
+from semfov.io.ranges import Count, Positive, Share, Weight
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.progress import track
-from semfov.runs.settings import Count, Positive, Share, Weight
 from semfov.runs.tables import table
 
 _JUDGED = (1, 5, 15)  # numbers of looks after which a belief is evaluated

@@ -12,7 +12,8 @@ from semfov.fit.training import descend
 from semfov.fit.viewing import Events, Viewed, log_centre
 from semfov.gaze.saliency import OculomotorBias, cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Whole
+from semfov.io.ranges import Count, Positive, Range, Seed, Share, Whole
+from semfov.runs.settings import Settings
 
 _EVENTS = 12  # fixations of a picture in a pass of the fit of oculomotor biases
 _SCORED = 40  # fixations of a picture on which conditional densities are scored, drawn at random

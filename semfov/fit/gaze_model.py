@@ -16,7 +16,7 @@ from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores
 from semfov.fit.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.likeness import FEWEST, PictureLikeness, pooled
-from semfov.runs.settings import Whole
+from semfov.io.ranges import Whole
 from semfov.runs.tables import table
 
 _DURATIONS = 5  # numbers of fixations with a duration of their own; later ones have that of the last

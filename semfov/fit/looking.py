@@ -13,27 +13,15 @@ from semfov.detection.detections import Detections
 from semfov.episode import EpisodeLook, Looks
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
-from semfov.runs.config import DataConfig, DetectorConfig, LookingConfig, SensorConfig
+from semfov.runs.config import EyeSettings, LookingConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import cell_store, look_everywhere
 
 
-class LookingSettings(Protocol):
+class LookingSettings(EyeSettings, Protocol):
     """Settings of looks from every cell, as an `EyeConfig` with `cells` has them."""
-
-    @property
-    def data(self) -> DataConfig:
-        """The scenes."""
-
-    @property
-    def detector(self) -> DetectorConfig:
-        """The detector."""
-
-    @property
-    def sensor(self) -> SensorConfig:
-        """The sensor."""
 
     @property
     def cells(self) -> tuple[int, int]:

@@ -20,11 +20,11 @@ from semfov.fit.looking import Looking
 from semfov.fit.settings import FitOnLooksConfig
 from semfov.fit.training import Fit, descend, split, training_of
 from semfov.gaze.acquisition import CloserLook
+from semfov.io.ranges import Count, Range
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import answers_of
 from semfov.runs.progress import track
 from semfov.runs.seeds import generator_for
-from semfov.runs.settings import Count, Range
 from semfov.runs.tables import table
 
 _JUDGED = (1, 2, 3, 5, 10, 15)  # numbers of looks after which a map is evaluated

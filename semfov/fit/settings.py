@@ -6,8 +6,8 @@ from typing import Annotated, ClassVar
 
 from semfov.errors import InputError
 from semfov.fit.gaze_model import GazeModelFit
+from semfov.io.ranges import Count, Positive, Range, Seed, Side, SingleName, Whole
 from semfov.runs.config import DataConfig, DetectorConfig, EyeConfig
-from semfov.runs.settings import Count, Positive, Range, Seed, Side, SingleName, Whole
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from semfov.decision.candidates import LookType
 from semfov.errors import DataError
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, TargetSearch, photograph_searches
 from semfov.fit.settings import FitOnCellsConfig
-from semfov.runs.settings import Count, Positive, Range, Share
+from semfov.io.ranges import Count, Positive, Range, Share
 
 _LEVELS = tuple(number / 100 for number in range(50, 100))  # values from which the threshold `confirm` is chosen
 _STRENGTH = 10.0

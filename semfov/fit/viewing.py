@@ -21,10 +21,11 @@ from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cell
 from semfov.human.fixations.reading import frame_of, read_fixations
 from semfov.io.code import modules_digest
 from semfov.io.files import sha256
+from semfov.io.ranges import Count, Range
 from semfov.io.schema import Field, Schema
 from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.scene_run import digest_of, store_folder
-from semfov.runs.settings import Count, Range, Settings
+from semfov.runs.settings import Settings
 from semfov.runs.store import SceneStore
 
 LONGEST = 20  # number of fixations of a scanpath that are used, the first ones

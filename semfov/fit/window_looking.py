@@ -12,10 +12,10 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.detection.objects import Objects
 from semfov.errors import DataError
 from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
+from semfov.io.ranges import Range, Seed, Side, Whole
 from semfov.observation.matching import box_iou, match
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.settings import Range, Seed, Side, Whole
 from semfov.runs.setup import make_detector, make_scenes
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Association, CellMemory
@@ -10,7 +10,8 @@ from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.yolo import Runtime
 from semfov.errors import lookup
 from semfov.gaze.acquisition.base import Task
-from semfov.runs.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Whole, Workers
+from semfov.io.ranges import Count, Positive, Range, Seed, Share, Shifts, Side, Whole, Workers
+from semfov.runs.settings import Settings
 from semfov.runs.workers import Where
 from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
@@ -276,6 +277,22 @@ class WorkConfig(Settings):
 
 
 WHERE = ("out", "cache", "workers", "scheduler")  # settings of folders and processes, which do not change results
+
+
+class EyeSettings(Protocol):
+    """Settings of an eye and of the scenes that it looks at, as an `EyeConfig` and those of single fits have them."""
+
+    @property
+    def data(self) -> DataConfig:
+        """The scenes."""
+
+    @property
+    def detector(self) -> DetectorConfig:
+        """The detector."""
+
+    @property
+    def sensor(self) -> SensorConfig:
+        """The sensor."""
 
 
 @dataclass(frozen=True)

@@ -7,39 +7,7 @@ from typing import Any, ClassVar
 
 import yaml
 
-from semfov.io.ranges import (
-    CheckedSettings,
-    Count,
-    Positive,
-    Range,
-    Seed,
-    Share,
-    Shifts,
-    Side,
-    SingleName,
-    Weight,
-    Whole,
-    Workers,
-    check_settings,
-)
-
-__all__ = [
-    "Count",
-    "Positive",
-    "Range",
-    "Seed",
-    "Settings",
-    "Share",
-    "Shifts",
-    "Side",
-    "SingleName",
-    "Weight",
-    "Whole",
-    "Workers",
-    "check_settings",
-    "load_yaml",
-    "plain",
-]
+from semfov.io.ranges import CheckedSettings
 
 
 @dataclass(frozen=True)

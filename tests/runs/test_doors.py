@@ -8,9 +8,9 @@ import yaml
 
 from semfov import Selection
 from semfov.fit.settings import FitDetectorConfig
+from semfov.io.ranges import Range, check_settings
 from semfov.runs import config as settings
 from semfov.runs.command import run_command
-from semfov.runs.settings import Range, check_settings
 from tests import small
 from tests.refusals import refused
 

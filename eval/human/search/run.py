@@ -20,10 +20,11 @@ from semfov.episode import StoredLooks
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.protocols import Trial, run_episodes
 from semfov.gaze.acquisition.base import Task
+from semfov.io.ranges import Count, Positive, Range
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.seeds import noise_for
-from semfov.runs.settings import Count, Positive, Range, Settings
+from semfov.runs.settings import Settings
 
 
 @dataclass(frozen=True)
