@@ -101,7 +101,7 @@ class Parts:
         """The boxes of a part `(H, W, 3)` that `merge` would take."""
         self.passes += 1
         view = self.eye.open(np.ascontiguousarray(pixels))
-        look = self.eye.glance(view, torch.tensor([Window.overview(view.lattice).fixation]), hints=False).detections
+        look = self.eye.detect(view, torch.tensor([Window.overview(view.lattice).fixation]), hints=False).detections
         scores, labels = look.confidence[0], look.labels[0]
         if self.target is not None:
             scores, labels = look.scores[0, :, self.target], torch.full_like(labels, self.target)

@@ -98,9 +98,9 @@ def start(folder: Path, scenes: int) -> subprocess.Popen[str]:
 
 
 def finished(process: subprocess.Popen[str]) -> dict[str, float]:
-    """What a process tells at its end."""
-    told: dict[str, float] = json.loads(process.communicate()[0].splitlines()[-1])
-    return told
+    """Wait for a process, and read the numbers that it prints at its end."""
+    numbers: dict[str, float] = json.loads(process.communicate()[0].splitlines()[-1])
+    return numbers
 
 
 def killed_and_continued(scenes: int) -> list[dict[str, float]]:
@@ -147,12 +147,12 @@ def main() -> None:
         print(f"{coordination(options.scenes):.2f} ms of the coordinator's processor for each scene")
         return
     _, about = begin(options)
-    told = killed_and_continued(options.scenes)
+    runs = killed_and_continued(options.scenes)
     head = ["scenes", "finished before", "restart, s", "records", "peak memory, MiB", "database, MiB"]
     names = ("scenes", "before", "restart", "records", "peak", "size")
-    rows = [[number(each[name]) if each[name] else "0" for name in names] for each in told]
-    assert all(each["records"] == each["scenes"] * POLICIES * EPISODES for each in told)
-    write(options.out, "scale", page("Scale", TEXT, about, table(head, rows)), {"machine": about, "runs": told})
+    rows = [[number(run[name]) if run[name] else "0" for name in names] for run in runs]
+    assert all(run["records"] == run["scenes"] * POLICIES * EPISODES for run in runs)
+    write(options.out, "scale", page("Scale", TEXT, about, table(head, rows)), {"machine": about, "runs": runs})
 
 
 if __name__ == "__main__":

@@ -26,11 +26,12 @@ from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.human import content_suspicions
 from semfov.human.fixations.reading import read_fixations
+from semfov.io.ranges import Seed, Whole
 from semfov.paths.gaze import GazePrediction
 from semfov.runs.command import command
 from semfov.runs.config import DetectorConfig
 from semfov.runs.progress import track
-from semfov.runs.settings import Seed, Settings, Whole
+from semfov.runs.settings import Settings
 from semfov.runs.setup import detector_options
 from semfov.runs.tables import table
 
@@ -177,11 +178,11 @@ def _read_wrongly(
     renamed = names if fault.renamed is None else fault.renamed(names, rng)
     people = sorted({record.subject for name in names for record in by_picture[name]})
     records = []
-    for order, (name, told) in enumerate(zip(names, renamed, strict=True)):
+    for order, (name, name_read) in enumerate(zip(names, renamed, strict=True)):
         for record in by_picture[name]:
             size = np.array(record.size, np.float64)
             points = fault.change(record.points, size, people.index(record.subject), order)
-            records.append(replace(record, picture=told, points=points, size=fault.frame or record.size, box=None))
+            records.append(replace(record, picture=name_read, points=points, size=fault.frame or record.size, box=None))
     return records
 
 

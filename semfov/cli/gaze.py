@@ -85,7 +85,7 @@ class _GazeJob:
         check_detector(options.detector)
         check_onnx_options(options, options.detector)
         loading = detector_options(options)
-        # A model that cannot be read is told before the detector is loaded.
+        # A model that cannot be read is reported before the detector is loaded.
         given_model = None if options.model is None else FixationDensity.from_pretrained(options.model)
         self.detector = load_detector(options.detector, **loading)
         remember(options, options.detector)

@@ -71,14 +71,14 @@ class PictureJob(ABC, Generic[_Options]):
         self._check_names()
         self.truth = None if options.annotations is None else Truth(options.annotations)
         if self.truth is not None:
-            # A picture that the annotations lack is told now, and not after hours.
+            # A picture that the annotations lack is reported now, and not after hours.
             for source in self.sources:
                 self.truth.image_id(source.name)
         if self.every:
             first = "none for find, which begins with the whole picture"
             check(options.start is None, "start", first, repr(options.start))
         _check_outputs(options)
-        # What is wrong with the target is told before the agent is loaded, where its classes are known by then.
+        # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
         self.aim(detector_classes(options) if agent is None else agent.classes[1:])
         self.agent = make_agent(options) if agent is None else agent
         classes = self.agent.classes[1:]
@@ -178,7 +178,7 @@ class PictureJob(ABC, Generic[_Options]):
             try:
                 kind = self.agent.kind_of_look(source.picture(), self.options.how, every=self.every)
             except Exception:
-                continue  # it is told when the picture is looked at
+                continue  # it is reported when the picture is looked at
             possible = [drawing for drawing in KINDS_OF_LOOK[kind].kind.drawings if drawing in self.drawings]
             impossible = ", ".join(drawing for drawing in self.options.draw or () if drawing not in possible)
             expected = f"{' or '.join(possible)} for {source.name}, which is looked at by {kind!r}"

@@ -42,7 +42,7 @@ def look_live(options: LiveOptions) -> int:
     out = options.out
     is_video = out is None or out.is_dir() or out.suffix.lower() in ("", *VIDEO_CODECS)
     check(is_video, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", out)
-    # What is wrong with the target is told before the agent is loaded, where its classes are known by then.
+    # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
     _sought(options, detector_classes(options))
     stream = open_stream(source, options.frames, white_of(options.white))
     agent = make_agent(options)

@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "--help-all" in rest or "--help_all" in rest:
         make_parser(options, command.help.partition("\nusage:")[0], positional, program).print_help()
         return 0
-    words = partial(_in_command_words, options=_told_options(name))
+    words = partial(_in_command_words, options=_message_options(name))
     names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": name == "fit"}
     with warnings.catch_warnings():  # each is one line in the words of the command, without the place in the code
         warnings.showwarning = lambda message, *_, **__: print(f"warning: {words(str(message))}", file=sys.stderr)
@@ -148,7 +148,7 @@ def _option_names(name: str) -> list[str]:
     return [name.rstrip("_") for name in names]  # `try_` is --try
 
 
-def _told_options(name: str) -> list[str]:
+def _message_options(name: str) -> list[str]:
     """List the options that messages may name; those of `semfov fit` for a detector are dotted."""
     names = [field.name for field in fields(_options_of(name))]
     if name != "fit":

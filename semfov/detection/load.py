@@ -137,7 +137,7 @@ def _load(load: _Loader, model: str | nn.Module, description: str, options: dict
     if "device" in options:
         _check_is_device(options["device"])
     selection = {name: value for name, value in options.items() if name in _SELECTING}
-    Selection(**selection)  # what is wrong is told before a network is loaded
+    Selection(**selection)  # what is wrong is reported before a network is loaded
     loader_options = {name: value for name, value in options.items() if name in names_of_loader}
     detector = load(model, **loader_options)
     # What is not given stays as the loader has set it, such as `per_class` in the settings of an ONNX file.

@@ -5,8 +5,6 @@ from semfov.episode.loop import Step, rollout
 from semfov.episode.memory import Forgetting
 from semfov.episode.stopwatch import STAGES
 
-Sight = EpisodeLook  # its name before "look" became the only word for a look
-
 __all__ = [
     "STAGES",
     "EpisodeLook",

@@ -12,7 +12,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import box_text
 
 Box = tuple[float, float, float, float]  # `(x1, y1, x2, y2)`
-CONFIDENT = 0.1  # score from which on the detections of a look are counted, told and drawn
+CONFIDENT = 0.1  # score from which on the detections of a look are counted, named and drawn
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,8 +103,8 @@ def detections_in_words(
     detections: Detections, classes: Sequence[str], most: int = 3, target: int | None = None
 ) -> str:
     """Name the most confident detections of a look, before them the best one of the target with its box."""
-    told = confident_detections(detections)
-    labels, scores = told.labels[0].tolist(), told.confidence[0].tolist()
+    confident = confident_detections(detections)
+    labels, scores = confident.labels[0].tolist(), confident.confidence[0].tolist()
     names = [f"{classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
     if target is not None and bool(detections.mask.any()):
         best = int(detections.class_scores[0, :, target - 1].argmax())

@@ -27,8 +27,8 @@ Data = dict[str, Any]
 """JSON values of a record, or of a part of it, by name."""
 
 _DRAWN = 500  # largest number of objects that are drawn in the picture and listed
-_DETECTIONS = 10  # largest number of detections of a look that are told
-_SCORES = 5  # largest number of classes of a detection that are told
+_DETECTIONS = 10  # largest number of detections of a look that are listed
+_SCORES = 5  # largest number of classes of a detection that are listed
 
 
 def pillow(image: Tensor) -> PillowImage:

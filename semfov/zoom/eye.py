@@ -123,9 +123,9 @@ class WindowEye(nn.Module):
         Returns:
             A batch of F detections, boxes in picture pixels.
         """
-        return self.glance(view, fixations).detections
+        return self.detect(view, fixations).detections
 
-    def glance(
+    def detect(
         self,
         view: WindowView,
         fixations: Tensor,
@@ -202,7 +202,7 @@ class WindowEye(nn.Module):
         return unit, torch.tensor(frames, dtype=unit.dtype).view(-1, 8)
 
     def resample(self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None) -> Resampled:
-        """Resample windows for `glance`.
+        """Resample windows for `detect`.
 
         Args:
             view: the picture, from `open`.

@@ -198,7 +198,7 @@ class LiveWindowLooks(WindowLooks):
         self.meanwhile = None
         fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
         within = [window.within for window in windows]
-        looks = self.eye.glance(self.view, fixations, within, hints=hints, resampled=resampled, meanwhile=meanwhile)
+        looks = self.eye.detect(self.view, fixations, within, hints=hints, resampled=resampled, meanwhile=meanwhile)
         return [_look_at(looks, n, window, self.lattice) for n, window in enumerate(windows)]
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 import semfov
 from semfov import load_detector
 from semfov.cli.commands import SUBCOMMANDS
-from semfov.cli.main import _in_command_words, _told_options, main
+from semfov.cli.main import _in_command_words, _message_options, main
 from semfov.cli.options import DetectorOptions
 from semfov.detection.load import loader_options
 from tests.small import write_network
@@ -72,7 +72,7 @@ def photo(folder: Path, colour: tuple[int, int, int] = (128, 128, 128)) -> Path:
 
 @pytest.mark.parametrize("command", WITH_DETECTOR)
 def test_every_command_that_takes_a_detector_has_its_options(command):
-    names = {name.rpartition(".")[2] for name in _told_options(command)}
+    names = {name.rpartition(".")[2] for name in _message_options(command)}
     own = {field.name for field in fields(DetectorOptions)} - {"detector", "remember", "device"}
     assert own <= names
     assert command == "fit" or "remember" in names
@@ -206,7 +206,7 @@ def remedies() -> Iterator[tuple[str, str, str]]:
             for text in messages(file) if name not in OTHER_PROGRAMS else ():
                 only = next((some for words, some in CONDITIONAL.items() if words in text), commands)
                 for command in only:
-                    told = _in_command_words(text, _told_options(command))
+                    told = _in_command_words(text, _message_options(command))
                     # A whole command in a message may be another one.
                     for other, words in re.findall(r"`semfov (\w+)([^`]*)`", told):
                         yield name, other, words
@@ -216,7 +216,7 @@ def remedies() -> Iterator[tuple[str, str, str]]:
 def test_every_remedy_of_a_message_exists_in_the_command_that_prints_it():
     options, wrong, seen = "|".join({*loader_options(), "detector"}), [], 0
     for name, command, text in remedies():
-        known = {option.replace("_", "-") for option in (*_told_options(command), "try")}
+        known = {option.replace("_", "-") for option in (*_message_options(command), "try")}
         for option in re.findall(r"(?<![\w-])--([a-z][a-z._-]*[a-z])", text):
             seen += 1
             if option not in known:

@@ -194,7 +194,7 @@ def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch)
     def refuse(*given, **options):
         raise AssertionError("the detector was called")
 
-    monkeypatch.setattr(again.eye, "glance", refuse)
+    monkeypatch.setattr(again.eye, "detect", refuse)
     kept = again.looks_at(0).see([Window.overview(again.looks_at(0).lattice)])[0]
     assert torch.equal(kept.show, shown_in(env)[0].show)
 

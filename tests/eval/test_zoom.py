@@ -24,7 +24,7 @@ def test_sparse_slices_are_those_in_which_the_overview_shows_enough():
     source = LiveWindowLooks(eye, eye.open(pixels))
     windows = usual_slices(source.lattice)
     (look,) = source.see([Window.overview(source.lattice)])
-    (hints,) = eye.glance(source.view, torch.tensor([look.window.fixation])).hints
+    (hints,) = eye.detect(source.view, torch.tensor([look.window.fixation])).hints
     wide, high = source.lattice.pitch
     for targets in ([], [1], [2]):
         for least in (0.05, 0.5):

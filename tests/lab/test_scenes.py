@@ -179,7 +179,7 @@ def test_results_do_not_depend_on_the_store(zooming):
     fresh = ZoomRun(replace(zooming, store=False)).outcomes(0)[0]
     written = ZoomRun(zooming).outcomes(0)[0]
     run = ZoomRun(zooming)
-    run.eye.glance = None  # any new look would fail
+    run.eye.detect = None  # any new look would fail
     assert run.outcomes(0)[0] == written == fresh
 
 

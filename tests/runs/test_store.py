@@ -54,14 +54,14 @@ WINDOWS = [
     Window.on(LATTICE, (1, 2, 1)),
     Window.around(LATTICE, (10.0, 20.0, 110.5, 120.0)),
 ]
-GLANCES = {window: look(number, window) for number, window in enumerate(WINDOWS)}
+WINDOW_LOOKS = {window: look(number, window) for number, window in enumerate(WINDOWS)}
 
 KINDS = {
     "cells": (cells, NUMBERED),
     "cells and boxes": (cells, NUMBERED | BOXED),
     "boxes": (cells, BOXED),
     "poses and cells": (poses, {100 * pose + 7: detections(pose, pose) for pose in range(3)}),
-    "windows": (windows, GLANCES),
+    "windows": (windows, WINDOW_LOOKS),
 }
 
 

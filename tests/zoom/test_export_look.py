@@ -76,7 +76,7 @@ def run(path, picture, fixation):
 def compare(found, eye, picture, fixation, pixels, score):
     """Compare box by box; boxes with equal scores may be in any order."""
     view, at = eye.open(picture), torch.tensor([fixation])
-    look = eye.glance(view, at)
+    look = eye.detect(view, at)
     seen = look.detections
     assert len(found["boxes"]) == int(seen.mask.sum()) > 0
     match = box_iou(found["boxes"], seen.boxes[0]).argmax(-1)

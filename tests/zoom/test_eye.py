@@ -70,7 +70,7 @@ def test_boxes_are_in_pixels_of_the_picture(detector, picture, magnification):
 def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, picture):
     fixation = torch.tensor([[640.0 - 64 + 8 - 0.5, 335.5, 1.0]])  # its window ends in the red square
     keep, drop, nothing = (WindowEye(detector, cut=cut) for cut in ("keep", "drop", "background"))
-    seen = keep.glance(keep.open(picture), fixation)
+    seen = keep.detect(keep.open(picture), fixation)
     assert bool(seen.cut.any())
     assert int(drop.look(drop.open(picture), fixation).count) == int(seen.detections.count) - int(seen.cut.sum())
     background = nothing.look(nothing.open(picture), fixation)
@@ -79,7 +79,7 @@ def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, p
     image = torch.zeros(3, 256, 256)
     image[0, :32, :32] = 1
     eye = WindowEye(detector)
-    assert not bool(eye.glance(eye.open(image), torch.tensor([[63.5, 63.5, 1.0]])).cut.any())
+    assert not bool(eye.detect(eye.open(image), torch.tensor([[63.5, 63.5, 1.0]])).cut.any())
 
 
 @pytest.mark.parametrize("fill", [0.0, 114 / 255, 0.5, 0.3])
@@ -121,10 +121,10 @@ def test_detections_of_a_batch_equal_those_of_its_looks_one_by_one(detector, pic
     eye = WindowEye(detector)
     view = eye.open(picture)
     fixations = torch.tensor([[655.5, 335.5, 1.0], [640.0 - 64 + 8 - 0.5, 335.5, 1.0], [511.5, 383.5, 0.125]])
-    together = eye.glance(view, fixations)
+    together = eye.detect(view, fixations)
     counts = set()
     for number in range(3):
-        alone = eye.glance(view, fixations[number : number + 1])
+        alone = eye.detect(view, fixations[number : number + 1])
         whole, one = together.detections, alone.detections
         found = int(one.count)
         assert found == int(whole.count[number]) > 0
@@ -140,7 +140,7 @@ def test_cut_boxes_are_those_that_reach_the_border_of_the_canvas_inside_the_pict
     eye = WindowEye(detector)
     view = eye.open(picture)
     fixations = torch.tensor([[640.0 - 64 + 8 - 0.5, 335.5, 1.0], [60.0, 60.0, 1.0], [511.5, 383.5, 0.125]])
-    seen = eye.glance(view, fixations)
+    seen = eye.detect(view, fixations)
     _, frames = eye.glimpse(view, fixations)
     wide, high = view.picture.size
     for number, (x1, y1, x2, y2, u1, _, u2, _) in enumerate(frames.tolist()):
@@ -371,10 +371,10 @@ def test_looks_of_a_batch_have_their_own_hints():
     picture = torch.linspace(0, 1, 512).expand(3, 384, 512)
     view = eye.open(picture)
     fixations = torch.tensor([[100.0, 100.0, 1.0], [300.0, 200.0, 0.7], [400.0, 300.0, 1.0]])
-    together = eye.glance(view, fixations)
+    together = eye.detect(view, fixations)
     assert len({len(hints.boxes) for hints in together.hints}) == 3
     for number, hints in enumerate(together.hints):
-        alone = eye.glance(view, fixations[number : number + 1]).hints[0]
+        alone = eye.detect(view, fixations[number : number + 1]).hints[0]
         for name in ("boxes", "scores"):
             assert torch.equal(getattr(hints, name), getattr(alone, name))
 
@@ -397,7 +397,7 @@ def test_hints_share_the_scores_of_detections_for_any_background():
     for policy in ("residual", "normalised", "uniform", "none"):
         detector = Given(80, policy)
         eye = WindowEye(detector)
-        seen = eye.glance(eye.open(torch.zeros(3, 128, 128)), torch.tensor([[63.5, 63.5, 1.0]]))
+        seen = eye.detect(eye.open(torch.zeros(3, 128, 128)), torch.tensor([[63.5, 63.5, 1.0]]))
         hints, found = seen.hints[0], seen.detections
         same = (found.boxes[0][:, None] == hints.boxes).all(-1)
         assert bool((same.sum(1) == 1).all())
