@@ -138,7 +138,7 @@ class AcuityCounts:
 
 
 def report(chosen: dict[str, Sensor], detector: Detector, scenes: Scenes, count: int, fixations: int) -> str:
-    """The report with all tables, as Markdown."""
+    """Return the report with all tables, as Markdown."""
     bins = [f"{low}–{high}" for low, high in pairwise(EDGES)]
     acuity = [[name, *finest(sensor)] for name, sensor in chosen.items() if name != "none"]
     by_sensor = {name: AcuityCounts() for name in chosen}

@@ -60,7 +60,7 @@ VALUES: dict[str, tuple[Callable[[Array], float], Callable[[Tensor], Tensor]]] =
 
 
 def make_model(classes: int = CLASSES, levels: int = LEVELS) -> FovealObservationModel:
-    """An observation model whose expected scores become flatter with distance."""
+    """Return an observation model whose expected scores become flatter with distance."""
     sharp = torch.linspace(8, 0.5, levels)[:, None] * torch.eye(classes + 1)[:, None]
     edges = torch.arange(1, levels) * 50 / 640
     return (
@@ -75,7 +75,7 @@ def make_belief(cells: int, classes: int = CLASSES, batch: int = 1) -> Dirichlet
 
 
 def unvisited(belief: DirichletBelief) -> Tensor:
-    """A mask of visited cells in which no cell is visited."""
+    """Return a mask of visited cells in which no cell is visited."""
     return torch.zeros_like(belief.closest, dtype=torch.bool)
 
 

@@ -30,7 +30,7 @@ TEXT = "Written by `python -m benchmarks.busy`: milliseconds by the clock, media
 
 
 def paths() -> dict[str, Run]:
-    """The hot paths by name."""
+    """Return the hot paths by name."""
     image, gaze = photograph(), torch.tensor(GAZE)
     grid = Grid(10, 10, (640, 480))
     belief, (likelihood, footprint) = make_belief(100, batch=1), make_look(100, batch=1)
@@ -45,7 +45,7 @@ def paths() -> dict[str, Run]:
 
 
 def large_search() -> Run:
-    """A search of a mosaic by windows, whose detector returns what it has returned before."""
+    """Return a search of a mosaic by windows, whose detector returns what it has returned before."""
     agent = ZoomAgent.recommended("yolov3-tiny")
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     picture = to_bytes(Mosaics(scenes, 6, 6, tile=(640, 480), count=1)[0].image)
@@ -67,7 +67,7 @@ def large_search() -> Run:
 
 
 def with_threads(threads: int, run: Run) -> Run:
-    """The program with so many threads."""
+    """Return the program with so many threads."""
 
     def limited() -> object:
         torch.set_num_threads(threads)

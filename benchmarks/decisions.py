@@ -77,7 +77,7 @@ def make_seen(seed: int) -> Detections:
 
 
 def believe(observer: observers.Semantic, grid: Grid) -> DirichletBelief:
-    """The belief after `LOOKS` looks."""
+    """Return the belief after `LOOKS` looks."""
     belief = observer.start(1, grid, torch.zeros(()))
     for seed in range(LOOKS):
         belief = observer(belief, make_seen(seed), grid.centres[seed : seed + 1], grid)
@@ -85,7 +85,7 @@ def believe(observer: observers.Semantic, grid: Grid) -> DirichletBelief:
 
 
 def decide(value: acquisition.AcquisitionFunction, belief: DirichletBelief) -> Run:
-    """A program that makes one decision."""
+    """Make a program that makes one decision."""
     visited, generator = unvisited(belief), torch.Generator().manual_seed(0)
     visited[:, :LOOKS] = True
 
@@ -178,7 +178,7 @@ def measure_all(
 
 
 def sections(spreads: dict[str, Spread], others: list[str], peers: Measured) -> list[str]:
-    """The tables with their headings, as Markdown."""
+    """Write the tables with their headings, as Markdown."""
     parts = []
     for experiment, published in PUBLISHED.items():
         rows = [[name, spread(spreads[name]), number(cost) if cost else ""] for name, cost in published.items()]

@@ -30,7 +30,7 @@ SELECTIONS = {
 
 
 def rows_above(candidates: Candidates, threshold: float, *, multilabel: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """The candidates of one image whose score is at least `threshold`.
+    """Return the candidates of one image whose score is at least `threshold`.
 
     Args:
         candidates: candidates of one image.

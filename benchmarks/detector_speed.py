@@ -26,7 +26,7 @@ RUNTIMES: tuple[Runtime, ...] = ("onnxruntime", "torch")
 
 
 def programs(detector: Detector, images: Tensor) -> dict[str, Run]:
-    """The programs to time, by name."""
+    """Return the programs to time, by name."""
     canvas, placement = detector.fit(images)
     return {
         "network": lambda: detector.propose(canvas),

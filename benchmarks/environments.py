@@ -38,7 +38,7 @@ YOLOv3-tiny in every step."""
 
 
 def steps(envs: Any, seed: int) -> Run:
-    """A program that makes `STEPS` steps of several environments side by side."""
+    """Make a program that makes `STEPS` steps of several environments side by side."""
     random = np.random.default_rng(seed)
     state: dict[str, Any] = {"infos": envs.reset(seed=seed)[1]}
 
@@ -56,7 +56,7 @@ def any_free(random: np.random.Generator, masks: NDArray[np.int8]) -> NDArray[np
 
 
 def alone(env: GazeSearch | GazeExplore, seed: int) -> Run:
-    """A program that makes `STEPS` steps of one environment."""
+    """Make a program that makes `STEPS` steps of one environment."""
     random = np.random.default_rng(seed)
     state: dict[str, Any] = {"info": env.reset(seed=seed)[1]}
 
@@ -71,7 +71,7 @@ def alone(env: GazeSearch | GazeExplore, seed: int) -> Run:
 
 
 def looking(task: str, scenery: Scenery) -> Run:
-    """A program in which the recommended agent makes as many looks with the detector."""
+    """Make a program in which the recommended agent makes as many looks with the detector."""
     agent = semfov.ActivePerception.recommended()
     image = scenery.image(0)
     if task == "search":

@@ -85,7 +85,7 @@ class Command:
         os._exit(self.main(arguments))
 
     def digest(self, folder: Path) -> str:
-        """The sha256 of the results and of the contents of the caches."""
+        """Return the sha256 of the results and of the contents of the caches."""
         digest = hashlib.sha256()
         for name in self.results:
             digest.update((folder / "out" / name).read_bytes())
@@ -178,7 +178,7 @@ def descendants(number: int) -> list[int]:
 
 
 def still_there(numbers: list[int], seconds: float = 10.0) -> int:
-    """Number of these processes that do not end within some seconds."""
+    """Count the processes that do not end within some seconds."""
     deadline = time.monotonic() + seconds
     while (alive := [number for number in numbers if _alive(number)]) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -47,13 +47,13 @@ def numbers(*shape: int) -> Tensor:
 
 
 def foveation(device: torch.device, count: int = 1) -> Callable[[], Tensor]:
-    """Views of `count` photographs, `(count, 3, 480, 640)`."""
+    """Return views of `count` photographs, `(count, 3, 480, 640)`."""
     images, gaze = photograph().repeat(count, 1, 1, 1).to(device), torch.tensor(GAZE, device=device).repeat(count, 1)
     return lambda: foveate(images, gaze, sigma=SIGMA)
 
 
 def fixations(device: torch.device, count: int = 100) -> Callable[[], Tensor]:
-    """Views of one photograph for `count` fixations."""
+    """Return views of one photograph for `count` fixations."""
     image, gaze = photograph(416, 416).to(device), 416 * numbers(1, count, 2).to(device)
     return lambda: foveate(image, gaze, sigma=SIGMA)
 
@@ -75,7 +75,7 @@ def fusion(device: torch.device, episodes: int = 1, compiled: bool = False) -> C
 
 
 def exploration(device: torch.device, side: int = 10, classes: int = CLASSES, batch: int = 1) -> Callable[[], Tensor]:
-    """Expected KL divergence of every next fixation."""
+    """Compute expected KL divergence of every next fixation."""
     belief = DirichletBelief(make_belief(side**2, classes, batch).beta.to(device))
     value = acquisition.KLDivergence(make_model(classes), Grid(side, side, (640, 480))).to(device)
     visited = unvisited(belief)
@@ -95,7 +95,7 @@ def saliency(device: torch.device, model: Callable[[], torch.nn.Module], count: 
 
 
 def search(device: torch.device, how: Literal["fovea", "windows"], weights: str | None = None) -> Callable[[], object]:
-    """A search of a photograph by YOLOv3-tiny, five passes of the detector at most."""
+    """Return a search of a photograph by YOLOv3-tiny, five passes of the detector at most."""
     agent = ActivePerception.recommended("yolov3-tiny", weights=weights).to(device)
     image = EmbeddedScenes(agent.classes[1:], count=1)[0].image
     return lambda: agent.search(image, "cup", how=how, passes=5)
@@ -124,7 +124,7 @@ COMPILED: dict[str, Callable[..., Callable[[], Tensor]]] = {
 
 
 def finished(run: Callable[[], object]) -> Callable[[], object]:
-    """A run that ends when the GPU is done."""
+    """Return a run that ends when the GPU is done."""
 
     def timed() -> object:
         result = run()
@@ -135,7 +135,7 @@ def finished(run: Callable[[], object]) -> Callable[[], object]:
 
 
 def counted(run: Callable[[], object]) -> tuple[int, int]:
-    """Launches and waits of one call."""
+    """Return launches and waits of one call."""
     with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as profiled:
         run()
         torch.cuda.synchronize()
@@ -167,7 +167,7 @@ def rows(name: str, make: Work, device: torch.device, seconds: float, equal: boo
 
 
 def compiled(name: str, make: Callable[..., Callable[[], Tensor]], device: torch.device, seconds: float) -> list[str]:
-    """The table row of a compiled function."""
+    """Write the table row of a compiled function."""
     with torch.inference_mode(False):
         ours, eager = make(device, compiled=True), make(device)
     comparison = Comparison(

@@ -20,7 +20,7 @@ HALVED = 5
 
 
 def pyramid() -> Comparison:
-    """A Gaussian pyramid of a photograph, in OpenCV's convention."""
+    """Return a Gaussian pyramid of a photograph, in OpenCV's convention."""
     image = photograph()
     pixels = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy())
 
@@ -91,7 +91,7 @@ def half() -> Comparison:
 
 
 def lookahead(side: int = 64, classes: int = 365) -> Comparison:
-    """A decision over many cells and classes, compared with small ones of as many elements in all."""
+    """Return a decision over many cells and classes, compared with small ones of as many elements in all."""
 
     def decision(cells: int, kinds: int) -> Callable[[], Tensor]:
         model, belief = make_model(kinds), make_belief(cells**2, kinds)

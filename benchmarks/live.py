@@ -27,13 +27,13 @@ quartiles; above 1, semfov is faster."""
 
 
 def frames(classes: tuple[str, ...]) -> list[np.ndarray]:
-    """Embedded scenes as a camera gives them, `(480, 640, 3)` bytes."""
+    """List embedded scenes as a camera gives them, `(480, 640, 3)` bytes."""
     scenes = EmbeddedScenes(classes, count=FRAMES)
     return [cv2.resize(to_bytes(scenes[number].image), (640, 480)) for number in range(FRAMES)]
 
 
 def stream(how: Literal["windows", "fovea"], threads: int) -> Comparison:
-    """A search in a stream, compared with the detector on every frame."""
+    """Compare a search in a stream with the detector on every frame."""
     agent = ActivePerception.recommended("yolox-nano")
     pictures, detector = frames(agent.classes[1:]), agent.eye.detector
     bare = BareYolox(fetch("yolox-nano"), threads)

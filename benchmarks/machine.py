@@ -45,7 +45,7 @@ def processor() -> str:
 
 
 def photograph(width: int = 640, height: int = 480) -> Tensor:
-    """A photograph that comes with the package, `(1, 3, height, width)`."""
+    """Return a photograph that comes with the package, `(1, 3, height, width)`."""
     return resize(example("beach")[None], (width, height)).clamp(0, 1)
 
 

@@ -134,7 +134,7 @@ def score(counts: Mapping[str, int]) -> str:
 
 
 def listed() -> dict[str, list[str]]:
-    """Changes that `mutation.toml` sets aside, by function."""
+    """Return changes that `mutation.toml` sets aside, by function."""
     changes: dict[str, list[str]] = {}
     for group in tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))["equivalent"]:
         for entry in group["changes"]:
@@ -188,7 +188,7 @@ def one_change(line: str, change: str) -> bool:
 
 
 def outdated(equivalent: Mapping[str, Sequence[str]]) -> list[str]:
-    """Changes to set aside, after the name of their function, that are no change of a line of the present code."""
+    """List changes to set aside, after the name of their function, that change no line of the present code."""
     return [
         f"{function}: {change}"
         for function, changes in equivalent.items()

@@ -53,7 +53,7 @@ class _Parts(dict[str, list[float]]):
 
 
 def detector_alone(agent: ZoomAgent, view: WindowView, path: ZoomPath) -> Run:
-    """The detector with the selection of its boxes, on the canvases of a path."""
+    """Run the detector with the selection of its boxes, on the canvases of a path."""
     detector = agent.eye.detector
     fixations = torch.tensor([look.window.fixation for look in path.window_looks], dtype=torch.float64)
     # Bytes, channels last, as the eye passes them on.

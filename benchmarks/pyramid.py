@@ -29,19 +29,19 @@ SHAPES = ((1, 3, 480, 640), (4, 3, 416, 416), (16, 3, 64, 64))
 
 
 def split(image: Tensor) -> Tensor:
-    """A number that depends on every level of the pyramid."""
+    """Return a number that depends on every level of the pyramid."""
     bands = laplacian_pyramid(image, LEVELS)
     return torch.stack([level.square().sum() for level in (*bands.details, bands.base)]).sum()
 
 
 def view(image: Tensor) -> Tensor:
-    """A number that depends on the sensor's view, including its pyramid."""
+    """Return a number that depends on the sensor's view, including its pyramid."""
     gaze = torch.tensor([image.shape[-1] / 3, image.shape[-2] / 2], device=image.device)
     return foveate(image, gaze, sigma=image.shape[-1] / 6, levels=LEVELS).square().sum()
 
 
 def blur(image: Tensor) -> Tensor:
-    """A number that depends on the blur of VOCUS2's surround."""
+    """Return a number that depends on the blur of VOCUS2's surround."""
     if image.device.type in pyramid._AHEAD:
         blurred = gaussian_blur(image, SIGMA)
     else:
@@ -54,7 +54,7 @@ WORKS: dict[str, Callable[[Tensor], Tensor]] = {"pyramid": split, "sensor": view
 
 
 def run(work: Callable[[Tensor], Tensor], image: Tensor, ahead: Collection[str], gradients: bool) -> Tensor:
-    """The value or gradient of `work`; by matrices if the device is in `ahead`, else by Kornia."""
+    """Return the value or gradient of `work`; by matrices if the device is in `ahead`, else by Kornia."""
     with mock.patch.object(pyramid, "_AHEAD", ahead), torch.inference_mode(not gradients):
         if gradients:
             fresh = image.detach().requires_grad_()

@@ -14,14 +14,14 @@ CLASSES, SHIFTS = 80, 30
 
 
 def episode(number: int) -> Trial:
-    """The search of this number; successive searches have different targets and starts."""
+    """Return the search of this number; successive searches have different targets and starts."""
     target = 1 + number % CLASSES
     start = 1 + number % 99
     return Trial(scene=0, target=target, cue=target, repetition=number, start=start, goal=(0,), commonest=False)
 
 
 def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
-    """Detections from each cell of a scene, and a function that runs `count` searches in it, `batch` at a time."""
+    """Make detections from each cell of a scene, and a function that runs `count` searches in it, `batch` at a time."""
     generator = torch.Generator().manual_seed(0)
     grid = Grid(10, 10, (640, 480))
     corner = torch.rand(100, 12, 2, generator=generator) * torch.tensor([560.0, 400.0])
@@ -40,7 +40,7 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
 
 
 def rollouts(episodes: int = 40) -> Comparison:
-    """Searches of 30 gaze shifts in one scene; the peer runs a quarter of them, one at a time."""
+    """Return searches of 30 gaze shifts in one scene; the peer runs a quarter of them, one at a time."""
     run = searches(episodes)[1]
 
     def agree() -> None:

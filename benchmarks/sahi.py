@@ -98,7 +98,7 @@ class Parts:
         self.eye, self.target, self.passes = eye, target, 0
 
     def __call__(self, pixels: _Pixels) -> Objects:
-        """The boxes of a part `(H, W, 3)` that `merge` would take."""
+        """Return the boxes of a part `(H, W, 3)` that `merge` would take."""
         self.passes += 1
         view = self.eye.open(np.ascontiguousarray(pixels))
         look = self.eye.detect(view, torch.tensor([Window.overview(view.lattice).fixation]), hints=False).detections
@@ -174,7 +174,7 @@ class Outcome:
         return Bootstrap.of(measure, range(len(counts)))
 
     def mean(self) -> tuple[float, float]:
-        """Passes and seconds of a picture."""
+        """Return passes and seconds of a picture."""
         return sum(self.passes) / len(self.passes), sum(self.seconds) / len(self.seconds)
 
 
@@ -233,7 +233,7 @@ def _ordered(run: ZoomRun, pixels: _Pixels, *, order: Callable[[Lattice, list[Wi
 
 
 def ways(run: ZoomRun, sides: Iterable[int]) -> dict[tuple[str, str], _Way]:
-    """The ways of looking at a picture, by name and what was chosen."""
+    """Return the ways of looking at a picture, by name and what was chosen."""
     config, targets = run.config, [] if run.target is None else [run.target]
     orders: dict[str, Callable[[Lattice, list[Window]], Order]] = {
         "slices, merged here": lambda lattice, cut: in_order(cut),

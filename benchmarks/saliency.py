@@ -55,7 +55,7 @@ def vocus2_opencv(image: Array, centre: float, surround: float, layers: int = 5,
 
 
 def promote(image: Array) -> Array:
-    """The normalisation operator N(.) of Itti, Koch and Niebur for one map `(h, w)`."""
+    """Return the normalisation operator N(.) of Itti, Koch and Niebur for one map `(h, w)`."""
     image = stretch(image)
     # Among equal neighbours only the first counts as a peak.
     earlier = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 0]], np.uint8)
@@ -66,7 +66,7 @@ def promote(image: Array) -> Array:
 
 
 def total(images: Iterable[Array]) -> Array:
-    """The sum of images."""
+    """Compute the sum of images."""
     return reduce(np.add, images)
 
 
@@ -118,7 +118,7 @@ def itti_koch_opencv(image: Array, filters: list[Array]) -> Array:
 
 
 def saliency(name: str) -> Comparison:
-    """Computation of a saliency map."""
+    """Compare the computation of a saliency map."""
     image = photograph()
     pixels, filters = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), gabor_filters()
     programs: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[], Array]]] = {
@@ -134,7 +134,7 @@ def saliency(name: str) -> Comparison:
 
 
 def where_people_look(name: str = "yolov3-tiny") -> Comparison:
-    """Detections and density of fixations of a photograph from one pass, compared with that pass for detections."""
+    """Compare detections and density of fixations from one pass over a photograph with detections alone."""
     image, detector = photograph(), load_detector(name)
     density = FixationDensity.for_detector(detector)
 

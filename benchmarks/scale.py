@@ -39,7 +39,7 @@ class StubConfig:
     where: int | str = 1
 
     def plain(self) -> dict[str, Any]:
-        """The settings that outcomes depend on."""
+        """Return the settings that outcomes depend on."""
         return {"scenes": self.scenes}
 
 
@@ -55,7 +55,7 @@ class StubScenes:
         return self.count
 
     def digest(self, index: int) -> str:
-        """A digest as of a photograph."""
+        """Return a digest as of a photograph."""
         return hashlib.sha256(str(index).encode()).hexdigest()
 
 
@@ -70,7 +70,7 @@ class StubRun(SceneRun):
         return self.config.plain()
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
-        """The same episodes for each scene."""
+        """Return the same episodes for each scene."""
         records = [
             {"scene": index, "policy": policy, "repetition": repetition, "cells": [*range(SHIFTS)], "found_at": SHIFTS}
             for policy in range(POLICIES)
@@ -104,7 +104,7 @@ def finished(process: subprocess.Popen[str]) -> dict[str, float]:
 
 
 def killed_and_continued(scenes: int) -> list[dict[str, float]]:
-    """What a run over a tenth of the scenes tells, and one that was killed and continued."""
+    """Return what a run over a tenth of the scenes tells, and one that was killed and continued."""
     with tempfile.TemporaryDirectory() as small, tempfile.TemporaryDirectory() as large:
         few = finished(start(Path(small), max(1, scenes // 10)))
         process, results = start(Path(large), scenes), StubRun(StubConfig(Path(large), scenes)).results

@@ -35,13 +35,13 @@ def searchers(side: int) -> dict[str, acquisition.AcquisitionFunction]:
 
 
 def choices(value: acquisition.AcquisitionFunction, cells: int, episodes: int) -> Tensor:
-    """The cells that a searcher would fixate next, for random beliefs."""
+    """Compute the cells that a searcher would fixate next, for random beliefs."""
     belief = make_belief(cells, CLASSES, episodes)
     return value(belief, unvisited(belief)).argmax(-1)
 
 
 def decide(value: acquisition.AcquisitionFunction, cells: int) -> Run:
-    """A program that makes one decision."""
+    """Make a program that makes one decision."""
     belief = make_belief(cells)
     visited, noise = unvisited(belief), torch.rand(1, cells, generator=torch.Generator().manual_seed(0))
     return lambda: select_fixation(value(belief, visited), visited, noise)

@@ -30,7 +30,7 @@ def line(count: int, centre: float, sigma: float, step: int) -> np.ndarray:
 
 
 def plain(image: np.ndarray, gaze: tuple[float, float], sigma: float) -> np.ndarray:
-    """The sensor with OpenCV's pyramid, `(H, W, 3)`."""
+    """Return the sensor with OpenCV's pyramid, `(H, W, 3)`."""
     gaussian = [image]
     for _ in range(LEVELS):
         gaussian.append(cv2.pyrDown(gaussian[-1]))
@@ -46,7 +46,7 @@ def plain(image: np.ndarray, gaze: tuple[float, float], sigma: float) -> np.ndar
 
 
 def tuned(image: np.ndarray, gaze: tuple[float, float], sigma: float) -> np.ndarray:
-    """The sensor with OpenCV's pyramid, `(H, W, 3)`, as fast as OpenCV's calls allow."""
+    """Return the sensor with OpenCV's pyramid, `(H, W, 3)`, as fast as OpenCV's calls allow."""
     gaussian, bands = [image], []
     for k in range(LEVELS):
         gaussian.append(cv2.pyrDown(gaussian[k]))
@@ -63,7 +63,7 @@ def tuned(image: np.ndarray, gaze: tuple[float, float], sigma: float) -> np.ndar
 
 
 def with_kornia(image: Tensor, gaze: Tensor, sigma: float) -> Tensor:
-    """The sensor with Kornia's pyramid, for sizes that can be halved `LEVELS` times without remainder."""
+    """Return the sensor with Kornia's pyramid, for sizes that can be halved `LEVELS` times without remainder."""
     gaussian = [image]
     for _ in range(LEVELS):
         gaussian.append(kornia.pyrdown(gaussian[-1]))

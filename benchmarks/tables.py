@@ -13,7 +13,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def command(name: str, description: str | None, seconds: float, threads: int = 1) -> argparse.ArgumentParser:
-    """A command line with the options of all benchmarks that write a page."""
+    """Make a command line with the options of all benchmarks that write a page."""
     lines = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(f"python -m {name}", description=description, formatter_class=lines)
     parser.add_argument("--seconds", type=float, default=seconds, help="shortest duration of each measurement")
@@ -30,7 +30,7 @@ def begin(options: argparse.Namespace) -> tuple[Clock, dict[str, str]]:
 
 
 def number(value: float) -> str:
-    """A number with three significant digits, or a whole number from 100 on."""
+    """Write a number with three significant digits, or a whole number from 100 on."""
     return f"{value:.3g}" if value < 100 else f"{value:,.0f}"
 
 
@@ -62,13 +62,13 @@ def comparison_rows(measured: Measured, earlier: Mapping[tuple[str, str], Spread
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Write a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def page(title: str, text: str, about: Mapping[str, str], *sections: str) -> str:
-    """A Markdown page: title, text, the machine, and sections."""
+    """Write a Markdown page: title, text, the machine, and sections."""
     machine = "\n".join(f"- {key}: {value}" for key, value in about.items())
     return "\n\n".join([f"# {title}", text, machine, *sections]) + "\n"
 

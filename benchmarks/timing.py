@@ -12,7 +12,7 @@ Clock = Callable[[], float]
 
 
 def clock_for(threads: int) -> tuple[Clock, str]:
-    """The clock for programs with this number of threads, and a description of its times."""
+    """Make the clock for programs with this number of threads, and a description of its times."""
     return (time.process_time, "of the processor") if threads == 1 else (time.perf_counter, "of the clock")
 
 

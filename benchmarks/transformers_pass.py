@@ -71,7 +71,7 @@ MODELS: dict[str, Callable[[], Any]] = {"RT-DETR-R18": rt_detr, "D-FINE-S": d_fi
 
 @torch.inference_mode()
 def measure(name: str, side: int, repetitions: int) -> list[str]:
-    """The row of a model on a square canvas."""
+    """Write the row of a model on a square canvas."""
     from semfov import load_detector
 
     torch.set_num_threads(1)

@@ -12,7 +12,7 @@ from semfov.metrics.labels import as_numbers
 
 
 def errors_by_chance(confidence: Tensor, bins: int = 15, *, samples: int = 1000, seed: int = 0) -> Tensor:
-    r"""Expected calibration errors of perfectly calibrated predictions, which are above 0 by chance.
+    r"""Compute expected calibration errors of perfectly calibrated predictions, which are above 0 by chance.
 
     The outcomes are drawn from the predicted probabilities (Bröcker and Smith, 2007, consistency resampling):
 

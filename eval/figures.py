@@ -118,13 +118,13 @@ class Example:
         return self.scanpath.fixations[0]
 
     def foveated(self, sensor: SensorName, fixation: Tensor) -> Tensor:
-        """The photograph at its own resolution, through a named sensor, `(3, H, W)`."""
+        """Return the photograph at its own resolution, through a named sensor, `(3, H, W)`."""
         fovea = named_sensor(sensor)
         state = fovea.open(self.image[None], torch.full((2,), max(self.frame) / self.eye.reference))
         return fovea.picture(state, fixation[None])[0]
 
     def pictures(self, rows: int, columns: int, width: float) -> tuple[Figure, list[Axes]]:
-        """A figure with places for the photograph, each `width` inches wide."""
+        """Make a figure with places for the photograph, each `width` inches wide."""
         height = width * self.frame[1] / self.frame[0] + 0.25
         return make_figure(rows, columns, width * columns, height * rows, layout="compressed")
 
@@ -160,7 +160,7 @@ def _search_example(config: _FiguresConfig) -> Example:
 
 @styled
 def foveal_reconstruction(example: Example) -> Figure:
-    """The photograph, and its foveal images with the wider and the narrower fovea."""
+    """Draw the photograph, and its foveal images with the wider and the narrower fovea."""
     images = {"photograph": example.image}
     foveae: dict[str, SensorName] = {"fov100": "published", "fov50": "published-narrow"}
     for name, sensor in foveae.items():
@@ -174,7 +174,7 @@ def foveal_reconstruction(example: Example) -> Figure:
 
 @styled
 def detection_example(example: Example) -> Figure:
-    """What the detector sees in the photograph, above what it sees in the foveal image."""
+    """Draw what the detector sees in the photograph, above what it sees in the foveal image."""
     figure, axes = example.pictures(2, 1, 4.6)
     foveal = example.foveated("published", example.fixation)
     looks = [example.eye.detector(example.image[None]), example.scanpath.detections[0]]
@@ -196,7 +196,7 @@ def detection_example(example: Example) -> Figure:
 
 @styled
 def _foveal_scene(example: Example) -> Figure:
-    """The foveal image, and the distance from the fovea to the centre of each box, as a share of the longer side."""
+    """Draw the foveal image and the distance of the centre of each box from the fovea, in longer sides."""
     figure, (axes,) = example.pictures(1, 1, 5.4)
     draw_image(axes, example.foveated("published", example.fixation), example.grid)
     detections = confident_detections(example.scanpath.detections[0], MOST)
@@ -220,7 +220,7 @@ def _foveal_scene(example: Example) -> Figure:
 
 
 def ambiguities(example: Example) -> Figure | None:
-    """An object whose class changes when it is seen from afar; None if there is none."""
+    """Draw an object whose class changes when it is seen from afar; None if there is none."""
     sharp = confident_detections(example.eye.detector(example.image[None]), MOST)
     everywhere = look_everywhere(example.eye, lambda: example.image[None], example.grid, None, str)
     pair = ambiguous(
@@ -233,7 +233,7 @@ def ambiguities(example: Example) -> Figure | None:
 
 
 def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detections, int, Detections] | None:
-    """The pair of detections of one object that differ in class, of which the less confident is most confident."""
+    """Find the two detections of one object that differ in class, of which the less confident is most confident."""
     best, pair = 0.0, None
     for number, look in enumerate(looks):
         same = box_iou(sharp.boxes[0], look.boxes[0]) >= _SAME_OBJECT
@@ -248,7 +248,7 @@ def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detection
 
 @styled
 def _ambiguity(example: Example, before: Detections, after: Detections, fixation: Tensor) -> Figure:
-    """A detection in the photograph, beside one in the foveal image of a fixation."""
+    """Draw a detection in the photograph, beside one in the foveal image of a fixation."""
     figure, axes = example.pictures(1, 2, 4.2)
     draw_image(axes[0], example.image, example.grid)
     axes[0].set_title("regular")
@@ -262,13 +262,13 @@ def _ambiguity(example: Example, before: Detections, after: Detections, fixation
 
 
 def _only(detections: Detections, number: int) -> Detections:
-    """One detection of a look."""
+    """Take one detection of a look."""
     return detections.take(slice(number, number + 1))
 
 
 @styled
 def grid_example(example: Example) -> Figure:
-    """The cells of the map: the fixated one, and those that its detections of a score of 0.1 or more update."""
+    """Draw the cells of the map: the fixated one, and those that its detections of a score of 0.1 or more update."""
     from matplotlib.colors import ListedColormap
 
     figure, (axes,) = example.pictures(1, 1, 5.4)
@@ -283,7 +283,7 @@ def grid_example(example: Example) -> Figure:
 
 @styled
 def saliency_example(example: Example) -> Figure:
-    """The foveal image after a few looks, and its saliency by VOCUS2, which is 0 in the cells that were visited."""
+    """Draw the foveal image after a few looks, and its saliency by VOCUS2, which is 0 in visited cells."""
     grid, model, reduction = example.grid, VOCUS2(), SaliencyConfig().reduction
     state, points = open_at_reference(example.eye.sensor, example.eye.reference, example.image, grid.centres)
     visited, cells = torch.zeros(1, len(grid), dtype=torch.bool), [int(example.scanpath.cells[0])]

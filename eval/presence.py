@@ -12,7 +12,7 @@ from semfov.metrics.episodes import scores_by_presence
 
 
 def _threshold_for(absent: Tensor, share: float) -> float:
-    """The lowest threshold that keeps the false alarm rate at or below a limit; -inf for a limit of 1.
+    """Compute the lowest threshold that keeps the false alarm rate at or below a limit; -inf for a limit of 1.
 
     Shapes: absent `(M,)`.
     """
@@ -37,7 +37,7 @@ def hits_at(score: Tensor, present: Tensor, share: float) -> float:
 
 
 def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
-    """The receiver operating characteristic: false alarm rate and hit rate at every threshold.
+    """Compute the receiver operating characteristic: false alarm rate and hit rate at every threshold.
 
     Shapes: score `(M,)`, present `(M,)`.
     """

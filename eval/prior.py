@@ -151,7 +151,7 @@ class PriorRun(SceneRun):
 
 
 def prior_summary(records: Iterable[ResultRecord]) -> str:
-    """The table, as Markdown."""
+    """Write the table, as Markdown."""
     by_question: dict[str, list[ResultRecord]] = {}
     for record in records:
         by_question.setdefault(record["question"], []).append(record)

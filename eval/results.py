@@ -80,7 +80,7 @@ def results(config: ResultsConfig) -> None:
 
 
 def _read_page(path: Path) -> str:
-    """The text of a page with tables."""
+    """Write the text of a page with tables."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -111,7 +111,7 @@ def _fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
 
 
 def _page_table(line: str, runs: Runs) -> _PageTable:
-    """The table that a comment names: of several experiments, of a study, or of one experiment."""
+    """Write the table that a comment names: of several experiments, of a study, or of one experiment."""
     if line in STUDIES:
         return _PageTable(tuple(f"{line} {label}" for label in STUDIES[line].settings), partial(study_table, line))
     if line in _WHOLE:

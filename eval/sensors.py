@@ -99,7 +99,7 @@ class _SensorsConfig(LookingConfig):
     out: Path = Path("runs/sensors")
 
     def settings(self, name: str) -> dict[str, Any]:
-        """Settings that the fit and the runs of a candidate have in common."""
+        """Return settings that the fit and the runs of a candidate have in common."""
         candidate = CANDIDATES[lookup(name, CANDIDATES, "candidate")]
         detector = replace(self.detector, input_size=candidate.side, stride=None)
         sensor = SensorConfig(candidate.sensor, **candidate.settings)  # type: ignore[arg-type]
@@ -125,7 +125,7 @@ def _compare_sensors(config: _SensorsConfig) -> None:
 
 
 def _row(config: _SensorsConfig, name: str) -> list[str]:
-    """The row of a sensor."""
+    """Write the row of a sensor."""
     shared, folder = config.settings(name), config.folder(name)
     belief, searchers, mapping = config.belief, policies(config), "random-raw"
     model = None
@@ -154,7 +154,7 @@ def _row(config: _SensorsConfig, name: str) -> list[str]:
 
 
 def policies(config: _SensorsConfig) -> tuple[str, ...]:
-    """The searchers that are compared, the random one first."""
+    """Return the searchers that are compared, the random one first."""
     calibrated = ["non-predictive-calibrated"] * bool(config.fixations)
     return ("random", "non-predictive-raw", *calibrated)
 
@@ -186,7 +186,7 @@ def _at(curve: Curve, shift: int) -> tuple[float, float]:
 
 
 def _five_looks(run: SearchRun, model: FovealObservationModel | None, classes: int) -> Bootstrap:
-    """What is seen in one look from the middle, and in that and four looks around it.
+    """Return what is seen in one look from the middle, and in that and four looks around it.
 
     The area tells how well the largest score of a class says whether it is in a photograph. An object is found by a
     detection of its class with a score of 0.1 that overlaps it by half.

@@ -194,7 +194,7 @@ def _propose(graph: LookGraph, detector: Detector, canvas: str) -> tuple[str, st
 
 
 def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]:
-    """Outputs of the network in a detector's file, for a canvas."""
+    """Add the network in a detector's file to the graph, for a canvas; returns its outputs."""
     import onnx
     from onnx import version_converter
 
@@ -223,7 +223,7 @@ def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]
 
 
 def _exported(module: nn.Module, *inputs: Tensor) -> Any:
-    """The ONNX model of a torch module, whose inputs are `x_0`, `x_1` and so on."""
+    """Make the ONNX model of a torch module, whose inputs are `x_0`, `x_1` and so on."""
     import onnx
 
     names = [f"x_{number}" for number in range(len(inputs))]

@@ -28,7 +28,7 @@ class LookGraph(Graph):
         self.faint = detector.faint
 
     def double(self, value: float) -> str:
-        """A constant in double precision, in which windows are computed."""
+        """Make a constant in double precision, in which windows are computed."""
         return self.constant(torch.tensor(value, dtype=torch.float64))
 
     def append(self, model: Any, prefix: str, inputs: dict[str, str]) -> list[str]:

@@ -44,14 +44,14 @@ class BestScore(semfov.observers.Observer):
         self.components = components
 
     def start(self, batch: int, grid: semfov.Grid, like: Tensor) -> ScoreBelief:
-        """The belief before the first look: all scores are 0."""
+        """Return the belief before the first look: all scores are 0."""
         scores = like.new_zeros(batch, len(grid), self.components)
         return ScoreBelief(scores, torch.full_like(scores[..., 0], torch.inf))
 
     def weigh(
         self, detections: semfov.Detections, fixation: Tensor, grid: semfov.Grid, target: int | None = None
     ) -> ScoreLook:
-        """The largest score among the boxes that overlap a cell."""
+        """Compute the largest score among the boxes that overlap a cell."""
         covered = grid.footprint(detections.boxes) & detections.mask[..., None]  # (B, L, X·Y)
         scores = detections.scores.new_zeros(len(fixation), len(grid), self.components)
         for box in range(covered.shape[1]):
@@ -59,7 +59,7 @@ class BestScore(semfov.observers.Observer):
         return ScoreLook(scores, grid.distance(fixation))
 
     def update(self, belief: semfov.Belief, look: semfov.observers.Look) -> ScoreBelief:
-        """The belief after one more look."""
+        """Return the belief after one more look."""
         assert isinstance(belief, ScoreBelief)
         assert isinstance(look, ScoreLook)
         return ScoreBelief(torch.maximum(belief.scores, look.scores), torch.minimum(belief.closest, look.distance))

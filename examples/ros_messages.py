@@ -72,7 +72,7 @@ def found_array(decision: Decision | None, name: str, *, stamp: Any, frame: str)
 
 
 def _bounds(box: Sequence[float]) -> _Values:
-    """A `vision_msgs/BoundingBox2D`; like the box, its centre is in pixels from the image's left and upper edge."""
+    """Make a `vision_msgs/BoundingBox2D`; centre and box are in pixels from the image's left and upper edge."""
     x1, y1, x2, y2 = box
     position = {"x": (x1 + x2) / 2, "y": (y1 + y2) / 2}
     return {"center": {"position": position, "theta": 0.0}, "size_x": x2 - x1, "size_y": y2 - y1}

@@ -76,13 +76,13 @@ class CellPolicy(MaskableActorCriticPolicy):
 
 
 def belief_only(scenery: Scenery) -> gymnasium.Env[Any, Any]:
-    """An environment whose observation is the belief alone."""
+    """Make an environment whose observation is the belief alone."""
     env = GazeSearch(scenery, belief=True)
     return gymnasium.wrappers.TransformObservation(env, lambda each: each["belief"], env.observation_space["belief"])
 
 
 def gaze_shifts(env: gymnasium.Env[Any, Any], agent: Agent, episodes: Sequence[Any]) -> list[int]:
-    """The gaze shift that finds the target of each episode, or 0."""
+    """Return the gaze shift that finds the target of each episode, or 0."""
     found = []
     for episode in episodes:
         belief, info = env.reset(options={"episode": episode})

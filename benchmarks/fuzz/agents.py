@@ -41,7 +41,7 @@ class Fixed(Detector):
 def agent_with(
     detector: Detector, grid: tuple[int, int], model: FovealObservationModel | None, policy: policies.Policy
 ) -> ActivePerception:
-    """An agent that searches by `policy` and explores at random."""
+    """Return an agent that searches by `policy` and explores at random."""
     observer = observers.Semantic(len(CLASSES) + 1, model)
     eye = Eye(Foveation(10.0), detector, reference=64.0)
     return ActivePerception(eye, (observer, policy), (observer, policies.Policy("random")), grid=grid)
@@ -136,7 +136,7 @@ def agent_arguments(draw: Draw, _: Path) -> Case:
 
 
 def picture(kind: str, rng: np.random.Generator) -> Tensor:
-    """A small image, or a tensor that is not a valid image."""
+    """Return a small image, or a tensor that is not a valid image."""
     image = torch.from_numpy(rng.random((3, int(rng.integers(8, 40)), int(rng.integers(8, 40))), dtype=np.float32))
     if kind in ("NaN", "infinite"):
         image[tuple(int(rng.integers(size)) for size in image.shape)] = math.nan if kind == "NaN" else math.inf
@@ -151,7 +151,7 @@ def picture(kind: str, rng: np.random.Generator) -> Tensor:
 
 
 def settings_values(draw: Draw, _: Path) -> Case:
-    """Settings of the commands: accepted if a number is in the range of its type, else refused by name."""
+    """Return settings of the commands: accepted if a number is in the range of its type, else refused by name."""
     kinds = [kind for kind in vars(settings).values() if dataclasses.is_dataclass(kind) and isinstance(kind, type)]
     kind, name, base, allowed, optional = draw.choose(
         ((kind, *field) for kind in kinds for field in fields_of(kind)), "setting"

@@ -75,7 +75,7 @@ def annotation_files(draw: Draw, folder: Path) -> Case:
 
 
 def draw_document(draw: Draw) -> dict[str, Any]:
-    """A valid file with gaps between ids, unknown categories, crowds, and boxes without area or outside the image."""
+    """Write a valid file with gaps between ids, unknown categories, crowds, and boxes empty or outside the image."""
     rng = draw.rng
     images = rng.choice(1000, draw.integer(1, 4, "images"), replace=False).tolist()
     names = [str(name) for name in rng.permutation(CATEGORIES)[: draw.integer(1, 5, "categories")]]

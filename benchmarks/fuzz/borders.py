@@ -23,7 +23,7 @@ _WITHOUT_WHITE = ("u1", "u2")
 
 
 def _quiet(call: Any) -> Any:
-    """A call whose warnings are not shown; they may say what is unusual."""
+    """Return a call whose warnings are not shown; they may say what is unusual."""
 
     def quietly() -> Any:
         with warnings.catch_warnings():

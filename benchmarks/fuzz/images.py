@@ -68,7 +68,7 @@ def image_files(draw: Draw, folder: Path) -> Case:
 
 
 def picture(mode: str, size: tuple[int, int], rng: np.random.Generator) -> tuple[Any, NDArray[np.float64]]:
-    """A random picture of a Pillow mode, and the RGB values `(H, W, 3)` that it represents."""
+    """Return a random picture of a Pillow mode, and the RGB values `(H, W, 3)` that it represents."""
     shape = size[::-1]
     if mode in ("1", "F", "I;16"):
         deep = rng.integers(0, 2**16, shape, dtype=np.uint16)
@@ -109,7 +109,7 @@ def encode(image: Any, kind: str, orientation: int, frames: int, rng: np.random.
 
 
 def damaged(content: bytes, damage: str, rng: np.random.Generator) -> bytes:
-    """The contents of the file after the damage."""
+    """Return the contents of the file after the damage."""
     if damage == "huge header":
         side = int(rng.integers(10_000, 2**31 - 1))
         header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)

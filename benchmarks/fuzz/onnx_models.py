@@ -74,7 +74,7 @@ def onnx_files(draw: Draw, folder: Path) -> Case:
 
 
 def network(image: list[Any], rank: int, classes: int, kind: int, rng: np.random.Generator) -> onnx.ModelProto:
-    """A network with YOLOv5-style rows that do not depend on the image, converted to the given rank and type."""
+    """Return a network with YOLOv5-style rows that do not depend on the image, converted to the given rank and type."""
     rows = rng.random((1, 6, 5 + classes)).astype(np.float32)
     rows[..., :4] *= 30
     rows = rows.reshape(rows.shape if rank == 3 else {2: (6, -1), 1: (-1,), 0: (-1,)}[rank])

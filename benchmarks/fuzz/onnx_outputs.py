@@ -148,7 +148,7 @@ FORMS: dict[str, _Form] = {
 
 
 def _network(outputs: dict[str, _Array], canvas: tuple[int, int], metadata: dict[str, str]) -> onnx.ModelProto:
-    """A network with outputs that do not depend on the picture."""
+    """Return a network with outputs that do not depend on the picture."""
     nodes = [helper.make_node("ReduceMean", ["images"], ["mean"], keepdims=0)]
     nodes.append(helper.make_node("Mul", ["mean", "zero"], ["nil"]))
     stored = [numpy_helper.from_array(np.zeros((), np.float32), "zero")]

@@ -26,7 +26,7 @@ class Draw:
         return self.data.draw(st.sampled_from(list(options)), label=label)
 
     def integer(self, low: int, high: int, label: str) -> int:
-        """A whole number of a range, both ends included."""
+        """Return a whole number of a range, both ends included."""
         return self.data.draw(st.integers(low, high), label=label)
 
     def flag(self, label: str) -> bool:
@@ -53,7 +53,7 @@ class Case:
     names: Collection[str] | None = None
 
     def judge(self) -> str:
-        """The kind of the outcome: `result`, `missing`, or the name of the error that semfov raised on purpose."""
+        """Name the kind of the outcome: `result`, `missing`, or the error that semfov raised on purpose."""
         try:
             result = self.call()
         except (DataError, InputError) as error:
@@ -103,7 +103,7 @@ def run(target: Target, cases: int, number: int = 0) -> Counter[str]:
 
 
 def changed(content: bytes, damage: str, rng: np.random.Generator) -> bytes:
-    """The contents of a file after a damage (`cut`, `longer`, `text`, `bit` or `bytes`), always other than before."""
+    """Damage the contents of a file (`cut`, `longer`, `text`, `bit` or `bytes`); they are always other than before."""
     if damage == "cut":
         return content[: int(rng.integers(0, len(content)))]
     if damage == "longer":

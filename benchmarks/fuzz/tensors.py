@@ -158,7 +158,7 @@ def fusion_rules(draw: Draw, _: Path) -> Case:
 
 
 def formula(rule: str, beta: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
-    """The rules as in their published formulas."""
+    """Make the rules as in their published formulas."""
     expected = (beta * likelihood).sum()
     if rule == "kaplan":
         return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)

@@ -132,7 +132,7 @@ class BeliefCalibrationRun(ComparedLooking):
 
 
 def _judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:
-    """Sums over the cells of a search after a step, by group of cells.
+    """Compute sums over the cells of a search after a step, by group of cells.
 
     Shapes: goal `(X·Y,)`.
     """

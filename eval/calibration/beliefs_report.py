@@ -58,14 +58,14 @@ def _add_up(records: Iterable[ResultRecord]) -> _Sums:
 
 
 def _pooled(sums: _Sums, belief: str, looks: int) -> AddedSums:
-    """Sums over all cells, whatever their group."""
+    """Compute sums over all cells, whatever their group."""
     return sum(
         (sums[belief, looks, group] for group in CELL_GROUPS if (belief, looks, group) in sums), AddedSums.nothing()
     )
 
 
 def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCalibrationRun) -> str:
-    """The tables, as Markdown."""
+    """Write the tables, as Markdown."""
     beliefs = list(run.observers)
     there = sum(record["present"] for record in records)
     by_looks = [["looks", "belief", "cells", *_HEAD]]
@@ -111,12 +111,12 @@ def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCa
 
 
 def _judged_after(sums: _Sums) -> list[int]:
-    """The numbers of looks for which there are sums."""
+    """Return the numbers of looks for which there are sums."""
     return sorted({looks for _, looks, _ in sums})
 
 
 def _measures_row(sums: AddedSums) -> list[str]:
-    """The measures as cells of a table row."""
+    """Write the measures as cells of a table row."""
     return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
 
 
@@ -150,7 +150,7 @@ def _beliefs_json(sums: _Sums) -> str:
 
 
 def _sums_by_name(sums: _Sums) -> Iterator[tuple[str, int, str, AddedSums]]:
-    """The sums by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
+    """Sum by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
     for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
         yield belief, looks, "all", _pooled(sums, belief, looks)
         for group in CELL_GROUPS:
@@ -159,7 +159,7 @@ def _sums_by_name(sums: _Sums) -> Iterator[tuple[str, int, str, AddedSums]]:
 
 
 def _curves(sums: _Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
-    """The arguments of `plot_cell_reliability`."""
+    """Collect the arguments of `plot_cell_reliability`."""
     beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), _judged_after(sums)
     panels = {
         f"after {looks} looks" if looks > 1 else "after 1 look": {

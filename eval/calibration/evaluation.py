@@ -125,7 +125,7 @@ def _calibration_table(
 
 
 def _calibration_row(result: Calibration) -> list[str]:
-    """The measures as cells of a table row."""
+    """Write the measures as cells of a table row."""
     return [
         str(result.count),
         *(f"{value:.3f}" for value in (result.nll, result.brier, result.ece)),

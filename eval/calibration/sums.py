@@ -14,11 +14,11 @@ class AddedSums(BinarySums):
 
     @classmethod
     def nothing(cls) -> Self:
-        """The sums over no predictions, to which others are added."""
+        """Make the sums over no predictions, to which others are added."""
         return cls(torch.zeros(3, len(cls.EDGES) + 1, dtype=torch.float64), 0.0, 0.0)
 
     def __add__(self, other: Self) -> Self:
-        """Sums over the predictions of both."""
+        """Compute sums over the predictions of both."""
         return type(self)(self.bins + other.bins, self.surprisal + other.surprisal, self.square + other.square)
 
     @property
@@ -32,7 +32,7 @@ class AddedSums(BinarySums):
         return float(self.bins[2].sum()) / (self.count or math.nan)
 
     def record(self) -> dict[str, Any]:
-        """The sums as JSON values, without empty bins; `from_record` reads them."""
+        """Write the sums as JSON values, without empty bins; `from_record` reads them."""
         filled = self.bins[0].nonzero()[:, 0].tolist()
         bins = {str(number): self.bins[:, number].tolist() for number in filled}
         return {"bins": bins, "surprisal": self.surprisal, "square": self.square}

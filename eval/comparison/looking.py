@@ -27,7 +27,7 @@ class Candidate(Strategy):
         self.strategy, self.saliency, self.weight = strategy, saliency, weight
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
-        """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        """Return the acquisition function of episodes that fixate `cell` `(B,)`."""
         if self.saliency is None:
             return super().acquisition(target, grid, cell)
         salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
@@ -55,7 +55,7 @@ class ComparedLooking(PolicyLooking):
         return {**super().depends_on(), "saliency": asdict(self.config.saliency) if self.saliency_stores else None}
 
     def candidate(self, name: str, index: int) -> Candidate:
-        """The policy of this name in tables, for a scene."""
+        """Return the policy of this name in tables, for a scene."""
         policy = self.policies[lookup(name, self.policies, "policy of this run")]
         saliency = None if policy.saliency is None else self.saliency(policy.saliency, index)
         return Candidate(self.strategies[name], saliency, self.config.saliency.weight)

@@ -59,7 +59,7 @@ def with_models(config: _Config) -> _Config:
 
 
 def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfig:
-    """The settings of a folder's detector; name and weights in `settings` are the new locations of its files."""
+    """Return the settings of a folder's detector; name and weights in `settings` are the new locations of its files."""
     moved = None if settings.name == DetectorConfig().name else settings.name
     source, options = folder.detector_source(moved, settings.weights)
     names = {field.name for field in fields(DetectorConfig)}
@@ -72,7 +72,7 @@ def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfi
 
 
 def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> str | PolicyConfig:
-    """The policy that the agent of a folder uses."""
+    """Return the policy that the agent of a folder uses."""
     if config.task == "exploration":
         return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
     if folder.used("evidence"):

@@ -23,7 +23,7 @@ class StoredRecords:
         self._seconds: dict[str, float] | None = None
 
     def __iter__(self) -> Iterator[ResultRecord]:
-        """The records."""
+        """Read the records."""
         seconds: dict[str, float] = defaultdict(float)
         for result in self._results.read(self._scenes):
             yield from result["records"]
@@ -41,11 +41,11 @@ class StoredRecords:
 
 
 def gather(run: SceneRun) -> StoredRecords:
-    """Records of all scenes in their order, read as they are asked for, and the seconds that each stage took."""
+    """Read records of all scenes in their order, as they are asked for, and the seconds that each stage took."""
     return StoredRecords(run.results, len(run.scenes))
 
 
 def own_settings(config: Settings, *others: str) -> dict[str, Any]:
-    """The settings without those that the eye and the scenes tell, that change no outcome, or that are `others`."""
+    """List the settings without those that the eye and scenes tell, that change no outcome, or that are `others`."""
     left_out = (*WHERE, "store", "data", "detector", *others)
     return {name: value for name, value in config.plain().items() if name not in left_out}

@@ -63,7 +63,7 @@ class SaliencyStore(SceneStore):
         self.fixations = cells if view == "foveated" else 1
 
     def load(self, digest: str) -> Tensor | None:
-        """The saliency of a scene; None if it is missing or incomplete."""
+        """Read the saliency of a scene; None if it is missing or incomplete."""
         tensors = self.read(digest)
         return None if tensors is None or len(tensors["saliency"]) != self.fixations else tensors["saliency"]
 
@@ -73,7 +73,7 @@ class SaliencyStore(SceneStore):
 
 
 def saliency_map(name: str, detector: Detector) -> _SaliencyMap:
-    """What gives the saliency of pictures `(B, 3, H, W)` → `(B, H, W)`."""
+    """Return what gives the saliency of pictures `(B, 3, H, W)` → `(B, H, W)`."""
     if name in SALIENCY_CLASSES:
         return SALIENCY_CLASSES[name]()
     density = FixationDensity.for_detector(detector).requires_grad_(False)

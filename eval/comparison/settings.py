@@ -41,12 +41,12 @@ class ComparedConfig(RunConfig):
     models: Path | None = None
 
     def complete(self, folder: ModelFolder) -> Self:
-        """The settings, completed by the values that this kind of run takes from a folder of models."""
+        """Return the settings, completed by the values that this kind of run takes from a folder of models."""
         return self
 
 
 def sensor_settings(record: Mapping[str, Any]) -> SensorConfig:
-    """The settings of a sensor from what a folder of models keeps of it, `SensorConfig.record`."""
+    """Return the settings of a sensor from what a folder of models keeps of it, `SensorConfig.record`."""
     own = {each.name for each in fields(SensorConfig)} - {"settings"}
     others = {name: value for name, value in record.items() if name not in own}
     return SensorConfig(**{name: record[name] for name in own & record.keys()}, settings=others or None)

@@ -53,7 +53,7 @@ def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], 
 
 
 def collect_records(run: ComparedLooking) -> tuple[list[ResultRecord], dict[str, float]]:
-    """Records of all scenes, sorted by policy, and the seconds that each stage took."""
+    """Read records of all scenes, sorted by policy, and the seconds that each stage took."""
     stored = gather(run)
     order = {policy: number for number, policy in enumerate(run.policies)}
     return sorted(stored, key=lambda record: order.get(record["policy"], len(order))), stored.seconds
@@ -112,7 +112,7 @@ def announce(summary: str, written: Iterable[Path]) -> None:
 
 
 def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> str:
-    """The curves by average and policy as CSV, a row for each number of shifts; `head` names averages and values."""
+    """Write the curves by average and policy as CSV, a row for each number of shifts; `head` names what they are."""
     average, value = head
     errors = ["error_over_images", "error_over_repetitions"]
     rows: list[list[object]] = [[average, "policy", "shifts", value, *errors, "images", "episodes"]]
@@ -125,7 +125,7 @@ def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> st
 
 
 def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str]]:
-    """A table row for each policy: its curve at these gaze shifts, in percent, with both standard errors."""
+    """Write a table row for each policy: its curve at these gaze shifts, in percent, with both standard errors."""
     return [
         [
             name,

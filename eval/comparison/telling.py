@@ -118,7 +118,7 @@ def calibrated(probability: Tensor, there: Tensor) -> list[str]:
 
 
 def _spanned(value: Tensor, low: Tensor, high: Tensor, *, digits: int = 0, sign: str = "") -> str:
-    """A share in percent with its interval, such as `66 (57 to 73)`; a dash where there is none."""
+    """Write a share in percent with its interval, such as `66 (57 to 73)`; a dash where there is none."""
     if not value.isfinite():
         return "-"
     middle, *ends = (f"{100 * float(each):{sign}.{digits}f}" for each in (value, low, high))

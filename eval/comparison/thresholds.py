@@ -36,7 +36,7 @@ class _Proposed(Detector):
         self.candidates: Candidates | None = None
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """The boxes of the other detector."""
+        """Return the boxes of the other detector."""
         assert self.candidates is not None
         return self.candidates
 
@@ -125,7 +125,7 @@ def _holds(store: DetectionStore, digest: str, cells: int) -> bool:
 
 
 def _at(settings: dict[str, Any], threshold: float) -> dict[str, Any]:
-    """Settings of an eye, with another threshold."""
+    """Return settings of an eye, with another threshold."""
     detector = settings["detector"]
     selection = {**detector["selection"], "threshold": threshold}
     return {**settings, "detector": {**detector, "selection": selection}}

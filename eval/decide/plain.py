@@ -44,7 +44,7 @@ def plain_looks(
 
 
 def plain_rules(records: Sequence[ResultRecord]) -> dict[str, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """The plain rules by name: probabilities of presence and of the place, right places, and passes, each `(M,)`.
+    """List the plain rules by name: probabilities of presence and of the place, right places, and passes, each `(M,)`.
 
     The probabilities are logistic regressions of the highest score in the whole photograph, with those of the look
     that shows the place best; for quarters, of the highest score with them. Each part of the scenes is judged with

@@ -31,7 +31,7 @@ def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tens
 
 
 def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
-    """The tables, as Markdown."""
+    """Write the tables, as Markdown."""
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     scores, there = probabilities(records)
@@ -135,7 +135,7 @@ def sharp_finds(records: Sequence[ResultRecord]) -> list[bool]:
 
 
 def sharp_places(records: Sequence[ResultRecord]) -> Tensor:
-    """The same as `reported` for one unfoveated pass, `(M,)`."""
+    """Return the same as `reported` for one unfoveated pass, `(M,)`."""
     pairs = zip(records, sharp_finds(records), strict=True)
     return torch.tensor([float(record["sharp_place"]["right"]) if found else torch.nan for record, found in pairs])
 

@@ -105,7 +105,7 @@ class DecideConfig(ComparedConfig):
     out: Path = Path("runs/decide")
 
     def complete(self, folder: ModelFolder) -> Self:
-        """The settings with the folder's models that its agent uses, where none are given explicitly."""
+        """Return the settings with the folder's models that its agent uses, where none are given explicitly."""
         own = {name: folder.file(name) for name in ("windows", "verification") if folder.used(name)}
         missing: dict[str, Any] = {
             name: str(file) for name, file in own.items() if file is not None and getattr(self, name) is None
@@ -171,7 +171,7 @@ class DecisionRun(ComparedLooking):
         return decide(step, target, self.thresholds)
 
     def _verifier(self, closer: Callable[[tuple[float, ...]], Detections], grid: Grid, target: int) -> Verifier[Step]:
-        """The closer looks of one search."""
+        """Return the closer looks of one search."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
         config = self.config
@@ -182,7 +182,7 @@ class DecisionRun(ComparedLooking):
         )
 
     def _by_windows(self, source: WindowLooks, search: DrawnSearch, grid: Grid, annotation: Annotation) -> ResultRecord:
-        """What the agent that looks at windows makes of a search."""
+        """Return what the agent that looks at windows makes of a search."""
         config, target = self.config, search.target
         assert self.windows is not None
         goal = Goal.of(("background", *self.eye.detector.classes), target)
@@ -297,7 +297,7 @@ def _window_evidence(name: str | None, eye: Eye) -> GlimpseEvidence:
 
 
 def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:
-    """The rule that ends a search when a detection at the gaze shows the target with at least the `GAZE_SCORE`."""
+    """Make the rule that ends a search when a detection at the gaze shows the target with at least the `GAZE_SCORE`."""
     return confirms(step.detections, grid, step.cell, target, GAZE_SCORE).long()
 
 
@@ -323,7 +323,7 @@ def sharp_place(detections: Detections, grid: Grid, target: int, goal: Tensor, b
 
 
 def quarters(image: Tensor) -> list[Tensor]:
-    """The four quarters of pictures `(B, C, H, W)`."""
+    """Return the four quarters of pictures `(B, C, H, W)`."""
     row, column = image.shape[-2] // 2, image.shape[-1] // 2
     rows = image[..., :row, :], image[..., row:, :]
     return [part for half in rows for part in (half[..., :column], half[..., column:])]

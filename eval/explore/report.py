@@ -73,7 +73,7 @@ def _rate(record: ResultRecord, field: str) -> FloatArray:
 
 
 def _exploration_summary(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
-    """The tables that the run prints: success rates with standard errors over images."""
+    """Write the tables that the run prints: success rates with standard errors over images."""
     shifts = [n for n in _EXPLORATION_SHIFTS if n <= last]
     head = ["policy", *(str(n) for n in shifts), LAST_COLUMN]
     lines = []

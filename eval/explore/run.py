@@ -36,7 +36,7 @@ _SURE = 0.2
 
 
 def _sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
-    """Maps of what is where from one unfoveated pass at the whole picture.
+    """Compute maps of what is where from one unfoveated pass at the whole picture.
 
     - fused: scores are used as likelihoods and fused by Kaplan's rule from a uniform prior, as published.
     - boxes: every cell gets the scores of the boxes that overlap it, class by class the highest; its answer is

@@ -49,13 +49,13 @@ def compared(
 
 
 def _value_by(record: ResultRecord, seconds: float, what: str) -> float:
-    """The measure `what` of an exploration after the last look that has ended by `seconds`; 0 before the first."""
+    """Read the measure `what` of an exploration after the last look that has ended by `seconds`; 0 before the first."""
     done = sum(second <= seconds for second in record["seconds"])
     return float(record[what][done - 1]) if done else 0.0
 
 
 def _budgets(config: HeadConfig) -> list[float]:
-    """The times in seconds for which the tables give results."""
+    """Return the times in seconds for which the tables give results."""
     return sorted({second for second in (2.0, 5.0, 10.0) if second < config.seconds} | {config.seconds})
 
 

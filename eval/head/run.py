@@ -135,14 +135,14 @@ class HeadRun(SceneRun):
         return {"eye": self.eye.settings(), "models": models, "settings": own_settings(self.config)}
 
     def world(self, index: int) -> World:
-        """The scene as a world in which the head looks around."""
+        """Return the scene as a world in which the head looks around."""
         image, speeds = self.scenes[index].image, self.config.speeds
         if self.config.scene == "panorama":
             return Panorama(image, speeds=speeds)
         return Flat(image, speeds=speeds, degree=image.shape[-1] / _MOSAIC)
 
     def places(self, index: int) -> Boxes:
-        """The places of the scene's objects."""
+        """Return the places of the scene's objects."""
         scenes = self.scenes
         return scenes.regions(index) if isinstance(scenes, Panoramas) else Boxes(scenes.annotation(index).boxes)
 
@@ -199,7 +199,7 @@ class HeadRun(SceneRun):
         return int(generator.choice(poses)) * views.cells + views.cells // 2 + 5
 
     def targets(self, index: int) -> list[int]:
-        """The classes to search for in a scene."""
+        """Return the classes to search for in a scene."""
         generator = np.random.Generator(np.random.PCG64([self.config.seed, index]))
         legal = self.scenes.targets(index)
         return sorted(generator.permutation(legal)[: self.config.targets].tolist())
@@ -284,13 +284,13 @@ class HeadRun(SceneRun):
 
 
 def turns(steps: list[HeadStep], views: Views) -> int:
-    """Number of times that the head moved."""
+    """Count the times that the head moved."""
     poses = [step.action // views.cells for step in steps]
     return sum(one != other for one, other in pairwise(poses))
 
 
 def _tiling_order(views: Views, pose: int) -> list[int]:
-    """The poses that tile the scene in the order of a scan that begins at `pose`: row by row, alternating direction."""
+    """List the poses that tile the scene in the order of a scan from `pose` on: row by row, alternating direction."""
     snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(views.tiling)))]
     at = snake.index(pose)
     return snake[at:] + snake[:at]
@@ -321,7 +321,7 @@ class _Anywhere(AcquisitionFunction):
         self.views = views
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """The same value for all actions, `(1, A)`."""
+        """Return the same value for all actions, `(1, A)`."""
         return torch.zeros(1, len(self.views.grid))
 
 

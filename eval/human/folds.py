@@ -47,7 +47,7 @@ class StudiedFold(Fold):
         return super().fitted(self._only if source is None else source)
 
     def fit(self) -> FixationDensity:
-        """The model of given maps has oculomotor biases alone."""
+        """Fit the density; to given maps its oculomotor biases alone."""
         if self._given == "features":
             return super().fit()
         # The density of other people holds the centre bias already.
@@ -71,13 +71,13 @@ def spread(number: int, count: int) -> list[int]:
 
 
 def in_first(fold: Fold, picture: int) -> tuple[Viewed, int]:
-    """The group of a picture of the first data set, and its place there."""
+    """Find the group of a picture of the first data set, and its place there."""
     places = [(group, place) for group in fold.groups() if group.source == 0 for place in range(len(group))]
     return places[picture]
 
 
 def viewed_by(group: Viewed, subjects: Collection[str]) -> Viewed:
-    """The same pictures, viewed by some of the people."""
+    """Return the same pictures, viewed by some of the people."""
     some = tuple(tuple(each for each in people if each.subject in subjects) for people in group.people)
     return replace(group, people=some)
 

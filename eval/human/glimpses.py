@@ -66,7 +66,7 @@ def glimpsed(
 
 @torch.inference_mode()
 def views_of(image: Tensor, source: MapSource) -> tuple[FeatureMaps, Tensor]:
-    """Maps of foveated views of a picture `(3, H, W)`, and where each was fixated, `(V, 2)` in pixels."""
+    """Compute maps of foveated views of a picture `(3, H, W)`, and where each was fixated, `(V, 2)` in pixels."""
     height, width = image.shape[-2:]
     fixations = Grid(*CELLS, (width, height)).centres
     seen = [source.maps(foveate(image[None], each[None], sigma=FOVEA * max(width, height))) for each in fixations]
@@ -77,7 +77,7 @@ def views_of(image: Tensor, source: MapSource) -> tuple[FeatureMaps, Tensor]:
 def so_far(
     model: FixationDensity, views: FeatureMaps, fixations: Tensor, size: tuple[int, int], events: Events
 ) -> Tensor:
-    """The map of what was seen before each event, `(E, rows, columns)`."""
+    """Return the map of what was seen before each event, `(E, rows, columns)`."""
     with torch.inference_mode():
         parts = [model.map(features_so_far(views, fixations, each), size) for each in events.before.split(8)]
     return torch.cat(parts)

@@ -141,7 +141,7 @@ def _features(detector: DetectorConfig) -> MapSource:
 
 
 def _saliency(name: str) -> MapSource:
-    """The saliency map of a model over the cells of pictures, as if it were a feature map."""
+    """Compute the saliency map of a model over the cells of pictures, as if it were a feature map."""
     model = SALIENCY_CLASSES[name]()
 
     def maps(image: Tensor) -> FeatureMaps:
@@ -154,14 +154,14 @@ def _saliency(name: str) -> MapSource:
 
 
 def covering(maps: Mapping[str, Tensor], size: tuple[int, int]) -> FeatureMaps:
-    """Maps `(B, C, rows, columns)` over the whole of pictures of `(height, width)`, without detections."""
+    """Compute maps `(B, C, rows, columns)` over the whole of pictures of `(height, width)`, without detections."""
     rows, columns = next(iter(maps.values())).shape[-2:]
     placement = Placement((size[1], size[0]), (columns / size[1], rows / size[0]), (0, 0))
     return FeatureMaps(maps, (columns, rows), placement, Detections.empty(0, 0))
 
 
 def _without_maps(group: Viewed) -> Viewed:
-    """The same viewing with a map of zeros alone."""
+    """Return the same viewing with a map of zeros alone."""
     width, height = group.size[1], group.size[0]
     zeros = torch.zeros(len(group), 1, *cells_of(group.size), dtype=torch.half)
     return Viewed(covering({"none": zeros}, (height, width)), group.people, group.seconds, group.source)
@@ -212,7 +212,7 @@ def terms_table(rows: Mapping[str, Scores]) -> list[str]:
 
 
 def splits_table(splits: Mapping[str, Scores]) -> list[str]:
-    """The studied detector, by what its model was fitted to."""
+    """Return the studied detector, by what its model was fitted to."""
     sources = sorted({source for scores in splits.values() for _, source in scores})
     head = ["fitted to", *(f"{figure}, {source + 1}" for source in sources for figure in ("NSS", "AUC", "gain"))]
     body = [
@@ -230,7 +230,7 @@ def _figures(scores: Scores, row: str, source: int) -> list[str]:
 
 
 def filled(page: str, tables: Mapping[str, Sequence[str]]) -> str:
-    """A page with its tables of these names replaced."""
+    """Replace the tables of these names in a page."""
 
     def fill(match: re.Match[str]) -> str:
         lines = tables.get(match["name"])

@@ -74,5 +74,5 @@ class Attending(Candidate):
         self.attention, self.fovea = attention, fovea
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
-        """The attention to the target, accumulated over the fixated cells."""
+        """Compute the attention to the target, accumulated over the fixated cells."""
         return Policy(TemplateAttention, attention=self.attention, fovea=self.fovea)(target, grid)

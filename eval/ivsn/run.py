@@ -49,11 +49,11 @@ class IVSNRun(SearchRun):
         check(crops == 1, "sensor", "one view in a look, from which class templates are computed", f"{crops} crops")
 
     def depends_on(self) -> dict[str, Any]:
-        """The templates, beside what any search depends on."""
+        """Return the templates, beside what any search depends on."""
         return {**super().depends_on(), "templates": self.templates.digest()}
 
     def candidate(self, name: str, index: int) -> Candidate:
-        """The policy of this name in tables, for a scene."""
+        """Return the policy of this name in tables, for a scene."""
         candidate = super().candidate(name, index)
         if candidate.strategy.policy.function is not TemplateAttention:
             return candidate

@@ -94,12 +94,12 @@ class ClassTemplates(PretrainedForEye):
         self.check_compatible(settings)
 
     def _record(self) -> dict[str, Any]:
-        """The names of the classes."""
+        """Return the names of the classes."""
         return {"classes": self.classes}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The templates from a file's record and tensors."""
+        """Return the templates from a file's record and tensors."""
         return cls(tensors["templates"], tensors["mean"], record["classes"], metadata=record["metadata"])
 
 

@@ -24,12 +24,12 @@ def _read_records(folder: Path) -> tuple[ResultRecord, ...]:
 
 
 def records_of(folder: Path, policy: str, *, commonest: bool = False) -> list[ResultRecord]:
-    """Records of a policy; with `commonest`, only searches for each image's commonest target, as in the paper."""
+    """Read records of a policy; with `commonest`, only searches for each image's commonest target, as in the paper."""
     return [r for r in _read_records(folder) if r["policy"] == policy and (r["commonest"] if commonest else True)]
 
 
 def policies_of(folder: Path) -> list[str]:
-    """The policies of a run in their order."""
+    """Return the policies of a run in their order."""
     return list(dict.fromkeys(record["policy"] for record in _read_records(folder)))
 
 

@@ -223,7 +223,7 @@ class ResultsConfig(Settings):
 
 
 def experiments(config: ResultsConfig) -> dict[str, Experiment]:
-    """The experiments of the page, by name."""
+    """Return the experiments of the page, by name."""
     runs = dict(_measured(config))
     if config.fit_root is not None:
         runs |= dict(_studies(config))
@@ -232,7 +232,7 @@ def experiments(config: ResultsConfig) -> dict[str, Experiment]:
 
 
 def detector(name: str, config: ResultsConfig) -> DetectorConfig:
-    """Settings of a detector of the page."""
+    """Return settings of a detector of the page."""
     return (
         DetectorConfig(name="yolox-nano", weights=config.yolox)
         if name == "nano"
@@ -290,7 +290,7 @@ AT_THRESHOLDS = tuple(
 
 
 def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> Iterator[tuple[str, Experiment]]:
-    """The paper's searches and explorations at each score threshold, after the looks, which share a pass."""
+    """Return the paper's searches and explorations at each score threshold, after the looks, which share a pass."""
     sensor = SensorConfig(name="published")
     yield f"looks-threshold-{name}", ThresholdLooksConfig(**common, sensor=sensor, thresholds=SCORE_THRESHOLDS)
     for threshold in SCORE_THRESHOLDS:

@@ -48,7 +48,7 @@ VERDICTS = {
 
 
 def _gain_verdict(signs: set[int], expected: int, within: bool) -> str:
-    """The verdict on a finding about differences.
+    """Compute the verdict on a finding about differences.
 
     >>> [_gain_verdict(signs, 1, False) for signs in ({1}, {1, 0}, {-1}, {-1, 0}, {1, -1}, {0})]
     ['holds', 'holds in part', 'reversed', 'reversed in part', 'mixed', 'open']
@@ -65,7 +65,7 @@ def _gain_verdict(signs: set[int], expected: int, within: bool) -> str:
 
 
 def _overtaken_verdict(leads: Sequence[int], trails: Sequence[int], within: bool) -> str:
-    """The verdict on a finding about who leads at first; shifts are counted from 1.
+    """Compute the verdict on a finding about who leads at first; shifts are counted from 1.
 
     >>> _overtaken_verdict([1, 2], [9], False), _overtaken_verdict([1], [], False), _overtaken_verdict([], [1], False)
     ('holds', 'not overtaken', 'reversed')
@@ -120,7 +120,7 @@ class _Advantage:
         return Answer(sizes, _gain_verdict(signs, self.expected, within))
 
     def published(self) -> str:
-        """The paper's sizes, where it prints both policies."""
+        """Return the paper's sizes, where it prints both policies."""
         printed = paper.TABLE_II | paper.TABLE_I
         if self.one not in printed or self.other not in printed or self.shifts != paper.TABLE_SHIFTS:
             return "-"
@@ -163,7 +163,7 @@ class Finding:
         return paired_difference(folder, *policies, last, measure.field, commonest=measure.commonest)
 
     def answer(self, folder: Path, measure: Measure) -> Answer:
-        """The answer of a run, by a measure."""
+        """Compute the answer of a run, by a measure."""
         return self.test.answer(*self.difference(folder, measure))
 
     @property
@@ -220,7 +220,7 @@ _FINDINGS = (*TESTED[:7], *_BASELINES, *TESTED[7:])
 
 
 def findings(runs: Runs) -> list[str]:
-    """The table of all findings at the default threshold: sizes and verdicts for both detectors and both foveas."""
+    """Write the table of findings at the default threshold: sizes and verdicts for both detectors and both foveas."""
     folders = {kind: published_columns(kind, runs) for kind in LAST}
     rows = [["the paper finds", "shown", "in the paper", *folders["search"]]]
     for finding in _FINDINGS:

@@ -14,12 +14,12 @@ PLACE = re.compile(rf"<!-- table (?P<name>.+?)(?: -- (?P<origin>.+?))? -->.*?{EN
 
 
 def missing(names: Iterable[str], runs: Runs) -> list[str]:
-    """The experiments among these that have not run."""
+    """Return the experiments among these that have not run."""
     return [name for name in names if name not in runs or not (runs[name].out / MANIFEST).exists()]
 
 
 def origin(folders: Iterable[Path]) -> str:
-    """Commits, days and numbers of photographs of runs, each only once, as the pages say them."""
+    """Return commits, days and numbers of photographs of runs, each only once, as the pages say them."""
     manifests = [json.loads((folder / MANIFEST).read_text(encoding="utf-8")) for folder in folders]
     # A commit by its seven digits, with `+` after uncommitted changes.
     found = [each["commit"] for each in manifests]

@@ -60,7 +60,7 @@ def _largest_error(folder: Path, policy: str) -> str:
 
 
 def readings(runs: Runs) -> list[str]:
-    """Expected performance of random gaze for the commonest class, for both readings of n in the paper."""
+    """Compute expected performance of random gaze for the commonest class, for both readings of n in the paper."""
     folder = runs["search-published-nano"].out
     rows = [["random gaze, by formula", *(f"CP@{n}" for n in paper.TABLE_SHIFTS)]]
     rows.append(["paper, measured", *(f"{figure:.2f}" for figure in paper.TABLE_II["random"][:-1])])
@@ -75,7 +75,7 @@ def readings(runs: Runs) -> list[str]:
 
 
 def study_table(title: str, runs: Runs) -> list[str]:
-    """A row for each setting and policy: curves over all targets, or the published measure for explorations."""
+    """Write a row for each setting and policy: curves over all targets, or the published measure for explorations."""
     study = STUDIES[title]
     several = len(study.policies) > 1
     shifts = [str(n) if study.explores else f"CP@{n}" for n in study.shifts]
@@ -91,14 +91,14 @@ def study_table(title: str, runs: Runs) -> list[str]:
 
 
 def markdown_table(name: str, number: int, folder: Path, columns: Sequence[str] | None = None) -> list[str]:
-    """The table of this number in a Markdown file, without the text around it; with `columns`, only these of it."""
+    """Read the table of this number in a Markdown file, without the text around it; with `columns`, only these."""
     lines = (folder / name).read_text(encoding="utf-8").splitlines()
     tables = [list(rows) for is_table, rows in groupby(lines, lambda line: line.startswith("|")) if is_table]
     return tables[number] if columns is None else _with_columns(tables[number], columns)
 
 
 def _with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
-    """A Markdown table reduced to its first column and some others.
+    """Write a Markdown table reduced to its first column and some others.
 
     >>> _with_columns(["| a | b | c |", "|---|---|---|", "| 1 | 2 | 3 |"], ["c"])
     ['| a | c |', '|---|---|', '| 1 | 3 |']

@@ -11,7 +11,7 @@ from semfov.runs.tables import table
 
 
 def verdicts(runs: Runs) -> list[str]:
-    """The table of verdicts by detector and measure: each verdict with the score thresholds at which it is reached."""
+    """Write the table of verdicts by detector and measure, each with the score thresholds at which it is reached."""
     rows = [["the paper finds", "in the paper", "counted", *DETECTORS.values()]]
     for finding in TESTED:
         for number, measure in enumerate(COUNTED[finding.kind]):
@@ -22,7 +22,7 @@ def verdicts(runs: Runs) -> list[str]:
 
 
 def _answers_at(finding: Finding, measure: Measure, name: str, runs: Runs) -> dict[float, Answer]:
-    """The answers to a finding at each score threshold, with one of `DETECTORS`."""
+    """Compute the answers to a finding at each score threshold, with one of `DETECTORS`."""
     return {t: finding.answer(runs[at_threshold(finding.kind, t, name)].out, measure) for t in SCORE_THRESHOLDS}
 
 
@@ -38,7 +38,7 @@ def _verdict_text(answers: dict[float, Answer]) -> str:
 
 
 def words_of_verdicts(runs: Runs) -> list[str]:
-    """The verdicts that the table by score threshold uses, and their meanings."""
+    """Return the verdicts that the table by score threshold uses, and their meanings."""
     cells = "\n".join(verdicts(runs))
     return legend({word for word in VERDICTS if f" {word} at " in cells})
 
@@ -71,7 +71,7 @@ CONTRASTS = tuple(
 
 
 def by_threshold(runs: Runs) -> list[str]:
-    """The table of the differences at each score threshold, in percentage points, for both detectors."""
+    """Write the table of the differences at each score threshold, in percentage points, for both detectors."""
     rows = [["detector", "difference", "shifts", *(f"{threshold:g}" for threshold in SCORE_THRESHOLDS)]]
     for name, title in DETECTORS.items():
         for contrast in CONTRASTS:

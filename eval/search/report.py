@@ -80,7 +80,7 @@ def found(record: ResultRecord, shifts: int) -> FloatArray:
 
 
 def _expected_random(records: list[ResultRecord], shifts: int, cells: int) -> FloatArray:
-    """Expected performance of random search for these targets (hypergeometric formula), mean over images."""
+    """Compute expected performance of random search for these targets (hypergeometric formula), mean over images."""
     targets: dict[Any, dict[int, int]] = defaultdict(dict)
     for record in records:
         targets[record["scene"]][record["target"]] = len(record["goal"])
@@ -91,7 +91,7 @@ def _expected_random(records: list[ResultRecord], shifts: int, cells: int) -> Fl
 
 
 def _search_summary(curves: dict[str, dict[str, Curve]], expected: FloatArray, sensing: str) -> str:
-    """The tables that the run prints: cumulative performance with standard errors over images."""
+    """Write the tables that the run prints: cumulative performance with standard errors over images."""
     shifts = [n for n in _SEARCH_SHIFTS if n < len(expected)]
     head = ["policy", *(f"CP@{n}" for n in shifts), LAST_COLUMN]
     lines = []

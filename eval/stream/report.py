@@ -29,7 +29,7 @@ def stream(config: StreamConfig) -> None:
 
 
 def stream_summary(outcomes: Sequence[StreamOutcome], config: StreamConfig) -> str:
-    """The tables, as Markdown."""
+    """Write the tables, as Markdown."""
     courses = dict.fromkeys(outcome.course for outcome in outcomes)
     lines: list[str] = []
     for course in courses:
@@ -69,7 +69,7 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
 
 
 def by_way(records: Sequence[ResultRecord]) -> _By:
-    """The records of each way of looking and frame, in their order."""
+    """Read the records of each way of looking and frame, in their order."""
     groups: _By = {}
     for record in records:
         groups.setdefault(record["way"], {}).setdefault(record["frame"], []).append(record)
@@ -83,7 +83,7 @@ def precision_of(records: Sequence[ResultRecord]) -> float:
 
 
 def precision_figures(by: _By, after: int) -> Callable[[Tensor], Tensor]:
-    """A function of the indices of streams: AP50 of each way at all judged frames after a number, `(ways,)`."""
+    """Make a function of the indices of streams: AP50 of each way at all judged frames after a number, `(ways,)`."""
 
     def figures(streams: Tensor) -> Tensor:
         chosen = streams.tolist()

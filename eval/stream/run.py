@@ -131,7 +131,7 @@ class StreamRun:
             yield course, scene.name, flight(scene, COURSES[course], size, config.frames, config.seed + index)
 
     def _ways(self) -> list[Way]:
-        """The ways of looking, each with an empty memory."""
+        """Return the ways of looking, each with an empty memory."""
         eye, target, config = self.eye, self.target, self.config
         episode = partial(self.agent.stream, None, (target,), StreamSettings(rate=config.rate))
         makers: dict[WayName, Callable[[], Way]] = {

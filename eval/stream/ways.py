@@ -106,6 +106,6 @@ class Live(Way):
 
 
 def whole_and_slices(lattice: Lattice) -> list[Window]:
-    """The whole frame, and squares as large as the detector's input at native size, which overlap by a fifth."""
+    """Return the whole frame, and squares as large as the detector's input at native size, which overlap by a fifth."""
     side = min(lattice.canvas)
     return [Window.overview(lattice), *slices(lattice, side, int(0.8 * side))]

@@ -80,7 +80,7 @@ def decide_all(
 
 
 def by_way(records: Sequence[ResultRecord]) -> dict[str, list[ResultRecord]]:
-    """The records of each way of searching; all ways have the same searches in the same order."""
+    """Read the records of each way of searching; all ways have the same searches in the same order."""
     ways: dict[str, list[ResultRecord]] = {}
     for record in records:
         ways.setdefault(record["way"], []).append(record)

@@ -55,13 +55,13 @@ def expected_of(path: ZoomPath) -> Returned:
 
 
 def merged(looks: Sequence[WindowLook], target: int | None) -> Returned:
-    """The objects of looks by the scores of the detector (`semfov.zoom.objects.merge`)."""
+    """Return the objects of looks by the scores of the detector (`semfov.zoom.objects.merge`)."""
     objects = merge(looks, target)
     return Returned(objects, objects.above(LIKELY))
 
 
 def suppressed(looks: Sequence[WindowLook], target: int | None) -> Returned:
-    """The objects of looks by plain suppression: boxes that a border cuts go, of those alike one stays."""
+    """Return the objects of looks by plain suppression: boxes that a border cuts go, of those alike one stays."""
     boxes, scores = (
         torch.cat([each[0, ~look.cut] for look, each in zip(looks, column, strict=True)])
         for column in zip(*((look.detections.boxes, look.detections.scores) for look in looks), strict=True)
@@ -75,7 +75,7 @@ def suppressed(looks: Sequence[WindowLook], target: int | None) -> Returned:
 
 
 def sure_boxes(detections: Detections, target: int | None) -> Objects:
-    """What a plain pass of the detector shows from 0.5 on."""
+    """Return what a plain pass of the detector shows from 0.5 on."""
     boxes, scores, labels = detections.boxes[0], detections.confidence[0], detections.labels[0]
     kept = detections.mask[0] & (scores >= LIKELY) & (labels == (labels if target is None else target))
     return Objects(boxes[kept], scores[kept], labels[kept], torch.zeros_like(labels[kept]))
@@ -162,7 +162,7 @@ class _Boxes(NamedTuple):
 
     @classmethod
     def of(cls, group: Sequence[ResultRecord], number: str) -> Self:
-        """The boxes of the records of all pictures."""
+        """Return the boxes of the records of all pictures."""
         after = [record["after"][number] for record in group]
         scores, labels, right = (
             torch.tensor([value for each in after for value in each[name]]) for name in ("scores", "labels", "right")

@@ -31,12 +31,12 @@ def adaptive_slices(lattice: Lattice, overlap: float = 0.15) -> list[Window]:
 
 
 def in_order(windows: Sequence[Window]) -> Order:
-    """The windows in their order."""
+    """Return the windows in their order."""
     return lambda looks, done: [(windows[len(looks) - 1], 0.0)] if len(looks) <= len(windows) else []
 
 
 def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> Order:
-    """The windows in their order, without those in which the overview shows too little: sparse slicing.
+    """Return the windows in their order, without those in which the overview shows too little: sparse slicing.
 
     Args:
         windows: slices, as in slicing-aided hyper inference (SAHI; Akyon, Altinuc and Temizel, 2022).
@@ -58,7 +58,7 @@ def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> O
 
 
 def shuffled(windows: Sequence[Window], seed: Sequence[int]) -> Order:
-    """The windows in random order."""
+    """Return the windows in random order."""
     order = np.random.Generator(np.random.PCG64(list(seed))).permutation(len(windows))
     return in_order([windows[n] for n in order])
 

@@ -109,7 +109,7 @@ class ZoomRun(WindowLooking, SceneRun):
         return {"eye": self.eye.settings(), "models": models, "settings": settings}
 
     def slices(self, index: int, lattice: Lattice) -> list[Window]:
-        """The slices of a scene: the photographs of a mosaic, or squares of a picture, in a photograph four."""
+        """Return the slices of a scene: the photographs of a mosaic, or squares of a picture, in a photograph four."""
         if isinstance(self.scenes, Mosaics):
             boxes = [tile.slot for tile in self.scenes.tiles(index)]
             return [Window.around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
@@ -206,7 +206,7 @@ class ZoomRun(WindowLooking, SceneRun):
         return class_frequencies(self.scenes)
 
     def annotation(self, index: int) -> Annotation:
-        """The objects to be found: of the target class, or all."""
+        """Return the objects to be found: of the target class, or all."""
         annotation = self.scenes.annotation(index)
         if self.target is None:
             return annotation
@@ -289,6 +289,6 @@ class ZoomRun(WindowLooking, SceneRun):
 
 
 def without_cut(look: WindowLook) -> WindowLook:
-    """A look without the boxes that are cut by the border of its window."""
+    """Return a look without the boxes that are cut by the border of its window."""
     whole = ~look.cut
     return replace(look, detections=look.detections.take(whole), cut=look.cut[whole])

@@ -277,10 +277,14 @@ class Scanpath(_CellRecord):
         from semfov.viz import plot_belief, plot_belief_bars, plot_foveated_strip
         from semfov.viz.semantic import plot_semantic_map
 
-        figures = {**super().figures(boxes), "views": partial(plot_foveated_strip, self)}
+        figures = super().figures(boxes)
+        figures["views"] = partial(plot_foveated_strip, self)
         if self.target is None:
-            return {**figures, "map": partial(plot_semantic_map, self)}
-        return {**figures, "belief": partial(plot_belief, self, None), "belief_bars": partial(plot_belief_bars, self)}
+            figures["map"] = partial(plot_semantic_map, self)
+        else:
+            figures["belief"] = partial(plot_belief, self, None)
+            figures["belief_bars"] = partial(plot_belief_bars, self)
+        return figures
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
         """Show foveated views, and of closer looks the enlarged windows; without the stimulus parts of the picture."""

@@ -80,7 +80,7 @@ def _scored(
 
 
 def _floor(name: str, people: Sequence[Fixations], grid: Grid, config: PeopleSearchConfig) -> list[Fixations]:
-    """A search in each picture, by uniform random draws, or by draws from people's fixations in all pictures."""
+    """Return a search in each picture, by uniform random draws, or by draws from people's fixations in all pictures."""
     density = np.ones(len(grid)) if name == RANDOM else _centre(people, grid)
     trials = [searches[0] for searches in by_picture(people).values()]
     protocol = config.protocol

@@ -90,7 +90,7 @@ class PeopleSearchRun(ComparedLooking):
         check_detector(self.config.detector.name)
 
     def open_scenes(self) -> Scenes:
-        """The screens whose pictures are found."""
+        """Return the screens whose pictures are found."""
         config = self.config
         searches = read_searches(config.people, (config.screen.width, config.screen.height))
         by_screen = {each.picture: each for each in searches}
@@ -124,7 +124,7 @@ class PeopleSearchRun(ComparedLooking):
         return records, watch.seconds
 
     def searches(self, records: list[ResultRecord]) -> dict[str, list[Fixations]]:
-        """The policies' scanpaths in pixels of the screen, by policy."""
+        """Return the policies' scanpaths in pixels of the screen, by policy."""
         screen = self.config.screen
         centres = Grid(self.config.belief.columns, self.config.belief.rows, (screen.width, screen.height)).centres
         scanpaths: dict[str, list[Fixations]] = {name: [] for name in self.policies}

@@ -142,7 +142,7 @@ class People:
         return [labels[start:end].tolist() for start, end in zip([0, *ends], ends, strict=False)]
 
     def _error(self, finds: NDArray[np.int64], searches: Sequence[Fixations]) -> float:
-        """Standard error of TFP-AUC by bootstrap: pictures are resampled with replacement, target by target."""
+        """Compute standard error of TFP-AUC by bootstrap: pictures are resampled with replacement, target by target."""
         pictures = defaultdict(list)
         for at, each in zip(finds.tolist(), searches, strict=True):
             pictures[each.target, each.picture].append(max(0, 7 - at) if at >= 0 else 0)

@@ -62,7 +62,7 @@ class Screens(Scenes):
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def annotation(self, index: int) -> Annotation:
-        """The target's box."""
+        """Return the target's box."""
         search = self.searches[self.ids[index]]
         label = _class(search, self.classes)
         assert label is not None
@@ -71,7 +71,7 @@ class Screens(Scenes):
         return Annotation(torch.tensor([search.box]), labels, torch.zeros(1, dtype=torch.bool), search.size)
 
     def targets(self, index: int) -> list[int]:
-        """The target."""
+        """Return the target."""
         return self.annotation(index).labels.tolist()
 
     def _screen(self, index: int) -> Tensor:

@@ -48,7 +48,7 @@ def read_searches(path: Path, screen: tuple[int, int], subject: str | None = Non
 
 
 def shift_found(search: Fixations, longest: int) -> int:
-    """The gaze shift that found the target, from the file or else from the box; -1 if no fixation of `longest` did."""
+    """Find the gaze shift that found the target, by the file or else the box; -1 if no fixation of `longest` did."""
     assert search.box is not None
     at = len(search) - 1 if search.found else -1
     if search.found is None:
@@ -66,7 +66,7 @@ def goal_rectangle(search: Fixations, grid: Grid) -> tuple[int, int, int, int]:
 
 
 def in_cells(search: Fixations, grid: Grid) -> _Array:
-    """The fixated cells of a search, up to the first on the target.
+    """Return the fixated cells of a search, up to the first on the target.
 
     Successive fixations in the same cell are merged into one (`merge_close`), and all fixations after the first one in
     a cell of the target are left out. As in Ruarte et al., coordinates count from the left and top edges of the screen.
@@ -84,7 +84,7 @@ def in_cells(search: Fixations, grid: Grid) -> _Array:
 
 
 def _steps_to_target(path: _Array, search: Fixations, grid: Grid) -> int | None:
-    """Number of fixations `(n, 2)`, column and row, up to the first in a cell of the target; None if none is."""
+    """Count fixations `(n, 2)`, column and row, up to the first in a cell of the target; None if none is."""
     left, right, top, bottom = goal_rectangle(search, grid)
     x, y = path.T
     on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
