@@ -37,6 +37,17 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option by which printed texts are taken for the right ones (`tests.golden`)."""
+    parser.addoption("--accept", action="store_true", help="write what is printed into tests/golden")
+
+
+@pytest.fixture
+def accept(request: pytest.FixtureRequest) -> bool:
+    """Tell whether printed texts are taken for the right ones."""
+    return bool(request.config.getoption("--accept"))
+
+
 def pytest_configure() -> None:
     """Give each worker and the processes that it starts one thread, as all workers share the cores."""
     if "PYTEST_XDIST_WORKER" in os.environ:

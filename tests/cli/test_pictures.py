@@ -131,11 +131,8 @@ def test_all_objects_are_listed_and_written_as_tables(run, photo, large, tmp_pat
     """The box of the square is the same in every format, and a table has a line for each object."""
     agent.windows = evidence
     for kind in ("json", "csv", "geojson", "coco.json"):
-        code, printed = run("find", photo, large, "--target", "red", "--passes", 4, "--out", tmp_path / f"boxes.{kind}")
+        code, _ = run("find", photo, large, "--target", "red", "--passes", 4, "--out", tmp_path / f"boxes.{kind}")
         assert code == 0
-    assert re.search(r"my photo\.png, 160 × 120 px: 1 red found\n", printed.out)
-    assert re.search(r"  red 0\.\d\d at \(18, 18\), box 8,8–28,28", printed.out)
-    assert "2 pictures: 2 looked at" in printed.out
     first, second = json.loads((tmp_path / "boxes.json").read_text())["pictures"]
     boxes = [[row[edge] for edge in ("x1", "y1", "x2", "y2")] for row in (*first["objects"], *second["objects"])]
     assert boxes[0] == pytest.approx([8, 8, 28, 28], abs=1)
@@ -282,26 +279,18 @@ def make_truth(tmp_path):
     return make
 
 
-def test_several_classes_or_all_are_found(run, photo):
-    _, printed = run("find", photo, "--target", "Red, wine glass")
-    assert "px: 1 red, no wine glass found" in printed.out
-    _, printed = run("find", photo, "--passes", 1)
-    assert "px: 1 object found" in printed.out
-
-
 def test_a_search_of_pictures_is_a_table_with_a_line_for_each(run, photo, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     photo.rename(folder / "a.png")
     Image.new("RGB", (160, 120), (100, 100, 100)).save(folder / "b.png")
-    code, printed = run("search", folder, "--target", "red", "--shifts", 4, "--out", tmp_path / "found.csv")
+    code, _ = run("search", folder, "--target", "red", "--shifts", 4, "--out", tmp_path / "found.csv")
     assert code == 0
     with (tmp_path / "found.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
     assert (first["outcome"], second["outcome"]) == ("found", "undecided")
     assert 8 <= float(first["x"]) <= 28
     assert second["x"] == ""
-    assert "2 pictures: 1 found, 1 undecided" in printed.out
 
 
 def test_a_broken_picture_is_reported_and_the_others_are_written(run, photo, tmp_path):
@@ -310,10 +299,8 @@ def test_a_broken_picture_is_reported_and_the_others_are_written(run, photo, tmp
     for name in ("a.png", "c.png"):
         Image.open(photo).save(folder / name)
     (folder / "b.png").write_bytes((folder / "a.png").read_bytes()[:120])
-    code, printed = run("find", folder, "--out", tmp_path / "boxes.json", "--report", tmp_path / "page.html")
+    code, _ = run("find", folder, "--out", tmp_path / "boxes.json", "--report", tmp_path / "page.html")
     assert code == 1
-    assert re.search(r"skipped \S+b\.png: image .* cannot be decoded", printed.err)
-    assert "3 pictures: 2 looked at; 1 skipped" in printed.out
     result = json.loads((tmp_path / "boxes.json").read_text())
     assert [each["picture"] for each in result["pictures"]] == [str(folder / "a.png"), str(folder / "c.png")]
     assert [each["picture"] for each in result["skipped"]] == [str(folder / "b.png")]
@@ -598,15 +585,7 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     search = ("search", large, "--target", "red", "--passes", 5, "--looks")
     code, printed = run(*search, "--out", tmp_path / "out", "--report", tmp_path / "page.html")
     assert code == 0
-    assert re.search(
-        r"field\.png, 1280 × 960 px: found red at \(10\d\d, 7\d\d\), box \S+, "
-        r"probability that the picture holds it: 0\.50",
-        printed.out,
-    )
-    assert "A closer look confirmed the target." in printed.out
-    assert re.search(r"^  look +at \(x, y\) +shows +detections from score 0.1 on +value +s$", printed.out, re.M)
-    assert re.search(r"^  0 +\(640, 480\) +the whole picture +red 0\.\d\d", printed.out, re.M)
-    assert "\n  value: the probability that it shows the target" in printed.out
+    assert re.search(r"found red at \(10\d\d, 7\d\d\), box \S+, .*: 0\.50$", printed.out, re.M)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "scanpath.png", "animation.gif"}
     (episode,) = episodes_of(tmp_path / "page.html")
     assert len(episode["looks"]) == int(episode["passes"])
@@ -617,9 +596,6 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     place = re.search(r"red undecided, .*; best place: box (\d+),(\d+)–(\d+),(\d+), score 0\.\d\d$", printed.out, re.M)
     assert place
     assert [int(edge) for edge in place.groups()] == pytest.approx([1000, 700, 1040, 740], abs=8)
-    assert "3 looks (the limit) in" in printed.out
-    _, printed = run("explore", large, "--worth", 1000)
-    assert "1 look in" in printed.out
 
 
 def test_remedies_are_in_the_words_of_the_command(run, large):
