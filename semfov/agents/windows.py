@@ -44,6 +44,8 @@ class ZoomAgent(nn.Module):
 
     Example::
 
+        from semfov.settings import FindSettings
+
         agent = ZoomAgent.recommended("yolox-nano")
         path = agent.find_all("harbour.tif", "person", FindSettings(passes=16))
         print(path.objects.boxes, path.passes)
@@ -83,8 +85,8 @@ class ZoomAgent(nn.Module):
         """Search for one object of a class and decide whether the picture holds one.
 
         The recommended agent looks closely at places that seem to hold the class before it says `found`
-        (`semfov.zoom.closer`). Without evidence the search is found at a detection with a score of at least `confirm`
-        (None: 0.5), and without evidence that fits verification it decides without closer looks.
+        (`semfov.zoom.closer`); with evidence that has no fitted verification it does not. Without evidence the class is
+        found at a detection with a score of at least `confirm` (None: 0.5).
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
