@@ -23,8 +23,9 @@ from semfov.errors import check
 from semfov.fit.viewing import MapSource, features_of
 from semfov.gaze.saliency.likeness import PictureLikeness, pooled
 from semfov.io.files import write_text
+from semfov.io.ranges import Range, Seed
 from semfov.metrics.episodes import area_under_roc
-from semfov.runs.settings import Range, Seed, Settings
+from semfov.runs.settings import Settings
 from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker
 
