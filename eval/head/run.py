@@ -237,7 +237,7 @@ class HeadRun(SceneRun):
         return records
 
     def _closer(self, way: str, gain: LookGain, target: int | None) -> CloserLooks | None:
-        """What offers closer looks to our own way where the head zooms."""
+        """Make what offers closer looks to our own way where the head zooms."""
         return CloserLooks(gain, self.config.speeds, target) if way == OURS and len(gain.views.fields) > 1 else None
 
     def _steps(self, views, looks, observer, acquire, start, target, index, closer):  # type: ignore[no-untyped-def]
