@@ -13,6 +13,7 @@ from semfov.head.scenes import Sphere
 from semfov.head.views import Views
 from semfov.paths import HeadPath
 from semfov.sensor.sphere import panorama_directions
+from semfov.settings import ExploreSettings, SearchSettings
 from tests.refusals import unusable
 from tests.small import Coloured, rand
 
@@ -154,7 +155,11 @@ def towards_speck(views):
 def test_a_small_object_is_looked_at_closely_and_the_record_is_stored(agent, speck, tmp_path, search):
     world = Panorama(speck, fields=FIELDS)
     start = towards_speck(agent.views(world))
-    path = agent.search(world, "blue", start=start, confirm=1.0) if search else agent.explore(world, start=start)
+    path = (
+        agent.search(world, "blue", SearchSettings(start=start, confirm=1.0))
+        if search
+        else agent.explore(world, ExploreSettings(start=start))
+    )
     assert [round(float(path.pose(look)[2])) for look in range(len(path))] == [60, 20]  # 4 degrees are too narrow
     assert path.pose(1)[:2].tolist() == pytest.approx((20.0, 10.0), abs=0.3)
     regions, labels, _ = path.places(1, 0.5)
@@ -172,7 +177,7 @@ def test_a_small_object_is_looked_at_closely_and_the_record_is_stored(agent, spe
 @pytest.mark.usefixtures("closely")
 def test_a_closer_look_changes_the_belief_at_its_place_alone(agent, speck):
     world = Panorama(speck, fields=(13.0, 60.0))
-    path = agent.search(world, "blue", start=towards_speck(agent.views(world)), confirm=1.0)
+    path = agent.search(world, "blue", SearchSettings(start=towards_speck(agent.views(world)), confirm=1.0))
     assert [float(path.pose(look)[2]) for look in range(len(path))] == [60.0, 13.0]
     changed = (path.maps[1] != path.maps[0]).nonzero()[:, 0]
     angles = world.angles_of(world.centres[changed])
@@ -190,9 +195,9 @@ def test_a_record_of_several_fields_from_before_closer_looks_is_refused(agent, s
         return tensors, record
 
     monkeypatch.setattr(HeadPath, "_contents", without_closer)
-    agent.explore(Panorama(speck, fields=FIELDS), passes=2).save(tmp_path / "old.safetensors")
+    agent.explore(Panorama(speck, fields=FIELDS), ExploreSettings(passes=2)).save(tmp_path / "old.safetensors")
     unusable("aimed: expected the poses of closer looks", HeadPath.load, tmp_path / "old.safetensors")
-    one = agent.explore(Panorama(speck), passes=2)
+    one = agent.explore(Panorama(speck), ExploreSettings(passes=2))
     one.save(tmp_path / "one.safetensors")
     assert HeadPath.load(tmp_path / "one.safetensors").actions == one.actions
 
@@ -210,7 +215,7 @@ def test_a_camera_zooms_at_places_within_its_limits(agent, speck):
             return self.panorama.look_at(direction, field)
 
     camera = Zooming()
-    path = agent.explore(camera, start=towards_speck(agent.views(camera)))
+    path = agent.explore(camera, ExploreSettings(start=towards_speck(agent.views(camera))))
     assert [tuple(path.pose(look).tolist()) for look in range(len(path))] == camera.asked
     assert camera.asked[1] == (15.0, 5.0, 20.0)  # the place is beyond both limits, and the fixation beside the middle
     assert path.direction(1) == pytest.approx((20.0, 10.0), abs=2)

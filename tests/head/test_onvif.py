@@ -7,6 +7,7 @@ import pytest
 from semfov import HeadAgent, Panorama
 from semfov.head import Speeds, open_scene
 from semfov.head.onvif import OnvifCamera, OnvifClient, Position
+from semfov.settings import SearchSettings
 from tests.head.onvif_server import PASSWORD, USER, OnvifServer, envelope
 from tests.refusals import refused, unusable
 
@@ -55,7 +56,7 @@ def test_it_turns_where_it_is_sent_and_tells_where_it_is(server, make, panorama,
 def test_the_agent_searches_with_it(server, make, eye, models, panorama):
     """What it sees is that of a panorama in the same directions."""
     agent = HeadAgent(eye, *models).eval()
-    path = agent.search(make(), "blue", passes=4, confirm=1.0)
+    path = agent.search(make(), "blue", SearchSettings(passes=4, confirm=1.0))
     assert len(server.moves) == 4
     last = server.moves[-1]
     assert (170 * last[1], 30 + 60 * last[2]) == pytest.approx(tuple(path.pose(-1)[:2].tolist()), abs=1e-3)
