@@ -100,7 +100,10 @@ def landing_loss(observer: Semantic, searched: SearchedLooks, order: Tensor) -> 
         going = ~(searched.goal & visited).any(-1)
         if not going.any():
             break
-        probability = belief.class_probabilities()[0].T[searched.targets[going]].masked_fill(visited, 0)
+        targets = searched.targets[going]
+        # One row of the belief for each target that is not found yet.
+        rows = torch.zeros(len(targets), dtype=torch.long)
+        probability = belief[rows].chance(targets).masked_fill(visited, 0)
         landing = (probability * searched.goal[going]).sum(-1) / probability.sum(-1)
         losses.append(-landing.log().mean())
     return torch.stack(losses).mean() if losses else None

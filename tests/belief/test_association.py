@@ -76,7 +76,8 @@ def test_the_belief_equals_a_loop_over_cells(looks):
         closest = int(offset[x].argmin())
         # A tie keeps the earlier look, as argmin does.
         level = int(fom.level(offset[x, closest]))
-        likelihood = [1.0] + [float(fom.log_miss[k, level].exp()) for k in (1, 2, 3)]
+        missed = [1.0] + [float(fom.log_miss[k, level].exp()) for k in (1, 2, 3)]
+        likelihoods = {"given the looks": [*missed], "while the search goes on": [*missed]}
         for row in looks.mask[closest].nonzero()[:, 0].tolist():
             box, scores = looks.boxes[closest, row], looks.scores[closest, row]
             if not bool(GRID.footprint(box[None], "box_centre")[0, x]):
@@ -85,11 +86,18 @@ def test_the_belief_equals_a_loop_over_cells(looks):
             covers = GRID.footprint(box[None])[0]
             share = 0.2 if any(bool(covers[cell]) for cell in cells[: closest + 1]) else 1.0
             for k in (1, 2, 3):
-                likelihood[k] += share * float(calibrated[k] / calibrated[0])
-        posterior = torch.tensor(likelihood) / sum(likelihood)
-        # With the mean of Kaplan's rule: the prior, and one observation of the posterior.
-        expected = (prior + posterior) / (1 + 4 * prior)
-        torch.testing.assert_close(belief.probabilities[0, x].float(), expected, rtol=1e-5, atol=1e-7)
+                ratio = float(calibrated[k] / calibrated[0])
+                likelihoods["given the looks"][k] += ratio
+                likelihoods["while the search goes on"][k] += share * ratio
+        got = {
+            "given the looks": belief.probabilities[0, x],
+            "while the search goes on": torch.stack([belief.chance(k)[0, x] for k in range(4)]),
+        }
+        for condition, likelihood in likelihoods.items():
+            posterior = torch.tensor(likelihood) / sum(likelihood)
+            # With the mean of Kaplan's rule: the prior, and one observation of the posterior.
+            expected = (prior + posterior) / (1 + 4 * prior)
+            torch.testing.assert_close(got[condition].float(), expected, rtol=1e-5, atol=1e-7)
     assert belief.visited[0].nonzero()[:, 0].tolist() == sorted(cells)
 
 
@@ -114,7 +122,10 @@ def test_refutation_takes_what_covers_a_fixated_cell(looks):
     full = Detections(torch.tensor([[[0.0, 0.0, 100.0, 80.0]]]).double(), looks.scores[:1, :1], torch.ones(1, 1).bool())
     nothing = replace(full, mask=torch.zeros(1, 1).bool())
     sure = Semantic.searching(model(refutation=1.0).requires_grad_(False))
-    torch.testing.assert_close(watch(sure, full, FIXATIONS[:1]).beta, watch(sure, nothing, FIXATIONS[:1]).beta)
+    seen, unseen = (watch(sure, look, FIXATIONS[:1]) for look in (full, nothing))
+    torch.testing.assert_close(seen.chance(2), unseen.chance(2))
+    # That the search goes on says nothing of what the look shows.
+    assert float(seen.probability(2).max()) > float(unseen.probability(2).max())
     weight, covered = torch.rand(2, 3, 20), torch.rand(2, 3, 20)
     everywhere = torch.ones(2, 20, dtype=torch.bool)
     assert torch.equal(refuted(weight, covered, everywhere, torch.tensor(0.0)), weight)
@@ -136,7 +147,7 @@ def test_gradients_flow_through_three_looks(looks):
                 self.observer = observer
 
             def forward(self):
-                return watch(observer, looks).probability(2)
+                return watch(observer, looks).chance(2)
 
         named = {f"observer.observation.{name}": value for name, value in zip(names, values, strict=True)}
         return torch.func.functional_call(Held(), named, ())
@@ -157,10 +168,13 @@ def test_looks_are_joined_and_fade(looks):
     for row, part in enumerate((few, said[1:2], said[2:])):
         alone = observer.update(observer.start(1, GRID, seen.scores), part)
         torch.testing.assert_close(belief.beta[row], alone.beta[0])
+        torch.testing.assert_close(belief.following[row], alone.following[0])
     none = torch.zeros_like(belief.visited)
     faded = observer.fade(belief, together, 0.5, none)
     assert not faded.visited.any()
-    torch.testing.assert_close(faded.beta, 1e-5 + 0.5 * (belief.beta - 1e-5))
+    for name in ("beta", "following"):
+        values = getattr(belief, name)
+        torch.testing.assert_close(getattr(faded, name), 1e-5 + 0.5 * (values - 1e-5))
 
 
 def test_an_association_needs_odds_of_a_miss():

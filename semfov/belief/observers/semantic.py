@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from semfov.belief.association import one_of, refuted
-from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
+from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief, pick
 from semfov.belief.evidence import farther
 from semfov.belief.fusion import RULES, fuse_scaled, scale_covering
 from semfov.belief.grid import Footprint, Grid
@@ -67,9 +67,20 @@ class AssociatedLook(SemanticLook):
 
 @dataclass(frozen=True)
 class AssociatedBelief(DirichletBelief):
-    """A Dirichlet belief that knows which cells were fixated, `(B, X·Y)`."""
+    """A Dirichlet belief of a search, which goes on only if it has not fixated its target.
 
+    Attributes:
+        following: `(B, X·Y, K+1)`, Dirichlet parameters given that no fixated cell holds the target (`chance`); `beta`
+            are those given the looks alone.
+        visited: `(B, X·Y)` boolean, the fixated cells.
+    """
+
+    following: Tensor = None  # type: ignore[assignment]
     visited: Tensor = None  # type: ignore[assignment]
+
+    def chance(self, target: int | Tensor) -> Tensor:
+        """Give the posterior of the target class in each cell, given that no fixated cell holds it, `(B, X·Y)`."""
+        return pick(self.following, torch.as_tensor(target)) / self.following.sum(-1)
 
 
 class Semantic(Observer):
@@ -85,8 +96,9 @@ class Semantic(Observer):
 
     - `misses`: cells without detections are updated with the miss rate of each class at their distance.
     - `association="one"`: a look has one likelihood for each cell, in which detections and a miss are alternatives
-      (`semfov.belief.association`), and it is fused once. Detections that cover fixated cells lose weight by the
-      `refutation` of `misses`: the belief is that of a search, which goes on only if it has not seen its target.
+      (`semfov.belief.association`), and it is fused once. A search goes on only if it has not fixated its target: for
+      the next fixation (`Belief.chance`) detections that cover fixated cells lose weight, by the `refutation` of
+      `misses`.
 
     Args:
         components: K + 1, number of classes with background.
@@ -170,7 +182,7 @@ class Semantic(Observer):
         beta = like.new_full((batch, len(grid), self.components), self.prior)
         if self.association == "each":
             return DirichletBelief(beta)
-        return AssociatedBelief(beta, visited=torch.zeros_like(beta[..., 0], dtype=torch.bool))
+        return AssociatedBelief(beta, following=beta, visited=torch.zeros_like(beta[..., 0], dtype=torch.bool))
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SemanticLook:
         """Compute the likelihoods of the detections (`likelihoods`), the same for every target."""
@@ -186,21 +198,39 @@ class Semantic(Observer):
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
         """Fuse one more look in each episode."""
-        old = dirichlet_belief(belief)
         semantic = own(look, SemanticLook, "look")
-        before = old.beta if self.memory == "all" else torch.full_like(old.beta, self.prior)
-        changes: dict[str, Tensor] = {}
-        if self.association == "each":
-            fused = self._fuse_each(before, semantic)
-        else:
-            associated = own(look, AssociatedLook, "look")
-            visited = own(belief, AssociatedBelief, "belief").visited.scatter(1, associated.fixated[:, None], True)
-            fused = self._fuse_one(before, associated, visited)
-            changes["visited"] = visited
-        if self.memory == "closest":
-            # `before` was the prior, so a cell takes all of the closer look, or nothing of it.
-            fused = torch.where((semantic.distance < old.closest)[..., None], fused, old.beta)
-        return replace(old, beta=fused, closest=torch.minimum(old.closest, semantic.distance), **changes)
+        if self.association == "one":
+            return self._update_one(own(belief, AssociatedBelief, "belief"), own(look, AssociatedLook, "look"))
+        old = dirichlet_belief(belief)
+        fused = self._fuse_each(self._before(old.beta), semantic)
+        return replace(old, beta=self._kept(old, old.beta, fused, semantic), closest=_closest(old, semantic))
+
+    def _update_one(self, old: AssociatedBelief, look: AssociatedLook) -> AssociatedBelief:
+        """Fuse a look of which one detection shows the object of a cell: given the looks, and for the next fixation."""
+        assert self.misses is not None
+        visited = old.visited.scatter(1, look.fixated[:, None], True)
+        weight = look.footprint.to(old.beta)
+        share = self.misses.refutation.clamp(0, 1).to(old.beta)
+        unrefuted = refuted(weight, look.covered.to(old.beta), visited, share)
+        present = self._fuse_one(self._before(old.beta), look, weight)
+        following = self._fuse_one(self._before(old.following), look, unrefuted)
+        return replace(
+            old,
+            beta=self._kept(old, old.beta, present, look),
+            following=self._kept(old, old.following, following, look),
+            visited=visited,
+            closest=_closest(old, look),
+        )
+
+    def _before(self, beta: Tensor) -> Tensor:
+        """Return the Dirichlet parameters that a look is fused with: the prior, where the closest look alone counts."""
+        return beta if self.memory == "all" else torch.full_like(beta, self.prior)
+
+    def _kept(self, old: DirichletBelief, beta: Tensor, fused: Tensor, look: SemanticLook) -> Tensor:
+        """Choose between old and new Dirichlet parameters: a cell takes all of a closer look, or nothing of it."""
+        if self.memory == "all":
+            return fused
+        return torch.where((look.distance < old.closest)[..., None], fused, beta)
 
     def _fuse_each(self, before: Tensor, look: SemanticLook) -> Tensor:
         """Fuse the detections one after another, and misses in cells without any.
@@ -219,20 +249,18 @@ class Semantic(Observer):
         missed = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(before.dtype))
         return torch.where(empty[..., None], missed, fused)
 
-    def _fuse_one(self, before: Tensor, look: AssociatedLook, visited: Tensor) -> Tensor:
+    def _fuse_one(self, before: Tensor, look: AssociatedLook, weight: Tensor) -> Tensor:
         """Fuse one likelihood for each cell, in which all detections of a look and a miss are alternatives.
 
         Args:
             before: Dirichlet parameters `(B, X·Y, K+1)`.
             look: the look of each episode.
-            visited: cells that were fixated up to this look, `(B, X·Y)` boolean.
+            weight: how well each detection fits each cell, `(B, L, X·Y)`.
 
         Returns:
             New parameters.
         """
         assert self.misses is not None
-        share = self.misses.refutation.clamp(0, 1).to(before)
-        weight = refuted(look.footprint.to(before), look.covered.to(before), visited, share)
         odds = self.misses.miss_odds(look.distance).to(before)
         likelihood = one_of(look.likelihood.to(before), weight, odds)
         return RULES[self.fusion](before, likelihood / likelihood.amax(-1, keepdim=True))
@@ -245,10 +273,20 @@ class Semantic(Observer):
         belief = dirichlet_belief(belief)
         if keep == 1:
             return belief
-        changes = {"visited": visited} if isinstance(belief, AssociatedBelief) else {}
-        beta = self.prior + keep * (belief.beta - self.prior)
-        return replace(belief, beta=beta, closest=belief.closest + farther(keep), **changes)
+        faded = replace(belief, beta=self._faded(belief.beta, keep), closest=belief.closest + farther(keep))
+        if isinstance(faded, AssociatedBelief):
+            return replace(faded, following=self._faded(faded.following, keep), visited=visited)
+        return faded
+
+    def _faded(self, beta: Tensor, keep: float) -> Tensor:
+        """Move Dirichlet parameters towards the prior."""
+        return self.prior + keep * (beta - self.prior)
 
     def extra_repr(self) -> str:
         """Write prior, fusion rule, footprint and tempering."""
         return f"prior={self.prior:g}, fusion={self.fusion}, footprint={self.footprint}, tempering={self.tempering:g}"
+
+
+def _closest(belief: DirichletBelief, look: SemanticLook) -> Tensor:
+    """Compute the distance from each cell to the closest fixation after one more look, `(B, X·Y)`."""
+    return torch.minimum(belief.closest, look.distance)
