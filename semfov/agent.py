@@ -35,7 +35,7 @@ from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazePrediction, Record
 from semfov.paths.gaze import ScanpathLike
-from semfov.presets import published_arguments, raw_arguments, recommended_arguments
+from semfov.presets import learned_chain_arguments, published_arguments, raw_arguments, recommended_arguments
 from semfov.settings import (
     ExploreSettings,
     FindSettings,
@@ -188,6 +188,21 @@ class ActivePerception(nn.Module):
             DataError: the weights cannot be downloaded, or are damaged.
         """
         return cls._of(published_arguments, name, sensor, search, calibrated, **options)
+
+    @classmethod
+    def learned_chain(cls, name: str = "yolox-nano", **options: Any) -> Self:
+        """Make the paper's agent with an observation model that was trained through the belief to find targets.
+
+        It sees through the `gradual` fovea. It knows how likely a miss is, and takes the closest look at each cell.
+
+        Args:
+            name: `yolox-nano`.
+            options: options of `semfov.load_detector`.
+
+        Returns:
+            The agent, in `eval` mode and without gradients.
+        """
+        return cls._of(learned_chain_arguments, name, **options)
 
     @classmethod
     def raw(cls, name: DetectorLike = "yolox-nano", *, sensor: str = "published", **options: Any) -> Self:

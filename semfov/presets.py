@@ -1,7 +1,7 @@
 """Preset agents: eye, observers and policies by the name of a detector or of a folder of models.
 
-Each function returns the arguments of `semfov.ActivePerception`. The class methods `recommended`, `published` and `raw`
-document the parameters.
+Each function returns the arguments of `semfov.ActivePerception`. The class methods `recommended`, `published`,
+`learned_chain` and `raw` document the parameters.
 """
 
 from os import PathLike, fspath
@@ -26,6 +26,9 @@ from semfov.zoom import GlimpseEvidence
 
 PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.published)
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
+
+_THROUGH_BELIEF = "-search"
+"""End of the names of observation models that were fitted through the belief, after that of their detector."""
 
 
 def recommended_arguments(
@@ -94,6 +97,23 @@ def published_arguments(
     observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
     policy = Policy("predictive", model) if search == "predictive" else Policy("non-predictive")
     return {"eye": eye, "search": (observer, policy), "explore": (observer, Policy("kl", model)), "grid": grid}
+
+
+def learned_chain_arguments(name: str, **options: Any) -> dict[str, Any]:
+    """Make the arguments of the agent whose observation model was fitted through the belief, one for both tasks."""
+    detector = load_detector(name, **options)
+    files = sorted(FovealObservationModel.shipped.glob(f"*{_THROUGH_BELIEF}.safetensors"))
+    fitted = lookup(
+        detector.name, [file.stem.removesuffix(_THROUGH_BELIEF) for file in files], "detector with a learned chain"
+    )
+    eye = Eye(named_sensor("gradual"), detector)
+    observer = Semantic.searching(FovealObservationModel.from_pretrained(f"{fitted}{_THROUGH_BELIEF}"))
+    fovea = eye.sensor.width(eye.sensor.settings()) / eye.reference
+    return {
+        "eye": eye,
+        "search": (observer, Policy("non-predictive")),
+        "explore": (observer, Policy("closer-look", fovea=fovea)),
+    }
 
 
 def raw_arguments(name: DetectorLike, sensor: str, **options: Any) -> dict[str, Any]:

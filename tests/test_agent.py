@@ -370,6 +370,7 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
         (ActivePerception.from_pretrained, {"sigmas": 50.0}, r"sigmas: .*; did you mean sigma=\?$"),
         (ActivePerception.published, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
         (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one; known: name, sensor,"),
+        (ActivePerception.learned_chain, {"sigma": 50.0}, r"sigma: .*, got an unknown one; known: name,"),
         (ActivePerception.raw, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
         (ZoomAgent.recommended, {"finst": 0.5}, r"finst: .*; did you mean finest="),
         (

@@ -219,6 +219,30 @@ def test_published_agent_searches_and_explores(sensor):
         semfov.ActivePerception.published(sensor="gradual")
 
 
+def test_the_learned_chain_searches_and_explores_by_one_belief():
+    """Its policy goes by the belief that was fitted; a picture that shows the class holds it, without any head."""
+    agent = semfov.ActivePerception.learned_chain()
+    assert agent.searching.observer is agent.exploring.observer
+    assert agent.searching.observer.observation.metadata["method"] == "search"
+    assert agent.verification is None
+    scenes = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)
+    scene, target = scenes[0], scenes.targets(0)[0]
+    found = agent.search(scene.image, target, boxes=scene.boxes[scene.labels == target], start=0)
+    assert found.found
+    assert found.shifts <= 5
+    explored = agent.explore(scene.image, start=0, shifts=2)
+    assert len(explored) == 3
+    nowhere = torch.zeros(0, 4)  # boxes that no fixation lands on, so that both searches make all looks
+    present = agent.search(scene.image, target, start=0, shifts=4, boxes=nowhere)
+    absent = agent.search(scene.image, "toaster", start=0, shifts=4, boxes=nowhere)
+    assert present.presence[-1] > 10 * absent.presence[-1]
+
+
+def test_the_learned_chain_names_the_detectors_that_it_was_learned_for():
+    with pytest.raises(semfov.InputError, match=r"learned chain 'yolov3-tiny'.*yolox-nano"):
+        semfov.ActivePerception.learned_chain("yolov3-tiny")
+
+
 def test_recommended_agent_searches_and_explores():
     agent = semfov.ActivePerception.from_pretrained()
     scenes = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)

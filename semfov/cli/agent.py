@@ -136,7 +136,8 @@ def make_agent(options: AgentOptions) -> ActivePerception:
 def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePerception:
     """Load the agent that the options name, with options of `load_detector`."""
     if options.models is not None:
-        check(options.agent != "raw", "agent", "recommended or published with --models", options.agent)
+        made_of_a_folder = options.agent in ("recommended", "published")
+        check(made_of_a_folder, "agent", "recommended or published with --models", options.agent)
         moved = loaded if options.detector == AgentOptions.detector else {"detector": options.detector, **loaded}
         load = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
         return load(options.models, **moved)
@@ -146,6 +147,9 @@ def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePercepti
         check(sensor.make is Foveation, "sensor", "a Foveation, since models are shipped for no other sensor", kind)
         shape: dict[str, Any] = {name: sensor.settings[name] for name in ("sigma", "growth")}
         return ActivePerception.recommended(options.detector, **shape, **loaded)
+    if options.agent == "learned-chain":
+        check(options.sensor in (None, "gradual"), "sensor", "gradual with --agent learned-chain", options.sensor)
+        return ActivePerception.learned_chain(options.detector, **loaded)
     make = ActivePerception.published if options.agent == "published" else ActivePerception.raw
     return make(options.detector, sensor=options.sensor or "published", **loaded)
 

@@ -63,14 +63,17 @@ class DetectorOptions(Settings):
     device: str | None = None
 
 
+AgentKind = Literal["recommended", "published", "learned-chain", "raw"]
+
+
 @dataclass(frozen=True)
 class AgentOptions(StartSettings, DetectorOptions):
     """The agent, and where it starts.
 
     Args:
         agent: `recommended` (learned models, if they are shipped for the detector), `published` (the paper's:
-            calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
-            no model: scores as they are).
+            calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration), `learned-chain` (the
+            paper's chain, trained through the belief) or `raw` (any detector, no model: scores as they are).
         detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
         half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.
@@ -78,7 +81,7 @@ class AgentOptions(StartSettings, DetectorOptions):
         quiet: print errors and warnings alone.
     """
 
-    agent: Literal["recommended", "published", "raw"] = "recommended"
+    agent: AgentKind = "recommended"
     models: Path | None = None
     half: bool = False
     sensor: SensorName | None = None

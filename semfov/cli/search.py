@@ -17,7 +17,7 @@ from tqdm import tqdm
 from semfov.agent import ActivePerception
 from semfov.cli.agent import detector_classes, several_classes
 from semfov.cli.jobs import ExploreJob, FindJob, PictureJob, SearchJob, make_again
-from semfov.cli.options import ExploreOptions, FindOptions, PictureOptions, SearchOptions
+from semfov.cli.options import AgentKind, ExploreOptions, FindOptions, PictureOptions, SearchOptions
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import held_outputs
 from semfov.cli.written import PictureFiles
@@ -85,7 +85,7 @@ def run(
     target: str | Sequence[str] | None = None,
     *,
     task: Literal["search", "find", "explore"] = "find",
-    agent: ActivePerception | Literal["recommended", "published", "raw"] = "recommended",
+    agent: ActivePerception | AgentKind = "recommended",
     quiet: bool = True,
     **options: Any,
 ) -> list[dict[str, Any]]:

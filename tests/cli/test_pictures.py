@@ -642,6 +642,7 @@ def test_a_head_looks_at_panoramas_and_flat_pictures(run, tmp_path, agent, monke
     [
         "search --target Boats",
         "find --target dog",
+        "search --target boat --agent learned-chain --shifts 1",
         "search --target boat --agent published --sensor published-narrow --shifts 1 --draw scanpath",
     ],
 )
