@@ -8,10 +8,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
-from semfov.data.scene import Scenes, legal_targets
+from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
 from semfov.fit.samples import Samples
@@ -21,6 +22,7 @@ from semfov.observation.foveal import FovealObservationModel
 _EXPONENT = 0.75  # value from which the exponents are learned
 _MISS = 1e-4  # value from which the odds of a miss are learned
 _REFUTATION = 0.9  # value from which the refutation is learned
+_DEGREE = 2  # of the curves over the levels: few photographs show what each level alone is like
 
 
 @dataclass(frozen=True)
@@ -59,19 +61,37 @@ def searched_looks(
     searches = {}
     for index in samples.scenes.unique().tolist():
         annotation = scenes.annotation(index)
-        grid = Grid(*cells, annotation.size)
-        covered = grid.footprint(annotation.boxes)
-        goals: dict[int, Tensor] = {}
-        for target in legal_targets(annotation, max_target_area):
-            goal = covered[annotation.labels == target].any(0)
-            # A target in every cell is found at once.
-            if goal.any() and not goal.all():
-                goals[target] = goal
-        if goals:
-            looks, fixations = samples.looks_at(index)
-            targets = torch.tensor([*goals])
-            searches[index] = SearchedLooks(looks, fixations, grid, targets, torch.stack([*goals.values()]))
+        search = searches_of(annotation, *samples.looks_at(index), Grid(*cells, annotation.size), max_target_area)
+        if search is not None:
+            searches[index] = search
     return searches
+
+
+def searches_of(
+    annotation: Annotation, looks: Detections, fixations: Tensor, grid: Grid, max_target_area: float | None
+) -> SearchedLooks | None:
+    """Find the classes that may be searched for in a photograph, and their cells.
+
+    Args:
+        annotation: the objects of the photograph.
+        looks: detections of R looks at it.
+        fixations: `(R, 2)`, in pixels.
+        grid: the cells.
+        max_target_area: classes that cover a larger share of the image are not searched for; None: no limit.
+
+    Returns:
+        The looks with these classes; None if there is no class to search for.
+    """
+    covered = grid.footprint(annotation.boxes)
+    goals: dict[int, Tensor] = {}
+    for target in legal_targets(annotation, max_target_area):
+        goal = covered[annotation.labels == target].any(0)
+        # A target in every cell is found at once.
+        if goal.any() and not goal.all():
+            goals[target] = goal
+    if not goals:
+        return None
+    return SearchedLooks(looks, fixations, grid, torch.tensor([*goals]), torch.stack([*goals.values()]))
 
 
 def landing_loss(observer: Semantic, searched: SearchedLooks, order: Tensor) -> Tensor | None:
@@ -155,8 +175,9 @@ def fit_through_belief(
 ) -> FovealObservationModel:
     """Train a model by the loss of searches (`landing_loss`), through the belief that runs in a search.
 
-    Exponents, the prior of objects against background and the odds of a miss are learned for each level, the same for
-    all classes, and one refutation for all levels: 3 N + 1 numbers. α stays as it was fitted.
+    The logarithms of the exponents, of the prior of objects against background and of the odds of a miss change by a
+    parabola over the levels each, the same for all classes. With one refutation for all levels these are 10 numbers. α
+    stays as it was fitted.
 
     Args:
         model: the model to start from, as `fit` or `fit_discriminative` leaves it.
@@ -180,9 +201,8 @@ def fit_through_belief(
         raise DataError("data: expected a photograph with a class to search for, got none; raise max_target_area")
     trained = starting_model(model).eval()
     trained.log_alpha.requires_grad_(False)  # stays as it was fitted to single detections
-    assert trained.log_miss is not None
-    for table in (trained.log_prior, trained.log_miss):
-        table.register_hook(_same_for_all_classes)
+    for name in _CURVED:
+        parametrize.register_parametrization(trained, name, _Curve(getattr(trained, name)))
     observer = Semantic.searching(trained)
     generator = torch.Generator().manual_seed(seed)
 
@@ -196,15 +216,44 @@ def fit_through_belief(
                 losses.append(loss)
         return torch.stack(losses).mean() if losses else None
 
-    parameters = [trained.log_exponents, trained.log_prior, trained.log_miss, trained.refutation]
+    parameters = [parameter for parameter in trained.parameters() if parameter.requires_grad]
     descend(parameters, loss_of, steps, rate, decay=0.0, clip=None, title="fitting through the belief")
+    for name in _CURVED:
+        parametrize.remove_parametrizations(trained, name)
     with torch.no_grad():
         trained.refutation.clamp_(0, 1)  # a share, which the steps do not know
     trained.metadata |= {"method": "search", **metadata}
     return trained.requires_grad_(True)
 
 
-def _same_for_all_classes(gradient: Tensor) -> Tensor:
-    """Sum the gradient `(K+1, N)` of a table over its classes, which move together; background stays."""
-    total = gradient[1:].sum(0).expand_as(gradient)
-    return torch.cat([torch.zeros_like(total[:1]), total[1:]])
+_CURVED = ("log_exponents", "log_prior", "log_miss")
+"""Tables of an observation model that change by a curve over its levels."""
+
+
+class _Curve(nn.Module):
+    """A table of a model plus a curve over its levels, the same for all classes; background stays.
+
+    Args:
+        table: the table to start from, `(N,)` or `(K+1, N)`.
+    """
+
+    start: Tensor
+    powers: Tensor
+
+    def __init__(self, table: Tensor) -> None:
+        super().__init__()
+        levels = torch.linspace(-1, 1, table.shape[-1]).to(table)
+        powers = torch.stack([levels**power for power in range(_DEGREE + 1)])
+        self.register_buffer("start", table.detach().clone())
+        self.register_buffer("powers", powers)
+
+    def forward(self, coefficients: Tensor) -> Tensor:
+        """Compute the table from the coefficients `(D+1,)` of the curve."""
+        curve = coefficients @ self.powers
+        if self.start.ndim == 1:
+            return self.start + curve
+        return torch.cat([self.start[:1], self.start[1:] + curve])
+
+    def right_inverse(self, table: Tensor) -> Tensor:
+        """Return the coefficients from which the fit starts: those of no change."""
+        return table.new_zeros(len(self.powers))

@@ -1,0 +1,187 @@
+"""The paper's chain step by step: `python -m eval.chain` compares it as shipped, set by hand, and learned in folds.
+
+    python -m eval.chain --data.root DIR --data.annotations instances.json --out runs/chain
+
+The detector looks at every photograph from every cell; `eval.search` shares these looks under the same `--cache`. The
+photographs are dealt into folds. An observation model is fitted through the belief of searches in the other folds
+(`semfov.fit.through_belief`), and searches those of its own. The table has the targets found after some gaze shifts,
+and the difference to the learned target evidence, photograph by photograph. The model that is fitted on all photographs
+is saved in `out`. If the command is stopped, repeat it to continue.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from eval.comparison.summary import announce, by_scene, collect_records, write_summary
+from eval.search.report import found
+from eval.search.run import SearchConfig, SearchRun
+from semfov.errors import InputError
+from semfov.fit.looking import Looking
+from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
+from semfov.io.files import write_text
+from semfov.metrics.episodes import FloatArray, standard_error
+from semfov.observation.foveal import FovealObservationModel
+from semfov.runs.command import command
+from semfov.runs.config import PolicyConfig, RunConfig
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import finish
+from semfov.runs.settings import Count, Range
+from semfov.runs.setup import make_observation
+from semfov.runs.tables import plus_minus, table
+
+_STEPS: dict[str, str | PolicyConfig] = {
+    "as shipped": "non-predictive-calibrated",
+    "set by hand": PolicyConfig(
+        "non-predictive", tempering=0.25, footprint="box_centre", memory="closest", misses=True
+    ),
+    "learned": "non-predictive-fitted",
+    "target evidence": "target-evidence",
+}
+"""Policies by their names in the table."""
+
+_HEAD = "target evidence"
+_SHIFTS = (1, 5, 10, 15, 30)
+
+
+@dataclass(frozen=True)
+class ChainConfig(RunConfig):
+    """Search photographs by the paper's chain: as shipped, set by hand, and learned in folds.
+
+    Args:
+        folds: number of groups into which the photographs are dealt.
+        steps: number of steps of each fit.
+        looks: most looks in a search of the fits.
+        out: folder for the table, the records and the model that is fitted on all photographs.
+    """
+
+    unused = ("policies",)
+    folds: Annotated[int, Range(2, 1000)] = 2
+    steps: Count = 150
+    looks: Count = 10
+    out: Path = Path("runs/chain")
+
+
+class _Folds:
+    """Photographs in folds, the searches that they allow, and a model to fit through them.
+
+    Attributes:
+        config: the settings.
+        ids: id of each photograph.
+        searches: the searches in each photograph; None for one without.
+        start: the observation model that the fits start from.
+    """
+
+    def __init__(self, config: ChainConfig) -> None:
+        self.config = config
+        run = Looking(config)
+        if len(run.scenes) < 2 * config.folds:
+            raise InputError(f"data: expected at least 2 photographs in each fold, got {len(run.scenes)} in all")
+        finish(run, "looking")
+        self.ids = [*run.scenes.ids]
+        self.searches: list[SearchedLooks | None] = []
+        for index in range(len(run.scenes)):
+            grid = run.grid(index)
+            found_there = searches_of(
+                run.scenes.annotation(index),
+                run.detections(index),
+                grid.centres,
+                grid,
+                config.data.max_target_area,
+            )
+            self.searches.append(found_there)
+        self.start = make_observation(config.belief.model, run.eye)
+
+    def fit(self, left_out: int | None) -> FovealObservationModel:
+        """Fit a model to the photographs of all folds but one; None leaves none out."""
+        config = self.config
+        chosen = [
+            search
+            for number, search in enumerate(self.searches)
+            if search is not None and number % config.folds != left_out
+        ]
+        record = {"looks": config.looks, "steps": config.steps, "photographs": len(chosen)}
+        return fit_through_belief(self.start, chosen, looks=config.looks, steps=config.steps, search=record)
+
+    def search(self, fold: int, model: Path) -> list[ResultRecord]:
+        """Search the photographs of a fold by all policies; the learned chain has the model of a file."""
+        config = self.config
+        ids = config.out / f"fold-{fold}.txt"
+        write_text(ids, "".join(f"{name}\n" for name in self.ids[fold :: config.folds]))
+        common = {name: getattr(config, name) for name in _COMMON}
+        run = SearchRun(
+            SearchConfig(
+                **common,
+                data=replace(config.data, ids=ids, limit=None),
+                belief=replace(config.belief, search_model=str(model)),
+                policies=tuple(_STEPS.values()),
+                out=config.out / f"fold-{fold}",
+            )
+        )
+        finish(run, "searching")
+        names = dict(zip(run.policies, _STEPS, strict=True))
+        records, _ = collect_records(run)
+        return [{**record, "policy": names[record["policy"]], "fold": fold} for record in records]
+
+
+_COMMON = ("detector", "cache", "workers", "scheduler", "sensor", "store", "protocol")
+"""Settings that the searches of all folds share."""
+
+
+def chain_summary(records: Sequence[ResultRecord], shifts: int) -> str:
+    """Write the table, as Markdown: the targets found by each policy, and the differences to the target evidence."""
+    at = [number for number in _SHIFTS if number <= shifts]
+    curves = {name: _by_photograph(records, name, shifts) for name in _STEPS}
+    rows = [["policy", *(f"CP@{number}" for number in at)]]
+    for name, curve in curves.items():
+        rows.append([name, *_cells(curve, at)])
+    for name, curve in curves.items():
+        if name != _HEAD:
+            rows.append([f"{name} - {_HEAD}", *_cells(curve - curves[_HEAD], at, sign="+")])
+    photographs, searches = len(curves[_HEAD]), sum(record["policy"] == _HEAD for record in records)
+    return "\n".join(
+        [
+            f"Targets found within n gaze shifts (%), ± standard error over {photographs} photographs; {searches} "
+            "searches by each policy. *learned*: by the model that was fitted on the other folds. *target evidence*: "
+            "the model that is shipped, which may have been fitted on these photographs.",
+            "",
+            *table(rows),
+            "",
+        ]
+    )
+
+
+def _by_photograph(records: Sequence[ResultRecord], policy: str, shifts: int) -> FloatArray:
+    """Compute the share of targets found after 0, 1, … shifts in each photograph, `(photographs, shifts + 1)`."""
+    pairs = ((record["scene"], found(record, shifts)) for record in records if record["policy"] == policy)
+    return np.stack([*by_scene(pairs).values()])
+
+
+def _cells(curve: FloatArray, at: Sequence[int], sign: str = "") -> list[str]:
+    """Write the means after some shifts in percent, with their standard errors over the photographs."""
+    mean = 100 * curve.mean(0)
+    error = 100 * standard_error(curve)
+    return [plus_minus(float(mean[number]), float(error[number]), sign=sign) for number in at]
+
+
+def compare_chains(config: ChainConfig) -> None:
+    """Fit and search in folds, and write the table, the records and the model that is fitted on all photographs."""
+    folds = _Folds(config)
+    records: list[ResultRecord] = []
+    for fold in range(config.folds):
+        model = config.out / f"fold-{fold}.safetensors"
+        folds.fit(fold).save(model)
+        records += folds.search(fold, model)
+    folds.fit(None).save(config.out / "search.safetensors")
+    text = chain_summary(records, config.protocol.shifts)
+    announce(text, write_summary(config.out, "chain", text, records))
+
+
+main = command(compare_chains, ChainConfig, __doc__)
+
+if __name__ == "__main__":
+    sys.exit(main())
