@@ -1,5 +1,6 @@
 """One of the detections shows the object of a cell: hypotheses enumerated, loops over cells, gradients, training."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -236,6 +237,26 @@ def test_training_through_three_looks_makes_searches_better():
     after = float(landing(observer, others).detach())
     assert all(not torch.equal(new, old) for new, old in zip(chosen, kept, strict=True))
     assert after < before - 0.1
+
+
+def test_the_fit_through_the_belief_changes_tables_by_parabolas():
+    generator = torch.Generator().manual_seed(14)
+    searches = [draw_search(generator) for _ in range(4)]
+    start = FovealObservationModel.identity(CLASSES, [0.1, 0.2, 0.3, 0.4, 0.5])
+    fitted = fit_through_belief(start, searches, looks=3, steps=4, batch=2)
+    assert torch.equal(fitted.log_alpha, start.log_alpha)
+    for name, from_value in (("log_exponents", math.log(0.75)), ("log_prior", 0.0), ("log_miss", math.log(1e-4))):
+        table = getattr(fitted, name).detach().double()
+        curves = table[None] if table.ndim == 1 else table[1:]
+        assert float((curves - from_value).abs().max()) > 0.01
+        # Third differences of a parabola are 0.
+        torch.testing.assert_close(curves.diff(n=3), torch.zeros(len(curves), 3).double(), rtol=0, atol=1e-5)
+        if table.ndim == 2:
+            assert not table[0].any()
+    assert type(fitted) is FovealObservationModel
+    assert {name for name, _ in fitted.named_parameters()} == {name for name, _ in start.named_parameters()} | {
+        "log_miss"
+    }
 
 
 def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_from():

@@ -65,7 +65,8 @@ def write_material(folder: Path) -> None:
         TargetEvidence(4, 4, components=4, thresholds=thresholds, metadata=settings).save(folder / "target.safetensors")
         MapEvidence(4, 4, components=4, metadata=settings).save(folder / "map.safetensors")
         GlimpseEvidence(3, 8).save(folder / "zoom.safetensors")
-        model = FovealObservationModel(0.5 + torch.rand(4, 3, 4), [0.2, 0.5], CLASSES, metadata=settings)
+        alpha, rates = 0.5 + torch.rand(4, 3, 4), torch.full((4, 3), 0.3)
+        model = FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=rates, metadata=settings)
         model.save(folder / "observation.safetensors")
     (folder / "people").mkdir()
     draw, viewed, record = np.random.default_rng(0), [], {}
@@ -125,6 +126,15 @@ COMMANDS = {
             (("--data.max_target_area", "1e-9", "--data.limit", "1", "--belief.columns", "2", "--belief.rows", "2"),
              "raise data.max_target_area"),
         ),
+    ),
+    "eval.chain": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--belief.model", "HERE/observation.safetensors",
+                  "--belief.target_model", "HERE/target.safetensors", "--protocol.starts", "1",
+                  "--protocol.shifts", "3", "--steps", "2", "--looks", "2"),
+        files=("records.jsonl", "chain.md"),
+        others=("search.safetensors", "fold-0.safetensors"),
+        parts="out/fold-*/parts/*.sqlite",
+        refused=((("--folds", "1"), "folds: expected a whole number from 2"),),
     ),
     "eval.prior": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--commonest", "2", "--drawn", "1", "--max_target_area", "0.5",
