@@ -1,0 +1,34 @@
+"""The table of the chain step by step: means over photographs, and differences photograph by photograph."""
+
+from eval.chain import chain_summary
+
+POLICIES = ("as shipped", "set by hand", "learned", "target evidence")
+
+
+def record(policy, scene, found_at):
+    return {"policy": policy, "scene": scene, "found_at": found_at}
+
+
+def test_the_table_has_means_over_photographs_and_paired_differences():
+    # Two searches in the first photograph, one in the second.
+    found_at = {
+        "as shipped": {7: [-1, -1], 8: [4]},
+        "set by hand": {7: [1, 6], 8: [3]},
+        "learned": {7: [1, 2], 8: [6]},
+        "target evidence": {7: [1, 7], 8: [1]},
+    }
+    records = [
+        record(policy, scene, shift)
+        for policy, scenes in found_at.items()
+        for scene, shifts in scenes.items()
+        for shift in shifts
+    ]
+    lines = [line.strip("| ").split(" | ") for line in chain_summary(records, 7).splitlines() if line.startswith("|")]
+    rows = {row[0].strip(): [cell.strip() for cell in row[1:]] for row in lines[2:]}
+    assert [cell.strip() for cell in lines[0]] == ["policy", "CP@1", "CP@5"]
+    assert list(rows) == [*POLICIES, *(f"{policy} - target evidence" for policy in POLICIES[:3])]
+    # The standard error of two values is half their difference.
+    assert rows["learned"] == ["25.0 ± 25.0", "50.0 ± 50.0"]
+    assert rows["target evidence"] == ["75.0 ± 25.0", "75.0 ± 25.0"]
+    assert rows["learned - target evidence"] == ["-50.0 ± 50.0", "-25.0 ± 75.0"]
+    assert rows["as shipped - target evidence"] == ["-75.0 ± 25.0", "-25.0 ± 25.0"]
