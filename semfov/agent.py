@@ -196,7 +196,7 @@ class ActivePerception(nn.Module):
         It sees through the `gradual` fovea. It knows how likely a miss is, and takes the closest look at each cell.
 
         Args:
-            name: `yolox-nano`.
+            name: `yolox-nano`, or `nanodet-plus-m-1.5x` (with `weights=`).
             options: options of `semfov.load_detector`.
 
         Returns:

@@ -144,7 +144,7 @@ def test_shipped_models_of_glimpse_evidence(path):
     torch.testing.assert_close(taper, taper.flip(0))
 
 
-SEARCHING = {"yolox-nano-search"}
+SEARCHING = {"yolox-nano-search", "nanodet-plus-m-1.5x-search"}
 DETECTORS = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
 
 
@@ -172,7 +172,7 @@ def test_models_fitted_through_the_belief_go_on_from_the_others(name):
     assert bool((odds[1, 1:] > odds[0, 1:]).all())
     assert float(model.refutation.detach()) > 0.5
     assert model.metadata["method"] == "search"
-    assert model.metadata["search"]["photographs"] > 50
+    assert model.metadata["search"]["photographs"] > 40
 
 
 @pytest.mark.parametrize("growth", [1.0, 2.0])
@@ -239,7 +239,7 @@ def test_the_learned_chain_searches_and_explores_by_one_belief():
 
 
 def test_the_learned_chain_names_the_detectors_that_it_was_learned_for():
-    with pytest.raises(semfov.InputError, match=r"learned chain 'yolov3-tiny'.*yolox-nano"):
+    with pytest.raises(semfov.InputError, match=r"learned chain 'yolov3-tiny'; did you mean 'yolox-nano'"):
         semfov.ActivePerception.learned_chain("yolov3-tiny")
 
 
