@@ -60,5 +60,6 @@ def test_agents_are_those_of_the_package(kind):
 
 def test_the_recommended_agent_is_the_default():
     assert type(load("agent").searching.observer) is observers.Target
-    with pytest.raises(semfov.InputError, match="kind: expected recommended, published, raw, got 'best'"):
+    kinds = "recommended, published, learned_chain, raw"
+    with pytest.raises(semfov.InputError, match=f"kind: expected {kinds}, got 'best'"):
         load("agent", kind="best")

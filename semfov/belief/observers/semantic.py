@@ -211,9 +211,9 @@ class Semantic(Observer):
         visited = old.visited.scatter(1, look.fixated[:, None], True)
         weight = look.footprint.to(old.beta)
         share = self.misses.refutation.clamp(0, 1).to(old.beta)
-        unrefuted = refuted(weight, look.covered.to(old.beta), visited, share)
+        remaining = refuted(weight, look.covered.to(old.beta), visited, share)
         present = self._fuse_one(self._before(old.beta), look, weight)
-        following = self._fuse_one(self._before(old.following), look, unrefuted)
+        following = self._fuse_one(self._before(old.following), look, remaining)
         return replace(
             old,
             beta=self._kept(old, old.beta, present, look),
