@@ -28,6 +28,7 @@ MODULES = (
     "semfov.report",
     "semfov.zoom",
     "semfov.motion",
+    "semfov.tracking",
     "semfov.head",
     "semfov.agents",
     "semfov.envs",

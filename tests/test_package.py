@@ -21,7 +21,7 @@ ROOT = PACKAGE.parent
 SUBPACKAGES = [
     "version", "words", "errors", "threads", "io", "data", "kinds", "settings", "motion", "sensor", "detection",
     "observation", "dirichlet", "belief", "observers", "gaze", "acquisition", "policies", "saliency", "eye",
-    "episode", "decision", "zoom", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
+    "episode", "decision", "zoom", "tracking", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
     "agent", "metrics", "viz", "report", "runs", "cli", "__main__", "baselines", "human", "fit", "envs",
 ]  # fmt: skip
 # Others' models for comparison, what is known of people, the fits with their stored looks and protocols, and the

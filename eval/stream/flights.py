@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from eval.stream.pasted import PastedObjects
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.errors import check, check_data, needing
@@ -16,25 +17,44 @@ from semfov.io.files import read_text
 from semfov.motion import Motion
 from semfov.zoom.carrying import inside_frame
 
-CourseName = Literal["still", "slow", "usual", "fast", "turning", "shaking"]
+CourseName = Literal["still", "slow", "usual", "fast", "turning", "shaking", "moving", "moving-slow"]
 
 
 class Frame(NamedTuple):
-    """A frame `(h, w, 3)` of bytes, its objects, and the map from the scene to it, where that is known."""
+    """A frame of a stream.
+
+    Attributes:
+        pixels: `(h, w, 3)` bytes.
+        annotation: its objects.
+        pose: the map from the scene to it; None where that is not known.
+        identities: `(N,)`, numbers of the objects that stay from frame to frame; None where they are not known.
+        moving: `(N,)` boolean, the objects that move on their own; None where that is not known.
+    """
 
     pixels: NDArray[np.uint8]
     annotation: Annotation
     pose: Motion | None = None
+    identities: torch.Tensor | None = None
+    moving: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
 class Course:
-    """How a camera moves: pixels, degrees and share of the scale a frame, and the deviation of its shake in pixels."""
+    """How a camera moves, and what moves before it.
+
+    Attributes:
+        speed: pixels a frame.
+        turn: degrees a frame.
+        zoom: share of the scale a frame.
+        shake: standard deviation of the shake in pixels.
+        pasted: number of objects that are pasted into the picture and move on their own.
+    """
 
     speed: float = 0.0
     turn: float = 0.0
     zoom: float = 0.0
     shake: float = 0.0
+    pasted: int = 0
 
 
 COURSES: dict[CourseName, Course] = {
@@ -44,6 +64,8 @@ COURSES: dict[CourseName, Course] = {
     "fast": Course(speed=30),
     "turning": Course(speed=12, turn=0.4, zoom=0.004),
     "shaking": Course(speed=4, shake=3),
+    "moving": Course(pasted=24),
+    "moving-slow": Course(speed=4, pasted=24),
 }
 
 
@@ -79,13 +101,17 @@ def flight(scene: Scene, course: Course, frame: tuple[int, int], count: int, see
     with needing("OpenCV", "flights over pictures", "opencv-python-headless"):
         import cv2
     pixels = _as_bytes(scene)
+    pasted = PastedObjects(scene, pixels, course.pasted, seed)
+    labels = torch.cat([scene.labels, pasted.labels])
+    moves = torch.arange(len(labels)) >= len(scene.labels)
     for pose in poses(course, scene.size, frame, count, seed):
-        seen = cv2.warpAffine(pixels, pose.matrix[:2], frame, flags=cv2.INTER_LINEAR)
-        boxes = pose.boxes(scene.boxes.double())
+        pasted.step()
+        seen = cv2.warpAffine(pasted.picture(), pose.matrix[:2], frame, flags=cv2.INTER_LINEAR)
+        boxes = pose.boxes(torch.cat([scene.boxes.double(), pasted.boxes()]))
         there = inside_frame(boxes, frame)
         cut = within(boxes[there].float(), frame)
-        crowd = torch.zeros(len(cut), dtype=torch.bool)
-        yield Frame(np.asarray(seen, np.uint8), Annotation(cut, scene.labels[there], crowd, frame), pose)
+        annotation = Annotation(cut, labels[there], torch.zeros(len(cut), dtype=torch.bool), frame)
+        yield Frame(np.asarray(seen, np.uint8), annotation, pose, there.nonzero()[:, 0], moves[there])
 
 
 def film(scenes: Scenes) -> Iterator[Frame]:

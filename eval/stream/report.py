@@ -7,6 +7,7 @@ from torch import Tensor
 
 from eval.bootstrap import Bootstrap
 from eval.comparison.summary import announce, write_summary
+from eval.stream.identity import IdentityCounts
 from eval.stream.run import FILM, StreamConfig, StreamOutcome, StreamRun
 from eval.zoom.objects import average_precision
 from semfov.errors import check_data
@@ -64,6 +65,24 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         "Precision / recall of the objects that are listed, from 0.5 on.",
         "",
         *table(listed),
+        "",
+        *identity_table(outcomes),
+    ]
+
+
+def identity_table(outcomes: Sequence[StreamOutcome]) -> list[str]:
+    """Table of how well numbers stay with their objects, of the ways that tell numbers; empty without any."""
+    rows = [["", "IDF1", "found, of all boxes", "found, of objects that move"]]
+    for way in outcomes[0].identities:
+        counts = sum((outcome.identities[way] for outcome in outcomes), IdentityCounts(0, 0, 0))
+        moving = f"{counts.found / counts.moving:.2f}" if counts.moving else "-"
+        rows.append([way, f"{counts.score:.3f}", f"{counts.found_all / max(counts.there, 1):.2f}", moving])
+    if len(rows) == 1:
+        return []
+    return [
+        "IDF1 of the objects that are listed, and the share of boxes that are found, in all frames.",
+        "",
+        *table(rows),
         "",
     ]
 

@@ -12,8 +12,9 @@ import torch
 
 from eval.stream.drift import Drift
 from eval.stream.flights import COURSES, CourseName, Frame, film, flight, mot_film, within
+from eval.stream.identity import Identities, IdentityCounts
 from eval.stream.plain import PlainRule
-from eval.stream.ways import AllSlices, Live, RoundRobin, Way, WholeFrame
+from eval.stream.ways import AllSlices, Live, RoundRobin, TrackedSlices, Way, WholeFrame
 from semfov.agents.window_episode import LIKELY
 from semfov.agents.windows import ZoomAgent
 from semfov.data.classes import class_index
@@ -31,7 +32,7 @@ from semfov.settings import StreamSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 
-WayName = Literal["whole", "slices", "in-turn", "in-turn-carried", "plain", "live", "live-known"]
+WayName = Literal["whole", "slices", "bytetrack", "in-turn", "in-turn-carried", "plain", "live", "live-known"]
 _Length = Annotated[int, Range(64, 16_384)]
 FILM = "film"
 """The course of a film in tables."""
@@ -48,7 +49,8 @@ class StreamConfig(Settings):
         target: class whose objects are to be found.
         ways: ways of looking.
         courses: courses of the camera: `still`, `slow` (4 px a frame), `usual` (12 px), `fast` (30 px), `turning` (12
-            px, .4 degrees and .4 % of the scale), `shaking` (4 px, and a standard deviation of 3 px).
+            px, .4 degrees and .4 % of the scale), `shaking` (4 px, and a standard deviation of 3 px). In `moving`
+            (camera still) and `moving-slow` (4 px) 24 pasted objects move on their own, by 3 to 10 px a frame.
         successive: the pictures are the frames of one film, in the order of their ids.
         film: folder of a film in the form of MOTChallenge, in place of pictures.
         width: width of the frames of a flight in pixels.
@@ -87,12 +89,16 @@ class Cost(NamedTuple):
 
 
 class StreamOutcome(NamedTuple):
-    """What each way of looking knows at the judged frames of a stream, what it takes, and the drift of the motion."""
+    """What each way of looking knows at the judged frames of a stream, what it takes, and the drift of the motion.
+
+    `identities` has the ways that tell numbers of objects, in all frames after `StreamConfig.after`.
+    """
 
     course: str
     records: list[ResultRecord]
     costs: Mapping[str, Cost]
     drift: Drift
+    identities: Mapping[str, IdentityCounts]
 
 
 class StreamRun:
@@ -137,6 +143,7 @@ class StreamRun:
         makers: dict[WayName, Callable[[], Way]] = {
             "whole": lambda: WholeFrame(eye, target),
             "slices": lambda: AllSlices(eye, target),
+            "bytetrack": lambda: TrackedSlices(eye, target),
             "in-turn": lambda: RoundRobin(eye, target, carries=False),
             "in-turn-carried": lambda: RoundRobin(eye, target, carries=True),
             "plain": lambda: PlainRule(eye, target),
@@ -153,6 +160,7 @@ class StreamRun:
         steps = Counter[str]()
         passes: dict[str, int] = {}
         records: list[ResultRecord] = []
+        identities: dict[str, Identities] = {}
         for number, frame in enumerate(frames, 1):
             drift.step(frame)
             judged = number % self.config.every == 0
@@ -161,6 +169,8 @@ class StreamRun:
                 known = way.step(frame)
                 took = process_time() - began
                 for row, objects in known.items():
+                    if number > self.config.after and objects.track_ids is not None and frame.identities is not None:
+                        compare_identities(identities.setdefault(row, Identities()), objects, frame, self.target)
                     seconds[row] += took
                     steps[row] += 1
                     passes[row] = way.passes
@@ -168,7 +178,19 @@ class StreamRun:
                         where = {"course": course, "stream": name, "frame": number, "way": row}
                         records.append({**where, **judged_objects(objects, frame, self.target)})
         costs = {row: Cost(passes[row], 1000 * seconds[row] / steps[row]) for row in passes}
-        return StreamOutcome(course, records, costs, drift)
+        counts = {row: each.counts() for row, each in identities.items()}
+        return StreamOutcome(course, records, costs, drift, counts)
+
+
+def compare_identities(identities: Identities, objects: Objects, frame: Frame, target: int) -> None:
+    """Compare the numbers of objects with those of the annotated ones of a class."""
+    assert frame.identities is not None
+    assert objects.track_ids is not None
+    annotation = frame.annotation
+    mine = annotation.labels == target
+    moving = None if frame.moving is None else frame.moving[mine]
+    boxes = within(objects.boxes, annotation.size)
+    identities.step(frame.identities[mine], annotation.boxes[mine], objects.track_ids, boxes, moving)
 
 
 def judged_objects(objects: Objects, frame: Frame, target: int) -> ResultRecord:

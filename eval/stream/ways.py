@@ -2,8 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import cycle
 
+from eval.stream.bytetrack import ByteTrack
 from eval.stream.flights import Frame
 from eval.zoom.objects import suppressed
 from semfov.agents.window_episode import WindowStream
@@ -64,6 +66,20 @@ class AllSlices(Way):
         return {f"whole frame and {self.passes - 1} slices": suppressed(looks, self.target).objects}
 
 
+class TrackedSlices(AllSlices):
+    """The whole frame and slices of it, whose detections ByteTrack joins to tracks."""
+
+    remembers = True
+
+    def __init__(self, eye: WindowEye, target: int) -> None:
+        super().__init__(eye, target)
+        self.tracker = ByteTrack()
+
+    def step(self, frame: Frame) -> Mapping[str, Objects]:
+        (objects,) = super().step(frame).values()
+        return {f"{self.passes - 1} slices and ByteTrack": self.tracker.step(objects)}
+
+
 class RoundRobin(Way):
     """The whole frame and slices of it in turn, one a frame; looks of the last round count, carried along or not."""
 
@@ -102,7 +118,9 @@ class Live(Way):
     def step(self, frame: Frame) -> Mapping[str, Objects]:
         moment = self.episode.step(frame.pixels, pose=frame.pose if self.poses else None)
         known = ", pose known" if self.poses else ""
-        return {LIVE + known: moment.objects, CANDIDATES + known: moment.candidates}
+        # All candidates are too many for numbers to be told of them.
+        candidates = replace(moment.candidates, track_ids=None)
+        return {LIVE + known: moment.objects, CANDIDATES + known: candidates}
 
 
 def whole_and_slices(lattice: Lattice) -> list[Window]:

@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, no_frame_yet
-from semfov.agents.window_objects import MergedLooks
+from semfov.agents.window_objects import MergedLooks, seen_by
 from semfov.belief.prior import Prior
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp, Decision
-from semfov.detection import LEAST, Detections
+from semfov.detection import LEAST, Detections, Objects
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check
 from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
@@ -32,8 +32,11 @@ from semfov.paths import Ending, WindowMoment, ZoomPath
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import LookAtWindow, look_at_window
 from semfov.settings import DecisionSettings
+from semfov.tracking import Tracker, Tracks
+from semfov.tracking.gain import value_of_windows
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells
+from semfov.zoom.carrying import inside_frame
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import USUAL_WINDOW, closer_window, look_closely
 from semfov.zoom.decision import DecisionsByScore, WindowDecisions, decisions_of
@@ -43,6 +46,7 @@ from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLooks
 from semfov.zoom.slices import ranked, usual_slices
+from semfov.zoom.window_sums import Cells
 
 PASSES = 24  # default for the largest number of passes of the detector
 LIKELY = 0.5  # default for the least probability of the objects that a record counts
@@ -123,6 +127,7 @@ class WindowSession:
         photograph = None if evidence is None else evidence.photograph
         self._close_window = USUAL_WINDOW if photograph is None else photograph.window
         self._certainty = None if evidence is None else evidence.certainty_in(source.lattice)
+        self.tracker = None if self._stands_still or evidence is None else Tracker()
         self._closer_looks: list[KeptLook] = []  # those that count
         self._steps = self._chosen_steps() if steps is None else steps
 
@@ -153,7 +158,20 @@ class WindowSession:
             self.decisions = decisions_of(belief, self._close_up, task.decisions, self.forgetting)
             return search_windows(source, belief, forgetting=self.forgetting)
         worth = NEW_OBJECTS if task.worth is None else task.worth
-        return find_everything(source, evidence, goal.target, batch=task.batch, worth=worth, forgetting=self.forgetting)
+        return find_everything(
+            source,
+            evidence,
+            goal.target,
+            batch=task.batch,
+            worth=worth,
+            forgetting=self.forgetting,
+            known=None if self.tracker is None else self._value_of_known,
+        )
+
+    def _value_of_known(self, level: int) -> Cells:
+        """Value windows of a level by the objects that are known, and may have moved."""
+        assert self.tracker is not None
+        return value_of_windows(self.tracker.tracks, self.tracker.model, self.source.lattice, level)
 
     def look(self) -> KeptLook | None:
         """Look at the next window, or closely at a place that seems to hold the target; None if no window is left."""
@@ -186,6 +204,8 @@ class WindowSession:
         look.seconds = self.limits.elapsed()
         self.newest = look
         self.passes += 1
+        if self.tracker is not None:
+            self.tracker.see(seen_by(look, self.source.lattice, self.task.goal.sought))
 
     def follow(self, motion: Motion | None) -> None:
         """Carry closer looks along with the camera, or drop them where a frame fits none before."""
@@ -232,13 +252,26 @@ class WindowSession:
             "assumed": self.decisions.prior.assumed,
             "targets": task.goal.targets,
             "looks": tuple(looks),
-            "candidates": merged.objects,
+            "candidates": merged.objects
+            if self.tracker is None
+            else partial(self._tracked, self.tracker.tracks, places),
             "unseen": merged.unseen,
             "spread": SPREAD if self._certainty is None else self._certainty.spread,
             "least": self._least,
             "detector": task.detector,
             "closer": _renumbered(self.decisions.looks, places),
         }
+
+    def _tracked(self, tracks: Tracks, places: Mapping[int, int]) -> Objects:
+        """List the tracked objects in the frame, each with the place of its look in the record; -1 for none there."""
+        objects = tracks.objects()
+        passes = torch.tensor([places.get(number, -1) for number in objects.passes.tolist()], dtype=torch.long)
+        return replace(objects, passes=passes)[inside_frame(objects.boxes, self.source.lattice.size)]
+
+    @property
+    def tracks(self) -> Tracks:
+        """The objects that are tracked; none in a picture, and without evidence."""
+        return Tracks.none() if self.tracker is None else self.tracker.tracks
 
     @property
     def _least(self) -> float:
@@ -459,6 +492,8 @@ class WindowStream(StreamEpisode[WindowMoment]):
         assert isinstance(session.source, LiveWindowLooks)
         camera = self._camera.step(view, pose)
         session.follows = self._camera.is_followed
+        if session.newest is not None and session.tracker is not None:
+            session.tracker.follow(passed, camera)
         if camera is None or session.newest is None:
             session.source.show(view, passed)
             return
@@ -480,6 +515,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
             photograph=reduced_copy(view.picture),
             number=self.passes - 1,
             lost=self._is_lost,
+            tracks=session.tracks,
             next_window=session.next_window,
         )
 

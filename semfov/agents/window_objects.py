@@ -9,11 +9,14 @@ import torch
 from torch import Tensor
 
 from semfov.detection import Objects
+from semfov.detection.objects import FAINTEST
+from semfov.tracking import Seen
 from semfov.zoom.carrying import inside_frame
 from semfov.zoom.certainty import Certainty
+from semfov.zoom.episode import KeptLook
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import WindowLook
-from semfov.zoom.objects import merge, probable_objects
+from semfov.zoom.objects import detected_boxes, merge, probable_objects
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,31 @@ class MergedLooks:
             promised=self.promised,
             latest=self.fades,
         )
+
+
+def seen_by(look: KeptLook, lattice: Lattice, sought: Sequence[int]) -> Seen:
+    """Take what a look shows of objects of some classes, for a tracker.
+
+    Args:
+        look: the look, as it was taken at the present frame.
+        lattice: lattice of the frame.
+        sought: classes 1..K; none stands for all.
+
+    Returns:
+        The boxes, each with its best class.
+    """
+    detected = detected_boxes([look.original], sought, shares=False)
+    detected = detected.of(detected.scores >= FAINTEST)
+    window = look.original.window
+    return Seen(
+        boxes=detected.boxes.double().numpy(),
+        scores=detected.scores.double().numpy(),
+        labels=detected.labels.numpy(),
+        cut=detected.cut.numpy(),
+        region=window.region(lattice),
+        magnification=window.fixation[2],
+        number=look.number,
+    )
 
 
 def without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[WindowLook]:

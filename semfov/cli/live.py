@@ -14,8 +14,9 @@ from semfov.cli.results import held_outputs
 from semfov.data.classes import class_index
 from semfov.data.sources import Picture, Stream, open_stream
 from semfov.errors import InputError, check
+from semfov.io.files import check_writable, write_text
 from semfov.live import LivePerception
-from semfov.paths import Moment
+from semfov.paths import Moment, WindowMoment
 from semfov.paths.look import detections_in_words
 from semfov.settings import StreamSettings
 from semfov.viz.live import VIDEO_CODECS, draw_moment, video, video_suffix
@@ -42,8 +43,12 @@ def look_live(options: LiveOptions) -> int:
     out = options.out
     is_video = out is None or out.is_dir() or out.suffix.lower() in ("", *VIDEO_CODECS)
     check(is_video, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", out)
+    tracks = options.tracks
+    check(tracks is None or tracks.suffix.lower() == ".txt", "tracks", "a file that ends in .txt", tracks)
     # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
     _sought(options, detector_classes(options))
+    if tracks is not None:
+        check_writable(tracks)
     stream = open_stream(source, options.frames, white_of(options.white))
     agent = make_agent(options)
     settings = {setting.name: getattr(options, setting.name) for setting in fields(StreamSettings)}
@@ -52,9 +57,10 @@ def look_live(options: LiveOptions) -> int:
     if out is not None and (out.is_dir() or not out.suffix):
         path = out / f"live{video_suffix()}"
     with held_outputs(options):
-        _watch(live, stream, path)
-    if path is not None:
-        print(f"written:\n  {path}")
+        _watch(live, stream, path, tracks)
+    written = [str(file) for file in (path, tracks) if file is not None]
+    if written:
+        print("\n  ".join(["written:", *written]))
     return int("skipped" in stream.gaps)
 
 
@@ -84,9 +90,10 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
         raise InputError(f"{error}; {remedy}") from None
 
 
-def _watch(live: LivePerception, stream: Stream, path: Path | None) -> None:
-    """Look at every frame until Ctrl-C, print detections and belief, and write the video, if there is a path."""
+def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path | None) -> None:
+    """Look at every frame until Ctrl-C, print detections and belief, and write the video and the tracks, if wanted."""
     speed = _Speed()
+    lines: list[str] = []
     size = None
     print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add_frame:
@@ -96,6 +103,8 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None) -> None:
                 _check_same_size(picture, size)
                 moment = live.step(picture.image, picture.passed)
                 speed.count_frame()
+                if tracks is not None:
+                    lines.append(_mot_lines(moment))
                 if speed.frames == 1 and live.criterion is not None:
                     print(f"  found: when {live.criterion} (--confirm)")
                     print("  absent: when p is below one half, and no look is worth a frame (--give-up)")
@@ -105,11 +114,21 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None) -> None:
                     add_frame(draw_moment(picture.image, moment, f"{moment.describe()}   {rate}"))
         except KeyboardInterrupt:
             print("  stopped")
+    if tracks is not None:
+        write_text(tracks, "".join(lines))
     frames = f"{speed.frames} frame{'' if speed.frames == 1 else 's'}"
     gaps = [f"{number} {kind}" for kind, number in stream.gaps.items() if number]
     mean = speed.mean()
     rates = [f"{mean} after the first {_WARM_UP}"] if mean else []
     print(", ".join([frames, *gaps, *rates]))
+
+
+def _mot_lines(moment: Moment) -> str:
+    """Write the objects of a frame in MOTChallenge's format; raises `InputError` where they have no numbers."""
+    has_numbers = isinstance(moment, WindowMoment) and moment.candidates.track_ids is not None
+    check(has_numbers, "tracks", "looks at windows, by an agent with evidence for them", "others")
+    assert isinstance(moment, WindowMoment)
+    return moment.to_mot()
 
 
 def _check_same_size(picture: Picture, size: Sequence[int]) -> None:

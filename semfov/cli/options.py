@@ -179,6 +179,7 @@ class LiveOptions(StreamSettings, AgentOptions):
         white: values that are black and white, as for `semfov search`, such as of a thermal camera of 16 bits.
         out: video to write, `.mp4` or `.avi`, or a folder for it, with gaze and belief, or windows and objects, drawn
             into each frame.
+        tracks: file to write of the objects of each frame, with numbers that stay, `.txt` in MOTChallenge's format.
     """
 
     unused: ClassVar[tuple[str, ...]] = ("color",)
@@ -190,6 +191,7 @@ class LiveOptions(StreamSettings, AgentOptions):
     frames: Count | None = None
     white: str | None = None
     out: Path | None = None
+    tracks: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,12 @@ class CocoResult(TypedDict):
 
 
 def named_detections(
-    boxes: Tensor, labels: Tensor, scores: Tensor, classes: Sequence[str] | None, data: Mapping[str, object]
+    boxes: Tensor,
+    labels: Tensor,
+    scores: Tensor,
+    classes: Sequence[str] | None,
+    data: Mapping[str, object],
+    track_ids: Tensor | None = None,
 ) -> supervision.Detections:
     """Make `supervision.Detections` of boxes.
 
@@ -42,6 +47,7 @@ def named_detections(
         scores: `(L,)`.
         classes: names of the classes, without background; None leaves them out.
         data: further data of the boxes by name.
+        track_ids: `(L,)`, numbers of the objects of a stream; None without.
 
     Returns:
         The detections for Supervision.
@@ -52,7 +58,8 @@ def named_detections(
     data = dict(data)
     if classes is not None:
         data["class_name"] = np.array([classes[number] for number in numbers.tolist()], dtype=str)
-    return Detections(boxes.numpy(), None, scores.numpy(), numbers, data=data)
+    tracker_id = None if track_ids is None else track_ids.numpy()
+    return Detections(boxes.numpy(), None, scores.numpy(), numbers, tracker_id, data=data)
 
 
 def coco_results(

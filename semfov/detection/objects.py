@@ -13,6 +13,9 @@ from semfov.data.inputs import as_positions
 from semfov.errors import InputError, check, check_number, check_shape
 from semfov.words import OBJECTS, OtherWords
 
+NO_TRACK = -1
+"""Number of an object of a stream that no track follows."""
+
 _Column = NDArray[np.float32]
 _Index = NDArray[np.intp]
 
@@ -34,6 +37,7 @@ class Objects(OtherWords):
         scores: `(M,)`, score of the class.
         labels: `(M,)`, classes 1..K.
         passes: `(M,)`, number of the look that each box comes from; the first one is 0.
+        track_ids: `(M,)`, numbers that stay with the objects of a stream; None in a picture.
         classes: names of the classes, background first, for the text form; none where only numbers are known.
 
     >>> objects = Objects(torch.zeros(2, 4), torch.tensor([0.9, 0.2]), torch.tensor([1, 3]), torch.tensor([0, 4]))
@@ -46,6 +50,7 @@ class Objects(OtherWords):
     labels: Tensor
     passes: Tensor
     classes: tuple[str, ...] = field(default=(), compare=False)
+    track_ids: Tensor | None = None
 
     _other_words = OBJECTS
 
@@ -108,7 +113,9 @@ class Objects(OtherWords):
         check(not isinstance(index, str), "index", f"a number; objects.of({index!r}) are those of a class", repr(index))
         if isinstance(index, int):
             index = torch.tensor([index])
-        return Objects(self.boxes[index], self.scores[index], self.labels[index], self.passes[index], self.classes)
+        numbers = None if self.track_ids is None else self.track_ids[index]
+        columns = (self.boxes[index], self.scores[index], self.labels[index], self.passes[index])
+        return Objects(*columns, self.classes, numbers)
 
 
 def box_text(box: Sequence[float]) -> str:

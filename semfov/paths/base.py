@@ -350,6 +350,11 @@ class Moment(Record):
         """`(x, y)` in pixels, the point that the next look is at."""
 
     @property
+    def ways(self) -> dict[int, list[tuple[float, float]]]:
+        """The ways of the objects in the last frames, by their numbers: points `(x, y)` in pixels of this frame."""
+        return {}
+
+    @property
     def next_region(self) -> Box | None:
         """`(x1, y1, x2, y2)` in pixels, the part of the frame that the next look shows; None for all of it."""
         return None

@@ -250,7 +250,7 @@ class Conversion(Outcome, OtherWords):
 
         Supervision numbers classes from 0, without background. `data` has the names of the classes as `class_name`,
         which its annotators show, the number of the look that each box comes from as `look`, and which of the objects
-        were confirmed as `confirmed`.
+        were confirmed as `confirmed`. Objects of a stream have their numbers as `tracker_id`.
 
         Returns:
             The objects for Supervision.
@@ -265,7 +265,8 @@ class Conversion(Outcome, OtherWords):
         """
         objects = self.objects
         data = {"look": objects.passes.numpy(), "confirmed": self.confirmed.numpy()}
-        return named_detections(objects.boxes, objects.labels, objects.scores, self.classes[1:], data)
+        columns = (objects.boxes, objects.labels, objects.scores)
+        return named_detections(*columns, self.classes[1:], data, objects.track_ids)
 
     def to_torchvision(self) -> dict[str, Tensor]:
         """Convert the objects to what torchvision's detectors return and `torchmetrics` takes.

@@ -16,7 +16,7 @@ from semfov.belief.prior import Prior, check_prior
 from semfov.data.classes import class_index
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
-from semfov.detection.objects import LEAST, Objects
+from semfov.detection.objects import LEAST, NO_TRACK, Objects
 from semfov.errors import check
 from semfov.kinds import LookKind
 from semfov.observation.matching import box_iou
@@ -302,6 +302,7 @@ class _Listing:
         self.scores = candidates.scores
         self.labels = candidates.labels
         self.looks = candidates.passes
+        self.track_ids = candidates.track_ids
         self.counts = candidates.scores >= least
         self.confirmed = torch.zeros(len(candidates), dtype=torch.bool)
 
@@ -331,6 +332,8 @@ class _Listing:
         self.scores = torch.cat([self.scores, probability])
         self.labels = torch.cat([self.labels, self.labels.new_tensor([place.label])])
         self.looks = torch.cat([self.looks, self.looks.new_tensor([place.look])])
+        if self.track_ids is not None:
+            self.track_ids = torch.cat([self.track_ids, torch.tensor([NO_TRACK])])
         self.counts = torch.cat([self.counts, torch.tensor([False])])
         self.confirmed = torch.cat([self.confirmed, torch.tensor([False])])
         return row
@@ -339,4 +342,5 @@ class _Listing:
         """Return the objects that count or were confirmed, most confident first, and which were confirmed, `(M,)`."""
         order = self.scores.argsort(descending=True, stable=True)
         order = order[(self.counts | self.confirmed)[order]]
-        return Objects(self.boxes, self.scores, self.labels, self.looks)[order], self.confirmed[order]
+        objects = Objects(self.boxes, self.scores, self.labels, self.looks, track_ids=self.track_ids)
+        return objects[order], self.confirmed[order]

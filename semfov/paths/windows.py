@@ -11,6 +11,7 @@ from torch import Tensor
 
 from semfov.data.classes import plural
 from semfov.detection import Objects
+from semfov.detection.objects import NO_TRACK
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
 from semfov.kinds import WINDOWS
@@ -19,6 +20,8 @@ from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
 from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import Box, RecordedLook
 from semfov.paths.words import MomentWords, Words
+from semfov.tracking import Tracks
+from semfov.tracking.files import TRACK_FIELDS, track_tensors, tracks_of
 from semfov.zoom.certainty import SEVERAL, SPREAD, number_of, number_of_faint, reacts
 from semfov.zoom.closer import PhotographPlaces
 from semfov.zoom.lattice import Lattice
@@ -48,7 +51,8 @@ _TENSORS = {
     "object_boxes": Field(("P", 4), mixed=True, low=-FARTHEST, high=FARTHEST),
     "object_scores": Field(("P",), mixed=True),
     "object_labels": Field(("P",), dtype=torch.int64, low=1),
-    "object_passes": Field(("P",), dtype=torch.int64, low=0),
+    "object_passes": Field(("P",), dtype=torch.int64, low=-1),
+    "object_track_ids": Field(("P",), dtype=torch.int64, low=NO_TRACK, optional=True),
 }
 """Tensors of the files of looks at windows."""
 
@@ -344,6 +348,8 @@ class ZoomPath(Record):
 
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
+        if self.candidates.track_ids is not None:
+            tensors["object_track_ids"] = self.candidates.track_ids
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         tensors["cut"] = torch.cat([look.cut for look in self.window_looks])
         tensors["show"] = torch.stack([look.show for look in self.window_looks])
@@ -357,7 +363,7 @@ class ZoomPath(Record):
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
         boxes, scores, labels, passes = (tensors[f"object_{name}"] for name in _OBJECTS)
-        objects = Objects(boxes, scores, labels, passes)
+        objects = Objects(boxes, scores, labels, passes, track_ids=tensors.get("object_track_ids"))
         unseen = record.get("unseen") and tuple(record["unseen"])
         looks, classes = shared["detections"], shared["classes"]
         check(len(record["seconds"]) in (0, len(looks)), "seconds", f"{len(looks)} times, or none", record["seconds"])
@@ -403,6 +409,7 @@ class WindowMoment(ZoomPath, Moment):
     Beside the attributes of `ZoomPath` and `Moment` it has what comes next.
 
     Attributes:
+        tracks: the objects that are known, of all frames so far, with those that are hidden or have left the frame.
         next_window: the window to look at in the next frame.
         lost: whether the frame fits none before it, after a cut or in the dark; then nothing of earlier frames counts.
 
@@ -414,9 +421,14 @@ class WindowMoment(ZoomPath, Moment):
 
     next_window: Window
     lost: bool = False
+    tracks: Tracks = field(default_factory=Tracks.none)
 
     _words = WindowMomentWords
-    _format = Format("window moment", _TENSORS, {**_VALUES, "number": WHOLE, "next_window": _WINDOW, "lost": Flag()})
+    _format = Format(
+        "window moment",
+        {**_TENSORS, **TRACK_FIELDS},
+        {**_VALUES, "number": WHOLE, "next_window": _WINDOW, "lost": Flag()},
+    )
 
     @property
     def next_point(self) -> tuple[float, float]:
@@ -429,20 +441,58 @@ class WindowMoment(ZoomPath, Moment):
         return self.next_window.region(self.lattice)
 
     @property
+    def ways(self) -> dict[int, list[tuple[float, float]]]:
+        """The ways of the objects in the last frames, by their numbers: points `(x, y)` in pixels of this frame."""
+        numbers = self.objects.track_ids
+        return {} if numbers is None else self.tracks.of_ids(numbers).ways()
+
+    @property
     def window(self) -> Window:
         """The window that was looked at in this frame."""
         return self.window_looks[-1].window
 
+    def to_mot(self) -> str:
+        """Convert the objects of the frame to lines in the format of MOTChallenge.
+
+        Each line has the frame, the number of the object, the left and upper edge, width and height of its box, and its
+        probability, and three times -1 for what is not known. Frames and pixels are counted from 1.
+
+        Returns:
+            The lines; empty without objects. Joined, those of all frames are the file of a film.
+
+        Example::
+
+            lines = [live.step(frame).to_mot() for frame in frames]
+            Path("film.txt").write_text("".join(lines))
+        """
+        objects = self.objects
+        if objects.track_ids is None:
+            return ""
+        lines = []
+        for number, box, score in zip(
+            objects.track_ids.tolist(), objects.boxes.tolist(), objects.scores.tolist(), strict=True
+        ):
+            x1, y1, x2, y2 = box
+            place = f"{x1 + 1:.2f},{y1 + 1:.2f},{x2 - x1:.2f},{y2 - y1:.2f}"
+            lines.append(f"{self.number + 1},{number},{place},{score:.4f},-1,-1,-1\n")
+        return "".join(lines)
+
     def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors, record = super()._contents()
         window = {name: getattr(self.next_window, name) for name in _WINDOW_VALUES}
-        return tensors, {**record, "number": self.number, "next_window": window, "lost": self.lost}
+        return {**tensors, **track_tensors(self.tracks)}, {
+            **record,
+            "number": self.number,
+            "next_window": window,
+            "lost": self.lost,
+        }
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
         made = super()._fields(tensors, record, shared)
         window = _window_from(record["next_window"], made["lattice"])
-        return {**made, "number": record["number"], "next_window": window, "lost": record.get("lost", False)}
+        known = {"number": record["number"], "lost": record.get("lost", False), "tracks": tracks_of(tensors)}
+        return {**made, **known, "next_window": window}
 
 
 def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:

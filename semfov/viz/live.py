@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.detection.objects import NO_TRACK
 from semfov.errors import DataError, needing
 from semfov.io.files import replacing
 from semfov.paths import Moment
@@ -97,12 +98,29 @@ class _MomentDrawing:
         self.picture.paste(Image.new("RGB", size, TARGET), mask=strength)
 
     def draw_windows(self, next_region: Box) -> None:
-        """Draw the objects, the next window, and the window of this look."""
+        """Draw the objects and their ways, the next window, and the window of this look."""
         moment = self.moment
+        self._draw_ways()
         for box, confirmed in zip(moment.objects.boxes.tolist(), moment.confirmed.tolist(), strict=True):
             self.draw.rectangle(self._scaled(box), outline=FOUND if confirmed else TARGET, width=2)
         self.draw.rectangle(self._scaled(next_region), outline=GAZE, width=1)
         self._mark(self.draw.rectangle, self._scaled(moment.looks[-1].region))
+
+    def _draw_ways(self) -> None:
+        """Draw where the objects were in the last frames, and their numbers."""
+        objects = self.moment.objects
+        if objects.track_ids is None:
+            return
+        for way in self.moment.ways.values():
+            points = [self._scaled_point(point) for point in way]
+            self.draw.line(points, fill=GAZE, width=2)
+        from PIL import ImageFont
+
+        font = ImageFont.load_default(11)
+        for number, box in zip(objects.track_ids.tolist(), objects.boxes.tolist(), strict=True):
+            if number != NO_TRACK:
+                x1, y1, _, _ = self._scaled(box)
+                self.draw.text((x1, y1 - 13), str(number), fill="white", font=font, stroke_width=1, stroke_fill="black")
 
     def draw_fixations(self) -> None:
         """Draw a line to the next fixation, and a ring at this one, or a box around what was examined closely."""

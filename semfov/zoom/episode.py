@@ -12,6 +12,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
+from semfov.zoom.window_sums import Cells
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
 
@@ -284,12 +285,16 @@ def find_everything(
     batch: int = 1,
     worth: float = 0.0,
     forgetting: Forgetting | None = None,
+    known: Callable[[int], Cells] | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
-    """Look for all objects of a class, or of all classes, look by look, until no look promises enough."""
+    """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
+
+    `known` gives by level what a look at each window brings for objects that are known.
+    """
     belief = ZoomBelief(source.lattice, evidence, target or 0, source.blank)
 
     def best(looks: Sequence[WindowLook], done: set[Window]) -> Sequence[WindowChoice]:
-        chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight), belief, done, batch)
+        chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight, known=known), belief, done, batch)
         return [choice for choice in chosen if choice[1] > worth]
 
     return look_by_look(

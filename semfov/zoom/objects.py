@@ -52,7 +52,7 @@ def merge(
     """
     if not looks:
         return Objects.none()
-    detected = _detected(looks, target, shares=False)
+    detected = detected_boxes(looks, target, shares=False)
     objects = merge_looks(*detected, score=score, iou=iou, inside=inside)
     highest = _highest_scores(objects, detected, iou)
     return replace(objects, scores=highest)[highest.argsort(descending=True, stable=True)]
@@ -94,7 +94,7 @@ def merge_with_facts(
     """
     if not looks:
         return Objects.none(), torch.zeros(0, len(FACTS))
-    detected = _detected(looks, target, shares=True)
+    detected = detected_boxes(looks, target, shares=True)
     # Fainter boxes say nothing that the absence of a box does not.
     detected = detected.of(detected.scores >= FAINTEST)
     index = unlike(*detected, inside=_INSIDE)
@@ -184,7 +184,7 @@ def _joined(batches: Sequence[Detections]) -> Detections:
     )
 
 
-def _detected(looks: Sequence[WindowLook], target: int | Sequence[int] | None, *, shares: bool) -> DetectedBoxes:
+def detected_boxes(looks: Sequence[WindowLook], target: int | Sequence[int] | None, *, shares: bool) -> DetectedBoxes:
     """Collect the boxes of all detections, each with its best class of the targets.
 
     Scores are those of the vectors, on which a certainty is fitted (`shares`), or the detector's own.

@@ -15,7 +15,12 @@ WindowChoice = tuple[Window, float]  # a window and the value of a look at it
 
 
 def best_find(
-    belief: ZoomBelief, done: set[Window], foresight: float = 0.0, *, beside: Window | None = None
+    belief: ZoomBelief,
+    done: set[Window],
+    foresight: float = 0.0,
+    *,
+    beside: Window | None = None,
+    known: Callable[[int], Cells] | None = None,
 ) -> WindowChoice | None:
     r"""Choose the window in which a look is expected to find most objects, :math:`E[n_k(w)] + \kappa \, E[n_{k+1}(w)]`.
 
@@ -27,6 +32,7 @@ def best_find(
         foresight: κ.
         beside: a window that is being looked at. Other windows count for the share that does not lie in it: an estimate
             of the best one afterwards.
+        known: gives by level what a look at each window brings for objects that are known, `(down, across)`.
 
     Returns:
         The window and its value; None if no window has a value above 0.
@@ -35,6 +41,8 @@ def best_find(
     best: WindowChoice | None = None
     for level in range(1, lattice.levels):
         values = belief.value(level, foresight)
+        if known is not None:
+            values = values + known(level)
         best = _better(best, values, level, lattice, done, beside)
     return best
 

@@ -156,6 +156,8 @@ def same(a, b):
     """Whether two values of any type, also nested ones, are equal to the bit."""
     if isinstance(a, torch.Tensor):
         return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
     if dataclasses.is_dataclass(a):
         compared = [field.name for field in dataclasses.fields(a) if field.compare]
         return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in compared)

@@ -1,0 +1,242 @@
+"""A tracker of objects of which each look shows some: where they are, and the probability that they are there.
+
+tracks ── time passes, the camera moves ──► predicted ── a look at a window ──► seen: place, velocity, more probable
+                                                                                not seen there: less probable
+                                                                                not looked at: as they were
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semfov.motion import CameraStep, Motion
+from semfov.tracking.assignment import cheapest_pairs
+from semfov.tracking.kalman import Floats, Kinematics
+from semfov.tracking.model import TrackingModel
+from semfov.tracking.tracks import Tracks, no_trail
+
+_SAME = 0.5  # intersection over union from which on two objects of a class are one
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a look at a window of a frame shows.
+
+    Attributes:
+        boxes: `(M, 4)`, in pixels of the frame.
+        scores: `(M,)`, from 0 to 1.
+        labels: `(M,)`, classes 1..K.
+        cut: `(M,)` boolean, whether the border of the window cuts a box.
+        region: `(x1, y1, x2, y2)`, the window in pixels of the frame.
+        magnification: canvas pixels for a pixel of the frame.
+        number: number of the look.
+    """
+
+    boxes: Floats
+    scores: Floats
+    labels: NDArray[np.int64]
+    cut: NDArray[np.bool_]
+    region: tuple[float, float, float, float]
+    magnification: float
+    number: int = 0
+
+
+class Tracker:
+    r"""Tracks objects through a stream: Kalman filters of constant velocity, and a probability that each is there.
+
+    The probability p follows the recursion of a Bernoulli filter (Ristic et al., 2013, IEEE Transactions on Signal
+    Processing 61:3406). After t seconds, and after a look that does not show an object which it shows with probability
+    d, it is
+
+    .. math:: p \leftarrow p \, (1 - \ell)^t, \qquad \frac{p}{1 - p} \leftarrow \frac{p}{1 - p} (1 - d)^w
+
+    Detections belong to the objects at whose predicted places they most probably lie, all of them jointly; others begin
+    objects of their own. What no look covers stays as it was, so that objects go on while they are out of view.
+
+    Args:
+        model: what is assumed of objects and looks; None for the usual.
+
+    Attributes:
+        tracks: the objects, where they are in the present frame.
+
+    >>> tracker = Tracker()
+    >>> box = np.array([[100.0, 100.0, 140.0, 180.0]])
+    >>> for step in range(4):
+    ...     tracker.follow(0.1)
+    ...     tracker.see(Seen(box + 5 * step, np.array([0.8]), np.array([1]), np.array([False]), (0, 0, 400, 400), 1.0))
+    >>> tracker.tracks.track_ids.tolist(), tracker.tracks.velocities.round().tolist()
+    ([1], [[49.0, 49.0]])
+    """
+
+    def __init__(self, model: TrackingModel | None = None) -> None:
+        self.model = model or TrackingModel()
+        self.tracks = Tracks.none()
+        self._aside = Tracks.none()  # objects of a scene that the camera has lost and may find again
+        self._waited = 0.0  # seconds since then
+        self._last = 0  # the last number that was given
+
+    def follow(self, seconds: float, camera: CameraStep | None = None) -> None:
+        """Predict the objects at the next frame.
+
+        Args:
+            seconds: time since the last frame.
+            camera: how the camera moved since the last frame; None for one that stands still.
+        """
+        self._waited += seconds
+        if camera is not None and camera.motion is None:
+            if not len(self._aside):
+                self._aside = self.tracks
+                self._waited = seconds
+            self.tracks = Tracks.none()
+        else:
+            self.tracks = self._after(self.tracks, seconds, None if camera is None else camera.motion)
+        if camera is not None and camera.recovered is not None:
+            found = self._after(self._aside, self._waited, camera.recovered)
+            self.tracks = found.joined(self.tracks)
+        if camera is None or camera.recovered is not None or not camera.waits:
+            self._aside = Tracks.none()
+
+    def _after(self, tracks: Tracks, seconds: float, motion: Motion | None) -> Tracks:
+        """Predict objects some seconds later, and forget those that are hardly there any more."""
+        model = self.model
+        if not len(tracks):
+            return tracks
+        lasting = np.log1p(-model.loss) * seconds
+        chance = lasting - np.logaddexp(0, -tracks.shown_odds)
+        later = replace(
+            tracks,
+            kinematics=tracks.kinematics.after(seconds, model.acceleration * tracks.sides**2),
+            size_variance=tracks.size_variance + model.growth * seconds,
+            shown_odds=chance - np.log(-np.expm1(chance)),
+            unseen=tracks.unseen + seconds,
+        )
+        later = later[later.log_odds > np.log(model.least / (1 - model.least))]
+        return later if motion is None or motion.is_still else later.carried(motion)
+
+    def see(self, seen: Seen) -> None:
+        """Update the objects by a look at the present frame.
+
+        Args:
+            seen: what the look shows.
+        """
+        noise = self._noise(seen)
+        pairs = cheapest_pairs(self._costs(seen, noise))
+        is_whole = ~seen.cut[pairs[:, 1]]
+        self._miss(seen, pairs[:, 0])
+        self._hit(seen, noise, pairs[is_whole])
+        fresh = ~seen.cut
+        fresh[pairs[:, 1]] = False
+        self._begin(seen, noise, fresh)
+        self._merge_doubles()
+        self.tracks = self.tracks.marked()
+
+    def _noise(self, seen: Seen) -> Floats:
+        """Variance of the places of detections, `(M,)`, in square pixels."""
+        sides = np.exp(_log_size(seen.boxes).mean(-1))
+        return (self.model.place * sides) ** 2 + (self.model.pixel / seen.magnification) ** 2
+
+    def _costs(self, seen: Seen, noise: Floats) -> Floats:
+        """Minus the log odds that a detection shows an object rather than another one, `(N, M)`."""
+        model = self.model
+        tracks = self.tracks
+        log_size = _log_size(seen.boxes)
+        area = np.exp(log_size.sum(-1))
+        variance = tracks.kinematics.variance[:, None] + noise
+        distance = _squared_distance(tracks.kinematics.place, _centres(seen.boxes)) / variance
+        size_variance = tracks.size_variance[:, None] + model.size**2
+        size_distance = _squared_distance(tracks.log_size, log_size) / size_variance
+        by_place = -distance / 2 - np.log(2 * np.pi * variance / area)
+        by_size = -size_distance / 2 - np.log(size_variance / _SIZE_SPREAD**2)
+        apart = (distance > model.gate) | (size_distance > model.gate) | (tracks.labels[:, None] != seen.labels)
+        return np.where(apart, np.inf, model.density - by_place - by_size)
+
+    def _miss(self, seen: Seen, shown: NDArray[np.intp]) -> None:
+        """Believe less in objects that the look should have shown."""
+        tracks = self.tracks
+        chance = self.model.detects(tracks.sides * seen.magnification) * _chance_inside(tracks, seen.region)
+        chance[shown] = 0
+        self.tracks = replace(tracks, missed_odds=tracks.missed_odds + self.model.miss * np.log1p(-chance))
+
+    def _hit(self, seen: Seen, noise: Floats, pairs: NDArray[np.intp]) -> None:
+        """Update the objects that the look shows, by pairs `(P, 2)` of objects and detections."""
+        rows, columns = pairs.T
+        tracks = self.tracks[rows]
+        log_size = _log_size(seen.boxes[columns])
+        gain = tracks.size_variance / (tracks.size_variance + self.model.size**2)
+        evidence = self.model.evidence(seen.scores[columns])
+        updated = replace(
+            tracks,
+            kinematics=tracks.kinematics.measured(_centres(seen.boxes[columns]), noise[columns]),
+            log_size=tracks.log_size + gain[:, None] * (log_size - tracks.log_size),
+            size_variance=tracks.size_variance * (1 - gain),
+            shown_odds=np.maximum(tracks.shown_odds, evidence),
+            missed_odds=np.zeros(len(rows)),
+            unseen=np.zeros(len(rows)),
+            passes=np.full(len(rows), seen.number),
+        )
+        others = np.setdiff1d(np.arange(len(self.tracks)), rows)
+        joined = self.tracks[others].joined(updated)
+        self.tracks = joined[joined.track_ids.argsort()]
+
+    def _begin(self, seen: Seen, noise: Floats, fresh: NDArray[np.bool_]) -> None:
+        """Begin an object with each of the detections `(M,)` that show none that is known."""
+        boxes = seen.boxes[fresh]
+        log_size = _log_size(boxes)
+        count = len(boxes)
+        speed = self.model.speed * np.exp(log_size.mean(-1))
+        begun = Tracks(
+            track_ids=self._last + 1 + np.arange(count),
+            labels=seen.labels[fresh],
+            kinematics=Kinematics.at(_centres(boxes), noise[fresh], speed),
+            log_size=log_size,
+            size_variance=np.full(count, self.model.size**2),
+            shown_odds=self.model.evidence(seen.scores[fresh]),
+            missed_odds=np.zeros(count),
+            unseen=np.zeros(count),
+            passes=np.full(count, seen.number),
+            trail=no_trail(count),
+        )
+        self._last += count
+        self.tracks = self.tracks.joined(begun)
+
+    def _merge_doubles(self) -> None:
+        """Drop objects that lie on a more probable one of their class."""
+        # Imported here: torchvision takes a second, and most programs of this room are not streams.
+        from torchvision.ops import batched_nms
+
+        kept = batched_nms(
+            self.tracks.boxes,
+            torch.from_numpy(self.tracks.log_odds).float(),
+            torch.from_numpy(self.tracks.labels),
+            _SAME,
+        )
+        self.tracks = self.tracks[np.sort(kept.numpy())]
+
+
+_SIZE_SPREAD = 0.5  # standard deviation of the logarithm of the sizes of other objects
+
+
+def _centres(boxes: Floats) -> Floats:
+    return (boxes[:, :2] + boxes[:, 2:]) / 2
+
+
+def _log_size(boxes: Floats) -> Floats:
+    """Logarithms of the widths and heights of boxes, at least a pixel, `(M, 2)`."""
+    return np.log(np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0))
+
+
+def _squared_distance(rows: Floats, columns: Floats) -> Floats:
+    """Squared distances of points `(N, 2)` and `(M, 2)`, `(N, M)`."""
+    return ((rows[:, None] - columns) ** 2).sum(-1)
+
+
+def _chance_inside(tracks: Tracks, region: tuple[float, float, float, float]) -> Floats:
+    """Probability that the whole box of each object lies in a window, `(N,)`."""
+    half = np.exp(tracks.log_size) / 2
+    deviation = np.sqrt(tracks.kinematics.variance)[:, None]
+    low = (np.array(region[:2]) + half - tracks.place) / deviation
+    high = (np.array(region[2:]) - half - tracks.place) / deviation
+    below = torch.special.ndtr(torch.from_numpy(np.stack([low, high]))).numpy()
+    return (below[1] - below[0]).clip(0).prod(-1)

@@ -1,0 +1,216 @@
+"""The objects that a tracker knows of, as columns."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.detection.objects import Objects
+from semfov.motion import Motion
+from semfov.tracking.kalman import Floats, Kinematics
+
+TRAIL = 32  # frames
+_STANDS = 4.0  # standard deviations of a velocity below which an object stands still
+
+_Index = NDArray[np.intp] | NDArray[np.bool_] | slice
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Objects that move, in the pixels of the present frame; some are beyond it, or hidden.
+
+    Attributes:
+        track_ids: `(N,)`, numbers from 1 that stay with the objects.
+        labels: `(N,)`, classes 1..K.
+        kinematics: their places and velocities.
+        log_size: `(N, 2)`, logarithms of width and height in pixels.
+        size_variance: `(N,)`, variance of these.
+        shown_odds: `(N,)`, log odds that they exist, by the best detection of each.
+        missed_odds: `(N,)`, what looks that should have shown them have changed these by since their last detection.
+        unseen: `(N,)`, seconds since a look showed them.
+        passes: `(N,)`, number of the last look that showed each; the first look of the stream is 0.
+        trail: `(N, 32, 2)`, where they were in the last frames, the newest place last; NaN before they were known.
+
+    >>> len(Tracks.none()), Tracks.none().boxes.shape
+    (0, torch.Size([0, 4]))
+    """
+
+    track_ids: NDArray[np.int64]
+    labels: NDArray[np.int64]
+    kinematics: Kinematics
+    log_size: Floats
+    size_variance: Floats
+    shown_odds: Floats
+    missed_odds: Floats
+    unseen: Floats
+    passes: NDArray[np.int64]
+    trail: Floats
+
+    def __len__(self) -> int:
+        return len(self.track_ids)
+
+    @classmethod
+    def none(cls) -> "Tracks":
+        """Make a set of no objects.
+
+        Returns:
+            The objects of a stream of which nothing was seen.
+        """
+        nothing = np.zeros(0)
+        numbers = np.zeros(0, np.int64)
+        kinematics = Kinematics(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        return cls(
+            numbers, numbers, kinematics, np.zeros((0, 2)), nothing, nothing, nothing, nothing, numbers, no_trail(0)
+        )
+
+    @property
+    def moves(self) -> NDArray[np.bool_]:
+        """Whether they move, `(N,)`: their velocities are clearly not zero; others are taken to stand still."""
+        variance = self.kinematics.covariance[:, 1, 1]
+        return (self.kinematics.velocity**2).sum(-1) >= _STANDS**2 * variance
+
+    @property
+    def place(self) -> Floats:
+        """Where they are, `(N, 2)` in pixels: those that stand still are where they were seen last."""
+        way = self.unseen[:, None] * self.kinematics.velocity
+        return np.where(self.moves[:, None], self.kinematics.place, self.kinematics.place - way)
+
+    @property
+    def corners(self) -> Floats:
+        """Their boxes, `(N, 4)` as an array."""
+        half = np.exp(self.log_size) / 2
+        return np.concatenate([self.place - half, self.place + half], -1)
+
+    @property
+    def boxes(self) -> Tensor:
+        """Their boxes, `(N, 4)`, `(x1, y1, x2, y2)` in pixels."""
+        return torch.from_numpy(self.corners).float()
+
+    @property
+    def sides(self) -> Floats:
+        """Roots of the areas of their boxes, `(N,)`, in pixels."""
+        return np.exp(self.log_size.mean(-1))
+
+    @property
+    def velocities(self) -> Tensor:
+        """Their velocities, `(N, 2)`, in pixels a second beside that of the scene."""
+        return torch.from_numpy(self.kinematics.velocity).float()
+
+    @property
+    def log_odds(self) -> Floats:
+        """Log odds that they exist, `(N,)`."""
+        return self.shown_odds + self.missed_odds
+
+    @property
+    def existence(self) -> Floats:
+        """Probabilities that they exist, `(N,)`, wherever they are."""
+        return 1 / (1 + np.exp(-self.log_odds))
+
+    @property
+    def fits(self) -> Floats:
+        r"""Probabilities that their boxes fit them, `(N,)`.
+
+        .. math:: 1 - \exp\bigl(-r^2 / 2 \sigma^2\bigr), \qquad r = \min(w, h) / 3
+
+        with the variance :math:`\sigma^2` of each coordinate of the place, and the sides w and h of the box: one that
+        is off by a third of a side overlaps its object by one half.
+        """
+        radius = np.exp(self.log_size.min(-1)) / 3
+        return -np.expm1(-(radius**2) / (2 * self.kinematics.variance))
+
+    @property
+    def probability(self) -> Tensor:
+        """Probabilities that they are where their boxes are, `(N,)`."""
+        return torch.from_numpy(self.existence * self.fits).float()
+
+    def __getitem__(self, index: _Index) -> "Tracks":
+        """Select some of the objects."""
+        return Tracks(*(getattr(self, column.name)[index] for column in fields(self)))
+
+    def joined(self, others: "Tracks") -> "Tracks":
+        """Append other objects.
+
+        Args:
+            others: objects in the same frame.
+
+        Returns:
+            All of them.
+        """
+        return Tracks(
+            np.concatenate([self.track_ids, others.track_ids]),
+            np.concatenate([self.labels, others.labels]),
+            self.kinematics.joined(others.kinematics),
+            np.concatenate([self.log_size, others.log_size]),
+            np.concatenate([self.size_variance, others.size_variance]),
+            np.concatenate([self.shown_odds, others.shown_odds]),
+            np.concatenate([self.missed_odds, others.missed_odds]),
+            np.concatenate([self.unseen, others.unseen]),
+            np.concatenate([self.passes, others.passes]),
+            np.concatenate([self.trail, others.trail]),
+        )
+
+    def carried(self, motion: Motion) -> "Tracks":
+        """Carry the objects along with the camera.
+
+        Args:
+            motion: maps pixels of the last frame to those of the present one.
+
+        Returns:
+            The objects in the pixels of the present frame.
+        """
+        scale = motion.scale_at(torch.from_numpy(self.kinematics.place)).numpy()
+        return replace(
+            self,
+            kinematics=self.kinematics.carried(motion),
+            log_size=self.log_size + np.log(scale)[:, None],
+            trail=motion.points(torch.from_numpy(self.trail)).numpy(),
+        )
+
+    def marked(self) -> "Tracks":
+        """Write the present places to the trails.
+
+        Returns:
+            The objects with their trails up to the present frame.
+        """
+        return replace(self, trail=np.concatenate([self.trail[:, 1:], self.place[:, None]], 1))
+
+    def of_ids(self, track_ids: Tensor) -> "Tracks":
+        """Select objects by their numbers.
+
+        Args:
+            track_ids: `(M,)`.
+
+        Returns:
+            Those of them that are known, by their numbers.
+        """
+        return self[np.isin(self.track_ids, track_ids.numpy())]
+
+    def ways(self) -> dict[int, list[tuple[float, float]]]:
+        """List the places of the objects in the last frames.
+
+        Returns:
+            By number of the object, points `(x, y)` in pixels of the present frame, the newest last.
+        """
+        known = ~np.isnan(self.trail[..., 0])
+        ways = {}
+        for number, trail, is_known in zip(self.track_ids.tolist(), self.trail, known, strict=True):
+            ways[number] = [(x, y) for x, y in trail[is_known].tolist()]
+        return ways
+
+    def objects(self) -> Objects:
+        """Convert to objects with probabilities as scores, the most probable first."""
+        chosen = self[(-self.existence * self.fits).argsort(kind="stable")]
+        return Objects(
+            chosen.boxes,
+            chosen.probability,
+            torch.from_numpy(chosen.labels),
+            torch.from_numpy(chosen.passes),
+            track_ids=torch.from_numpy(chosen.track_ids),
+        )
+
+
+def no_trail(count: int) -> Floats:
+    """Make the trails of objects that were in no frame, `(count, 32, 2)`."""
+    return np.full((count, TRAIL, 2), np.nan)

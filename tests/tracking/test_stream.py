@@ -1,0 +1,91 @@
+"""Tracks of an agent's stream: numbers, files of MOTChallenge, Supervision, and drawings."""
+
+import cv2
+import pytest
+import torch
+
+from semfov import WindowEye, ZoomAgent
+from semfov.observation.matching import box_iou
+from semfov.paths import WindowMoment
+from semfov.settings import StreamSettings
+from semfov.viz.live import draw_moment
+from semfov.zoom.evidence import GlimpseEvidence
+from tests.motion.test_camera import scene
+from tests.zoom.test_carrying import RED, Patches
+
+COVERED = range(14, 20)  # frames in which the square is behind something
+
+
+def frames(count=40):
+    """A still camera, and a red square that moves by 5 px a frame over a ground with texture."""
+    ground = scene(2, side=1100)[:768, :1024] // 2 + 40
+    for number in range(count):
+        frame = ground.copy()
+        x, y = 100 + 5 * number, 300 + 2 * number
+        if number not in COVERED:
+            cv2.rectangle(frame, (x, y), (x + 39, y + 39), (255, 0, 0), -1)
+        yield frame, torch.tensor([[x, y, x + 40.0, y + 40.0]])
+
+
+@pytest.fixture(scope="module")
+def moments():
+    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2, 8)).eval()
+    episode = agent.stream(None, (RED,), StreamSettings(rate=0.75, least=0.1))
+    return [(episode.step(frame), frame, box) for frame, box in frames()]
+
+
+def test_a_moving_object_keeps_one_number_through_an_occlusion(moments):
+    last, _, box = moments[-1]
+    fits = box_iou(last.tracks.boxes, box)[:, 0]
+    number = int(last.tracks.track_ids[fits.argmax()])
+    assert float(fits.max()) > 0.5
+    numbers = [set(moment.tracks.track_ids.tolist()) for moment, _, _ in moments]
+    first = next(frame for frame, there in enumerate(numbers) if number in there)
+    assert first < COVERED.start
+    assert all(number in there for there in numbers[first:])
+
+
+def test_objects_have_the_numbers_of_their_tracks(moments):
+    for moment, _, _ in moments:
+        objects = moment.objects
+        assert set(objects.track_ids.tolist()) <= set(moment.tracks.track_ids.tolist())
+        assert bool((objects.passes < len(moment)).all())
+
+
+def test_a_file_of_motchallenge_has_the_objects_counted_from_one(moments):
+    moment = next(each for each, _, _ in reversed(moments) if len(each.objects))
+    rows = [[float(value) for value in line.split(",")] for line in moment.to_mot().splitlines()]
+    assert len(rows) == len(moment.objects)
+    for row, number, box, score in zip(
+        rows, moment.objects.track_ids, moment.objects.boxes, moment.objects.scores, strict=True
+    ):
+        frame, identity, left, top, wide, high, confidence, *rest = row
+        assert (frame, identity, rest) == (moment.number + 1, int(number), [-1, -1, -1])
+        back = torch.tensor([left - 1, top - 1, left - 1 + wide, top - 1 + high])
+        torch.testing.assert_close(back, box, atol=0.011, rtol=0)
+        assert confidence == pytest.approx(float(score), abs=1e-4)
+
+
+def test_supervision_has_the_numbers_as_its_own(moments):
+    pytest.importorskip("supervision")
+    moment = next(each for each, _, _ in reversed(moments) if len(each.objects))
+    assert moment.to_supervision().tracker_id.tolist() == moment.objects.track_ids.tolist()
+
+
+def test_a_moment_is_saved_and_loaded_with_its_tracks(moments, tmp_path):
+    moment = moments[-1][0]
+    moment.save(tmp_path / "moment.safetensors")
+    loaded = WindowMoment.load(tmp_path / "moment.safetensors")
+    assert torch.equal(loaded.objects.track_ids, moment.objects.track_ids)
+    assert torch.equal(loaded.tracks.boxes, moment.tracks.boxes)
+    assert loaded.ways == moment.ways
+
+
+def test_the_way_of_an_object_is_drawn_where_it_was(moments):
+    moment, frame, _ = next(each for each in reversed(moments) if each[0].ways and len(each[0].objects))
+    image = torch.from_numpy(frame).permute(2, 0, 1)
+    way = next(way for way in moment.ways.values() if len(way) > 4)
+    drawn = draw_moment(image, moment, "red", moment.size).astype(int)
+    x, y = way[len(way) // 2]
+    around = slice(int(y) - 2, int(y) + 3), slice(int(x) - 2, int(x) + 3)
+    assert abs(drawn[around] - frame[around]).max() > 20

@@ -1,0 +1,175 @@
+"""Objects through a stream of looks: numbers, places, and the probability while they are not seen."""
+
+import numpy as np
+import pytest
+import torch
+
+from semfov.motion import CameraStep, Motion
+from semfov.tracking import Seen, Tracker, TrackingModel
+from semfov.tracking.gain import value_of_windows
+from semfov.zoom.lattice import Lattice
+
+WHOLE = (0.0, 0.0, 1000.0, 800.0)
+FRAME = 0.04
+
+
+def look(*boxes, score=0.8, region=WHOLE, magnification=1.0, cut=False, label=1):
+    count = len(boxes)
+    return Seen(
+        np.array(boxes, dtype=float).reshape(-1, 4), np.full(count, score), np.full(count, label),
+        np.full(count, cut), region, magnification,
+    )  # fmt: skip
+
+
+def box_at(x, y, wide=40, high=60):
+    return x, y, x + wide, y + high
+
+
+def test_an_object_keeps_its_number_behind_something():
+    """It moves by 6 px a frame, is looked at in each fourth frame, and is hidden for 20 frames."""
+    tracker = Tracker()
+    for frame in range(60):
+        tracker.follow(FRAME)
+        x = 100 + 6 * frame
+        if frame % 4 == 0 and not 24 < frame < 45:
+            tracker.see(look(box_at(x, 300)))
+    (number,) = tracker.tracks.track_ids.tolist()
+    assert number == 1
+    # The last look was at frame 56.
+    assert tracker.tracks.boxes[0].tolist() == pytest.approx(box_at(x, 300), abs=4)
+    assert tracker.tracks.velocities[0].tolist() == pytest.approx([6 / FRAME, 0], abs=10)
+
+
+def test_two_objects_that_cross_keep_their_numbers():
+    tracker = Tracker()
+    for frame in range(40):
+        tracker.follow(FRAME)
+        tracker.see(look(box_at(100 + 8 * frame, 300), box_at(412 - 8 * frame, 330)))
+    ends = dict(zip(tracker.tracks.track_ids.tolist(), tracker.tracks.boxes[:, 0].tolist(), strict=True))
+    assert ends == pytest.approx({1: 412, 2: 100}, abs=3)
+
+
+def test_looking_where_it_should_be_and_not_finding_it_is_evidence_against_it():
+    tracker = Tracker()
+    tracker.see(look(box_at(100, 100)))
+    (before,) = tracker.tracks.existence
+    tracker.see(look(region=(500, 500, 900, 700)))
+    assert tracker.tracks.existence.tolist() == [before]  # the look was elsewhere
+    tracker.see(look(region=(0, 0, 400, 400), magnification=0.05))
+    (faint,) = tracker.tracks.existence
+    tracker.see(look(region=(0, 0, 400, 400)))
+    (close,) = tracker.tracks.existence
+    # A look from far away says less than one from nearby.
+    assert before > faint > close
+    assert before - faint < faint - close
+    expected = np.log(before / (1 - before)) + 0.3 * sum(
+        np.log(1 - TrackingModel().detects(np.sqrt(40 * 60) * magnification)) for magnification in (0.05, 1)
+    )
+    assert np.log(close / (1 - close)) == pytest.approx(expected, abs=1e-6)
+    for _ in range(40):
+        tracker.see(look(region=(0, 0, 400, 400)))
+        tracker.follow(FRAME)
+    assert not len(tracker.tracks)  # it is forgotten
+
+
+def test_an_object_that_stands_still_does_not_drift_by_the_noise_of_its_places():
+    tracker, random = Tracker(), np.random.default_rng(0)
+    for _ in range(12):
+        for _ in range(10):
+            tracker.follow(FRAME)
+        x, y = 300 + 3 * random.normal(size=2)
+        tracker.see(look(box_at(x, y)))
+    seen = tracker.tracks.boxes
+    assert not tracker.tracks.moves.any()
+    for _ in range(25):
+        tracker.follow(FRAME)
+    torch.testing.assert_close(tracker.tracks.boxes, seen)
+
+
+def test_a_probability_falls_with_time_by_the_share_that_is_lost():
+    tracker = Tracker()
+    tracker.see(look(box_at(100, 100)))
+    (before,) = tracker.tracks.existence
+    for _ in range(50):
+        tracker.follow(FRAME)
+    assert tracker.tracks.existence[0] == pytest.approx(before * (1 - TrackingModel().loss) ** 2)
+
+
+def test_a_later_detection_takes_back_what_misses_took():
+    tracker = Tracker()
+    tracker.see(look(box_at(100, 100)))
+    (before,) = tracker.tracks.existence
+    tracker.see(look(region=(0, 0, 400, 400)))
+    tracker.see(look(box_at(100, 100), score=0.1))
+    assert tracker.tracks.existence[0] == pytest.approx(before)
+
+
+def test_what_the_border_of_a_window_cuts_begins_no_object_and_is_no_miss():
+    tracker = Tracker()
+    tracker.see(look(box_at(100, 100), cut=True))
+    assert not len(tracker.tracks)
+    tracker.see(look(box_at(100, 100)))
+    before = tracker.tracks.log_odds.copy()
+    tracker.see(look(box_at(100, 100, wide=35), cut=True))
+    assert tracker.tracks.log_odds.tolist() == before.tolist()
+
+
+def test_objects_move_with_the_camera():
+    """A camera that turns and zooms over objects that stand still."""
+    tracker, first = Tracker(), box_at(300, 200)
+    tracker.see(look(first))
+    step = Motion.similarity(shift=(4, -2), turn=0.5, scale=1.004)
+    since = Motion.still()
+    for _ in range(20):
+        tracker.follow(FRAME, CameraStep(step))
+        since = since.then(step)
+    torch.testing.assert_close(tracker.tracks.boxes, since.boxes(torch.tensor([first]).float()), atol=0.01, rtol=0)
+
+
+def test_objects_of_a_lost_scene_come_back_with_their_numbers():
+    tracker = Tracker()
+    tracker.see(look(box_at(300, 200)))
+    tracker.follow(FRAME, CameraStep(None, waits=True))
+    assert not len(tracker.tracks)
+    tracker.see(look(box_at(700, 500)))
+    tracker.follow(FRAME, CameraStep(Motion.still(), recovered=Motion.similarity(shift=(10, 0))))
+    assert sorted(tracker.tracks.track_ids.tolist()) == [1, 2]
+    assert tracker.tracks.boxes[0].tolist() == pytest.approx(box_at(310, 200))
+
+
+def test_after_a_cut_nothing_of_the_old_scene_is_left():
+    tracker = Tracker()
+    tracker.see(look(box_at(300, 200)))
+    tracker.follow(FRAME, CameraStep(None))
+    tracker.follow(FRAME, CameraStep(Motion.still(), recovered=Motion.still()))
+    assert not len(tracker.tracks)
+
+
+def test_memory_stays_flat_on_a_flight_that_never_returns():
+    """Three thousand frames with a new object in each tenth: what was left behind is forgotten."""
+    tracker, counts = Tracker(), []
+    for frame in range(3000):
+        tracker.follow(FRAME, CameraStep(Motion.similarity(shift=(-12, 0))))
+        tracker.see(look(*([box_at(900, 300)] if frame % 10 == 0 else []), region=(600, 0, 1000, 800)))
+        counts.append(len(tracker.tracks))
+    assert max(counts[1500:]) <= max(counts[:1500]) < 150
+
+
+def test_a_window_is_worth_the_objects_that_it_puts_right():
+    """By the definition: each object whose box lies in a window, one by one."""
+    lattice, tracker = Lattice.over((1600, 1200), (400, 400)), Tracker()
+    tracker.see(look(box_at(100, 200), box_at(900, 640), box_at(1500, 1100), region=(0, 0, 1600, 1200)))
+    tracker.follow(1.0)
+    tracks = tracker.tracks
+    for level in range(1, lattice.levels):
+        values = value_of_windows(tracks, tracker.model, lattice, level)
+        gains = (
+            tracks.existence * tracker.model.detects(tracks.sides * lattice.magnifications[level]) * (1 - tracks.fits)
+        )
+        across, down = lattice.places(level)
+        actions = torch.tensor([[level, x, y] for y in range(down) for x in range(across)])
+        windows, boxes = lattice.boxes(actions)[:, None], tracks.boxes[None]
+        holds = ((windows[..., :2] <= boxes[..., :2]) & (windows[..., 2:] >= boxes[..., 2:])).all(-1)
+        expected = (holds * torch.from_numpy(gains)).sum(-1).view(down, across)
+        np.testing.assert_allclose(values, expected.numpy(), atol=1e-5)
+        assert values.max() > 0
