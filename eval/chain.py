@@ -24,13 +24,13 @@ from semfov.errors import InputError
 from semfov.fit.looking import Looking
 from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
 from semfov.io.files import write_text
+from semfov.io.ranges import Count, Range
 from semfov.metrics.episodes import FloatArray, standard_error
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.config import PolicyConfig, RunConfig
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
-from semfov.runs.settings import Count, Range
 from semfov.runs.setup import make_observation
 from semfov.runs.tables import plus_minus, table
 

@@ -28,7 +28,7 @@ MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 
 
-LARGEST = {FovealObservationModel: 1_100_000, semfov.saliency.FixationDensity: 300_000}
+LARGEST = {FovealObservationModel: 1_100_000, semfov.saliency.FixationDensity: 350_000}
 SHIPPED = [(kind, path) for kind in KINDS for path in sorted(kind.shipped.glob("*.safetensors"))]
 
 

@@ -123,9 +123,9 @@ def test_the_agent_finds_a_target_by_the_head(head, robot):
     eye = semfov.Eye(semfov.Foveation(100.0, growth=2.0), Coloured(("red", "green", "blue"), (416, 312)))
     models = semfov.TargetEvidence(components=4), semfov.MapEvidence(components=4)
     agent = semfov.HeadAgent(eye, *models).eval().requires_grad_(False)
-    path = agent.explore(head(), ExploreSettings(passes=8))
-    assert len(robot.goals) == 8
-    regions = [path.places(look, 0.5)[0] for look in range(8)]
+    path = agent.explore(head(), ExploreSettings(passes=24))
+    assert len(robot.goals) == 24
+    regions = [path.places(look, 0.5)[0] for look in range(24)]
     middles = [path.views.world.angles_of(each.samples(3)[:1, 4])[0].tolist() for each in regions if len(each)]
     assert middles
     for middle in middles:
