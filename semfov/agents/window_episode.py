@@ -7,7 +7,7 @@ the looks that count at the present frame, a `WindowMoment`; and `GivenWindows` 
 """
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from math import isfinite
@@ -252,9 +252,7 @@ class WindowSession:
             "assumed": self.decisions.prior.assumed,
             "targets": task.goal.targets,
             "looks": tuple(looks),
-            "candidates": merged.objects
-            if self.tracker is None
-            else partial(self._tracked, self.tracker.tracks, places),
+            "candidates": merged.objects if self.tracker is None else self._tracked(self.tracker.tracks, places),
             "unseen": merged.unseen,
             "spread": SPREAD if self._certainty is None else self._certainty.spread,
             "least": self._least,
@@ -262,11 +260,9 @@ class WindowSession:
             "closer": _renumbered(self.decisions.looks, places),
         }
 
-    def _tracked(self, tracks: Tracks, places: Mapping[int, int]) -> Objects:
-        """List the tracked objects in the frame, each with the place of its look in the record; -1 for none there."""
-        objects = tracks.objects()
-        passes = torch.tensor([places.get(number, -1) for number in objects.passes.tolist()], dtype=torch.long)
-        return replace(objects, passes=passes)[inside_frame(objects.boxes, self.source.lattice.size)]
+    def _tracked(self, tracks: Tracks, places: Mapping[int, int]) -> Callable[[], Objects]:
+        """Make what lists the tracked objects in the frame, each with the place of its look in the record."""
+        return partial(_objects_in_frame, tracks, places, self.source.lattice.size)
 
     @property
     def tracks(self) -> Tracks:
@@ -563,6 +559,13 @@ def _camera_motion() -> CameraMotion | None:
     except InputError as error:
         warnings.warn(f"the camera is taken to stand still, unless poses are given: {error}", stacklevel=2)
         return None
+
+
+def _objects_in_frame(tracks: Tracks, places: Mapping[int, int], size: tuple[int, int]) -> Objects:
+    """List the tracked objects in a frame, each with the place of its look in the record; -1 for none there."""
+    objects = tracks.objects()
+    passes = torch.tensor([places.get(number, -1) for number in objects.passes.tolist()], dtype=torch.long)
+    return replace(objects, passes=passes)[inside_frame(objects.boxes, size)]
 
 
 def _renumbered(closer: Sequence[CloseUp], places: Mapping[int, int]) -> tuple[CloseUp, ...]:

@@ -92,12 +92,15 @@ class Verifier(Generic[LookType]):
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
     def follow(self, motion: Motion | None) -> None:
-        """Carry examined places along with the camera, or forget them where a frame fits none before."""
-        self.candidate = None
+        """Carry the candidate and examined places along, or forget them where a frame fits none before."""
         self.places.follow(motion)
         if motion is None:
+            self.candidate = None
             self.verdicts = []
             return
+        if self.candidate is not None:
+            # The closer look that is due is made in the next frame, wherever the camera has turned.
+            self.candidate = self.candidate._replace(box=motion.boxes(self.candidate.box))
         for number, verdict in enumerate(self.verdicts):
             moved = replace(verdict.look, box=motion.boxes(verdict.look.box))
             self.verdicts[number] = verdict._replace(look=moved)

@@ -12,11 +12,13 @@ from semfov.tracking.tracks import TRAIL, Tracks
 _PREFIX = "track_"
 _KINEMATICS = {"place": (2,), "velocity": (2,), "covariance": (2, 2)}
 _COLUMNS = {
+    "speed": (),
     "log_size": (2,),
     "size_variance": (),
     "shown_odds": (),
     "missed_odds": (),
     "unseen": (),
+    "magnification": (),
     "trail": (TRAIL, 2),
 }
 _NUMBERS = {"track_ids": 1, "labels": 1, "passes": 0}  # whole numbers, and the lowest of each

@@ -23,6 +23,9 @@ class TrackingModel:
 
     .. math:: \max_j \bigl(e_0 + e_1 \operatorname{logit} c_j\bigr) + w \sum_i \log\bigl(1 - d(s_i)\bigr)
 
+    Objects that are hard to see are missed again and again, so that w is less than 1. What a look as close has shown is
+    seen again with the probability a p, where p is that of its best detection, and a miss counts in full.
+
     Attributes:
         speed: standard deviation of each coordinate of an object's velocity, in sides a second.
         acceleration: density of the noise of the velocity, in square sides a second cubed.
@@ -37,6 +40,7 @@ class TrackingModel:
         offset: :math:`e_0`.
         score: :math:`e_1`.
         miss: w.
+        again: a.
         loss: share of the objects that cease to be there in a second.
         least: probability below which an object is forgotten.
     """
@@ -54,6 +58,7 @@ class TrackingModel:
     offset: float = 0.0
     score: float = 1.2
     miss: float = 0.3
+    again: float = 0.9
     loss: float = 0.1
     least: float = 0.02
 

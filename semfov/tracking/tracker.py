@@ -17,6 +17,7 @@ from semfov.tracking.kalman import Floats, Kinematics
 from semfov.tracking.model import TrackingModel
 from semfov.tracking.tracks import Tracks, no_trail
 
+_AS_CLOSE = 0.9  # of the magnification of a look, from which on another one is as close
 _SAME = 0.5  # intersection over union from which on two objects of a class are one
 
 
@@ -152,12 +153,18 @@ class Tracker:
         apart = (distance > model.gate) | (size_distance > model.gate) | (tracks.labels[:, None] != seen.labels)
         return np.where(apart, np.inf, model.density - by_place - by_size)
 
-    def _miss(self, seen: Seen, shown: NDArray[np.intp]) -> None:
+    def _miss(self, seen: Seen, shown_rows: NDArray[np.intp]) -> None:
         """Believe less in objects that the look should have shown."""
+        model = self.model
         tracks = self.tracks
-        chance = self.model.detects(tracks.sides * seen.magnification) * _chance_inside(tracks, seen.region)
-        chance[shown] = 0
-        self.tracks = replace(tracks, missed_odds=tracks.missed_odds + self.model.miss * np.log1p(-chance))
+        inside = _chance_inside(tracks, seen.region)
+        by_size = model.miss * np.log1p(-inside * model.detects(tracks.sides * seen.magnification))
+        shown = 1 / (1 + np.exp(-tracks.shown_odds))
+        by_look = np.log1p(-inside * model.again * shown)
+        is_as_close = seen.magnification >= _AS_CLOSE * tracks.magnification
+        change = np.where(is_as_close, np.minimum(by_size, by_look), by_size)
+        change[shown_rows] = 0
+        self.tracks = replace(tracks, missed_odds=tracks.missed_odds + change)
 
     def _hit(self, seen: Seen, noise: Floats, pairs: NDArray[np.intp]) -> None:
         """Update the objects that the look shows, by pairs `(P, 2)` of objects and detections."""
@@ -174,6 +181,7 @@ class Tracker:
             shown_odds=np.maximum(tracks.shown_odds, evidence),
             missed_odds=np.zeros(len(rows)),
             unseen=np.zeros(len(rows)),
+            magnification=np.full(len(rows), seen.magnification),
             passes=np.full(len(rows), seen.number),
         )
         others = np.setdiff1d(np.arange(len(self.tracks)), rows)
@@ -190,11 +198,13 @@ class Tracker:
             track_ids=self._last + 1 + np.arange(count),
             labels=seen.labels[fresh],
             kinematics=Kinematics.at(_centres(boxes), noise[fresh], speed),
+            speed=speed,
             log_size=log_size,
             size_variance=np.full(count, self.model.size**2),
             shown_odds=self.model.evidence(seen.scores[fresh]),
             missed_odds=np.zeros(count),
             unseen=np.zeros(count),
+            magnification=np.full(count, seen.magnification),
             passes=np.full(count, seen.number),
             trail=no_trail(count),
         )

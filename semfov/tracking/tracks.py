@@ -1,6 +1,7 @@
 """The objects that a tracker knows of, as columns."""
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from semfov.motion import Motion
 from semfov.tracking.kalman import Floats, Kinematics
 
 TRAIL = 32  # frames
-_STANDS = 4.0  # standard deviations of a velocity below which an object stands still
+_STANDING = 0.2  # share of the objects that stand still
 
 _Index = NDArray[np.intp] | NDArray[np.bool_] | slice
 
@@ -25,11 +26,13 @@ class Tracks:
         track_ids: `(N,)`, numbers from 1 that stay with the objects.
         labels: `(N,)`, classes 1..K.
         kinematics: their places and velocities.
+        speed: `(N,)`, standard deviation of each coordinate of a velocity before it is known, in pixels a second.
         log_size: `(N, 2)`, logarithms of width and height in pixels.
         size_variance: `(N,)`, variance of these.
         shown_odds: `(N,)`, log odds that they exist, by the best detection of each.
         missed_odds: `(N,)`, what looks that should have shown them have changed these by since their last detection.
         unseen: `(N,)`, seconds since a look showed them.
+        magnification: `(N,)`, of the last look that showed each, canvas pixels for a pixel of the frame.
         passes: `(N,)`, number of the last look that showed each; the first look of the stream is 0.
         trail: `(N, 32, 2)`, where they were in the last frames, the newest place last; NaN before they were known.
 
@@ -40,11 +43,13 @@ class Tracks:
     track_ids: NDArray[np.int64]
     labels: NDArray[np.int64]
     kinematics: Kinematics
+    speed: Floats
     log_size: Floats
     size_variance: Floats
     shown_odds: Floats
     missed_odds: Floats
     unseen: Floats
+    magnification: Floats
     passes: NDArray[np.int64]
     trail: Floats
 
@@ -62,14 +67,39 @@ class Tracks:
         numbers = np.zeros(0, np.int64)
         kinematics = Kinematics(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
         return cls(
-            numbers, numbers, kinematics, np.zeros((0, 2)), nothing, nothing, nothing, nothing, numbers, no_trail(0)
+            track_ids=numbers,
+            labels=numbers,
+            kinematics=kinematics,
+            speed=nothing,
+            log_size=np.zeros((0, 2)),
+            size_variance=nothing,
+            shown_odds=nothing,
+            missed_odds=nothing,
+            unseen=nothing,
+            magnification=nothing,
+            passes=numbers,
+            trail=no_trail(0),
         )
 
     @property
-    def moves(self) -> NDArray[np.bool_]:
-        """Whether they move, `(N,)`: their velocities are clearly not zero; others are taken to stand still."""
+    def standing(self) -> Floats:
+        r"""Probabilities that they stand still, `(N,)`, beside the scene.
+
+        The odds for a velocity of zero are those of its density after the looks to that before (Dickey, 1971), with the
+        velocity v, its variance :math:`\sigma^2` and that before, :math:`\sigma_0^2`, along each axis:
+
+        .. math:: \frac{\sigma_0^2}{\sigma^2} \exp\Bigl(-\frac{|v|^2}{2 \sigma^2}\Bigr)
+        """
         variance = self.kinematics.covariance[:, 1, 1]
-        return (self.kinematics.velocity**2).sum(-1) >= _STANDS**2 * variance
+        squared = (self.kinematics.velocity**2).sum(-1)
+        by_looks = np.log(self.speed**2 / variance) - squared / (2 * variance)
+        prior = np.log(_STANDING / (1 - _STANDING))
+        return 1 / (1 + np.exp(-(prior + by_looks)))
+
+    @property
+    def moves(self) -> NDArray[np.bool_]:
+        """Whether they rather move than stand still, `(N,)`."""
+        return self.standing < 0.5
 
     @property
     def place(self) -> Floats:
@@ -112,13 +142,16 @@ class Tracks:
     def fits(self) -> Floats:
         r"""Probabilities that their boxes fit them, `(N,)`.
 
+        It is one for an object that stands still, and for one that moves
+
         .. math:: 1 - \exp\bigl(-r^2 / 2 \sigma^2\bigr), \qquad r = \min(w, h) / 3
 
         with the variance :math:`\sigma^2` of each coordinate of the place, and the sides w and h of the box: one that
         is off by a third of a side overlaps its object by one half.
         """
         radius = np.exp(self.log_size.min(-1)) / 3
-        return -np.expm1(-(radius**2) / (2 * self.kinematics.variance))
+        of_moving = -np.expm1(-(radius**2) / (2 * self.kinematics.variance))
+        return self.standing + (1 - self.standing) * of_moving
 
     @property
     def probability(self) -> Tensor:
@@ -138,18 +171,13 @@ class Tracks:
         Returns:
             All of them.
         """
-        return Tracks(
-            np.concatenate([self.track_ids, others.track_ids]),
-            np.concatenate([self.labels, others.labels]),
-            self.kinematics.joined(others.kinematics),
-            np.concatenate([self.log_size, others.log_size]),
-            np.concatenate([self.size_variance, others.size_variance]),
-            np.concatenate([self.shown_odds, others.shown_odds]),
-            np.concatenate([self.missed_odds, others.missed_odds]),
-            np.concatenate([self.unseen, others.unseen]),
-            np.concatenate([self.passes, others.passes]),
-            np.concatenate([self.trail, others.trail]),
-        )
+        columns: dict[str, Any] = {}
+        for column in fields(self):
+            mine = getattr(self, column.name)
+            theirs = getattr(others, column.name)
+            is_array = isinstance(mine, np.ndarray)
+            columns[column.name] = np.concatenate([mine, theirs]) if is_array else mine.joined(theirs)
+        return Tracks(**columns)
 
     def carried(self, motion: Motion) -> "Tracks":
         """Carry the objects along with the camera.
@@ -164,6 +192,8 @@ class Tracks:
         return replace(
             self,
             kinematics=self.kinematics.carried(motion),
+            speed=self.speed * scale,
+            magnification=self.magnification / scale,
             log_size=self.log_size + np.log(scale)[:, None],
             trail=motion.points(torch.from_numpy(self.trail)).numpy(),
         )

@@ -62,9 +62,8 @@ def test_looking_where_it_should_be_and_not_finding_it_is_evidence_against_it():
     # A look from far away says less than one from nearby.
     assert before > faint > close
     assert before - faint < faint - close
-    expected = np.log(before / (1 - before)) + 0.3 * sum(
-        np.log(1 - TrackingModel().detects(np.sqrt(40 * 60) * magnification)) for magnification in (0.05, 1)
-    )
+    detected_from_afar = TrackingModel().detects(np.sqrt(40 * 60) * 0.05)
+    expected = np.log(before / (1 - before)) + 0.3 * np.log(1 - detected_from_afar) + np.log(1 - 0.9 * before)
     assert np.log(close / (1 - close)) == pytest.approx(expected, abs=1e-6)
     for _ in range(40):
         tracker.see(look(region=(0, 0, 400, 400)))
