@@ -100,6 +100,9 @@ class LookSettings(CheckedSettings):
 
         Args:
             kind: the kind of look.
+
+        Raises:
+            InputError: a setting is given that is not for this kind.
         """
         for setting in fields(self):
             value = getattr(self, setting.name)

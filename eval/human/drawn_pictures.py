@@ -140,7 +140,7 @@ def chart(rng: np.random.Generator) -> Picture:
     axes.set_xlabel(_words(rng, 2))
     content = io.BytesIO()
     figure.savefig(content, format="png")
-    return Image.open(content).convert("RGB")
+    return Image.open(content, formats=("PNG",)).convert("RGB")
 
 
 def line_drawing(rng: np.random.Generator) -> Picture:
@@ -209,7 +209,7 @@ def web_page_with_photograph(rng: np.random.Generator, photographs: Sequence[Pat
     page = web_page(rng)
     width, height = page.size
     bar = round(0.09 * height)
-    with Image.open(photographs[int(rng.integers(len(photographs)))]) as photograph:
+    with Image.open(photographs[int(rng.integers(len(photographs)))], formats=("JPEG", "PNG")) as photograph:
         banner = (width, round(height * rng.uniform(0.2, 0.4)))
         page.paste(photograph.convert("RGB").resize(banner), (0, bar))
     return page

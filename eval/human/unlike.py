@@ -100,7 +100,7 @@ def _changed(files: Sequence[Path]) -> dict[str, Callable[[np.random.Generator],
 
     def photograph(rng: np.random.Generator) -> Image.Image:
         """Draw a photograph."""
-        with Image.open(files[int(rng.integers(len(files)))]) as image:
+        with Image.open(files[int(rng.integers(len(files)))], formats=("JPEG", "PNG")) as image:
             return image.convert("RGB")
 
     return {

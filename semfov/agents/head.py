@@ -23,7 +23,7 @@ from semfov.head.belief import SceneObserver
 from semfov.head.camera import SceneLike, open_scene
 from semfov.head.closer import CloserLooks
 from semfov.head.episode import HeadStep, live, look_around
-from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain, was_fixated
+from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
 from semfov.io.compatibility import learned_for
 from semfov.io.pretrained import shipped_model
@@ -114,9 +114,9 @@ class HeadAgent(nn.Module):
         """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerSecond`).
 
         The target is found when the gaze is on a cell that holds it with a probability of at least `confirm` (None:
-        0.7). It is absent if every cell that the views show was fixated, it or an equally probable neighbour, or is
-        less probable than `give_up` (None: than a cell that was never seen), and no cell holds it with a probability of
-        one half. Both end the search. A search that a limit ends is undecided (`semfov.decision.settle`).
+        0.7). It is absent if every cell that the views show was fixated, or is less probable than `give_up` (None: than
+        a cell that was never seen), and no cell holds it with a probability of one half. Both end the search. A search
+        that a limit ends is undecided (`semfov.decision.settle`).
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
@@ -392,7 +392,7 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
     cells = belief.probability(target).double()
     located = place_known(cells[:, cell, None], torch.ones(1, 1, dtype=torch.bool), thresholds.place)
     # The chance of a view assumes that the target is in it, which is one of many.
-    best = cells.masked_fill(was_fixated(belief, views.world) | ~views.reachable, 0).amax(-1)
+    best = cells.masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
     outcome = int(settle(belief.presence(target).double(), located, best, thresholds))
     decision = conclude(outcome, belief, [step.detections], views.view_grid, target, step.action % views.cells)
     if decision.outcome != "found":

@@ -49,8 +49,8 @@ class Prior:
         fitted: share in the searches of the fit.
         known: whether the share of the fit is known; if not, both are equal and nothing changes.
 
-    >>> Prior(share=0.5, fitted=0.97)(0.99)  # of a class that nearly all searches of the fit found
-    0.7537688442211054
+    >>> round(Prior(share=0.5, fitted=0.97)(0.99), 3)  # of a class that nearly all searches of the fit found
+    0.754
     """
 
     share: float = 0.5

@@ -112,7 +112,7 @@ def share_in(density: Tensor, area: Area) -> float:
     Returns:
         The probability of a fixation in the area.
 
-    >>> share_in(torch.full((4, 5), 0.05), (0.5, 1, 2.5, 3))
+    >>> round(share_in(torch.full((4, 5), 0.05), (0.5, 1, 2.5, 3)), 6)
     0.2
     """
     left, top, right, bottom = area

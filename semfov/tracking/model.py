@@ -43,6 +43,10 @@ class TrackingModel:
         again: a.
         loss: share of the objects that cease to be there in a second.
         least: probability below which an object is forgotten.
+
+    >>> model = TrackingModel(miss=0.5)
+    >>> float(model.evidence(np.array([0.5]))[0])
+    0.0
     """
 
     speed: float = 2.0

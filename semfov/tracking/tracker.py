@@ -33,6 +33,11 @@ class Seen:
         region: `(x1, y1, x2, y2)`, the window in pixels of the frame.
         magnification: canvas pixels for a pixel of the frame.
         number: number of the look.
+
+    >>> box = np.array([[100.0, 100.0, 140.0, 180.0]])
+    >>> seen = Seen(box, np.array([0.8]), np.array([1]), np.array([False]), (0.0, 0.0, 400.0, 400.0), 1.0)
+    >>> len(seen.scores), seen.number
+    (1, 0)
     """
 
     boxes: Floats

@@ -149,6 +149,20 @@ class TestFixationDensity(GraphTester):
         return module({"fine": fine, "coarse": coarse}, (39, 52), scanpath).flatten(1)[:, ::97]
 
 
+class TestPictureLikeness(GraphTester):
+    """Fitted to correlated values."""
+
+    batched = (0,)
+    differentiable = (0,)
+
+    def make(self):
+        values = torch.randn(60, 5, generator=torch.Generator().manual_seed(0))
+        return saliency.PictureLikeness.fitted(values @ values[:5], axes=2)
+
+    def inputs(self):
+        return (rand(4, 5),)
+
+
 class TestOculomotorBias(GraphTester):
     batched = (0,)
     differentiable = (0, 1)
