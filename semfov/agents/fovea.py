@@ -36,6 +36,22 @@ class FoveaAgent(GazeParts):
         Returns:
             The record, with its decision.
         """
+        return self.open_search(image, target, settings).run()
+
+    def open_search(
+        self, image: Tensor, target: TargetLike, settings: SearchSettings, cells: Sequence[int] | None = None
+    ) -> FoveaEpisode:
+        """Open a search of a photograph, before its first look.
+
+        Args:
+            image: the photograph, `(1, 3, H, W)`.
+            target: class by name or index 1..K, several, or each with the probability that it is meant.
+            settings: the settings of the search.
+            cells: cells that are looked at one after the other; None follows the policy.
+
+        Returns:
+            The episode, which ends as a search does.
+        """
         limits = EpisodeLimits.of(settings)
         strategy, index, weights = self.searching.sought(target, ("background", *self.eye.detector.classes))
         plan = GazePlan(
@@ -46,6 +62,7 @@ class FoveaAgent(GazeParts):
             shifts=_shifts(settings.shifts, 30, limits),
             seed=settings.seed,
             decisions=settings if settings.boxes is None else replace(settings, closer=0),
+            cells=cells,
         )
         boxes = settings.boxes
 
@@ -56,7 +73,7 @@ class FoveaAgent(GazeParts):
             return AtDetection(grid, index, weights, score)
 
         learned = boxes is None and plan.thresholds is not None
-        return FoveaEpisode(plan, image, limits, None if learned else criterion).run()
+        return FoveaEpisode(plan, image, limits, None if learned else criterion)
 
     def explore(self, image: Tensor, settings: ExploreSettings) -> Scanpath:
         """Explore a photograph, without a target (`ActivePerception.explore`).

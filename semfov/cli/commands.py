@@ -251,12 +251,13 @@ semfov app: a page in the browser on which to try the agent out
 usage: semfov app [DETECTOR] [options]
 
 {_AGENT.partition(chr(10))[2]}
-  --host ADDRESS       address to serve the page on (default 127.0.0.1: this machine alone; no password is asked for)
+  --host ADDRESS       address to serve the page on (default 127.0.0.1: this machine alone; others need the token in
+                       the address that is printed)
   --port N             its port (default: the first free one from 7860 on)
 
-Give it a picture or take an example, choose a class, and search, find all objects, explore, or predict where people
-look. Or look yourself: click on the picture, and see what the fovea sees there and what the agent then believes.
-Pictures are kept nowhere, and nothing is sent elsewhere. Ctrl-C ends it.
+A photograph is there: press Look. Or give it a picture of yours, and find all objects, search for a class, explore, or
+predict where people look. Or look yourself: the fovea follows the pointer, and a click looks; can you find it in fewer
+looks than the agent? Nothing is sent elsewhere; pictures are deleted after an hour, and at the end. Ctrl-C ends it.
 """,
     ),
     "mcp": Subcommand(

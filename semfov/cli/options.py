@@ -238,8 +238,8 @@ class AppOptions(AgentOptions):
     """A page on which to try the agent out, served to the browsers of this machine.
 
     Args:
-        host: address that the page is served on. Another one than that of this machine lets others use it: anybody who
-            reaches it, as it asks for no password.
+        host: address that the page is served on. Another one than that of this machine lets others use it, who need
+            the token in the address that is printed.
         port: its port (none: the first free one from 7860 on).
     """
 

@@ -1,6 +1,6 @@
 """The page on which to try an agent out: looks at given cells, and the page in Chromium."""
 
-import asyncio
+import json
 import os
 import re
 import shutil
@@ -8,48 +8,22 @@ import socket
 import sys
 import urllib.error
 import urllib.request
-from types import ModuleType, SimpleNamespace
+from concurrent.futures import ThreadPoolExecutor
+from html import unescape
+from types import ModuleType
 
 import pytest
 import torch
 
 from semfov.cli import app
-from semfov.cli.app import _Calls, _Doorkeeper, _look_at_cells
+from semfov.cli.app import _Calls
 from semfov.cli.main import main
-from semfov.data import read_image
-from tests.pretended import a_gpu
+from semfov.data import Scene, read_image
+from tests import small
 from tests.small import rand
 
 NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((path for name in NAMES if name and (path := shutil.which(name))), None)
-
-
-@pytest.mark.slow
-def test_looks_at_cells_that_the_agent_chose_are_those_of_its_search(agent, photo):
-    image = read_image(photo)
-    own = agent.search(image, "wine glass", how="fovea", start=47, shifts=3, closer=0)
-    assert len(own) == 4
-    cells = own.cells.tolist()
-    for count in (1, 2, 3):
-        looked = _look_at_cells(agent, image, "wine glass", cells[:count])
-        assert looked.record.cells.tolist() == cells[:count]
-        torch.testing.assert_close(looked.record.presence, own.presence[:count])
-        values = own.values[count - 1]
-        assert float(values[looked.advice]) == pytest.approx(float(values[cells[count]]))  # ties are drawn
-        assert looked.advice not in cells[:count]
-        assert looked.agent.cells.tolist() == cells[:count]
-    assert "before it" in looked.describe()
-    assert "before it" not in _look_at_cells(agent, image, "wine glass", [3]).describe()
-
-
-def test_looks_at_cells_beside_a_gpu_are_those_on_the_cpu(agent):
-    image = rand(3, 120, 160)
-    here = _look_at_cells(agent, image, "wine glass", [3, 7])
-    with a_gpu():
-        there = _look_at_cells(agent.to("cuda"), image, "wine glass", [3, 7])
-    assert there.advice == here.advice
-    assert there.record.presence is not None
-    torch.testing.assert_close(there.record.presence, here.record.presence, rtol=1e-3, atol=1e-4)
 
 
 def test_what_cannot_be_served_is_told_before_anything_is_loaded(monkeypatch, capsys):
@@ -81,29 +55,74 @@ def calls(agent, monkeypatch):
 
 def test_what_the_page_calls_needs_no_gradio_but_for_its_errors(agent, calls, photo):
     path, (_, height, width) = str(photo), read_image(photo).shape
-    refused = {"picture: expected one": (None, "red"), "class: expected one to search for": (path, "all classes")}
-    for said, given in refused.items():
-        with pytest.raises(Told, match=said):
-            calls.look(*given, "search", 3.0)
-        with pytest.raises(Told, match=said):
-            calls.click(*given, [], SimpleNamespace(index=(1, 1)))
-    for task, target in (("search", "red"), ("find all", "all classes")):
-        words, page = calls.look(path, target, task, 3.0)
-        assert words
+    with pytest.raises(Told, match="picture: expected one"):
+        calls.click(None, "red", [], (1, 1))
+    for task, target in (("search", "red"), ("find all", "all classes"), ("explore", "all classes")):
+        asked, page = calls.look(path, target, task, 3.0)
+        assert asked == ""
         assert page.startswith('<iframe title="The looks" sandbox="allow-scripts" srcdoc="&lt;!DOCTYPE html')
-    with pytest.raises(Told, match="prior: expected a share above 0 and below 1"):
-        calls.look(path, "red", "search", 3.0, 1.5)
-    assert calls.look(path, "all classes", "find all", 3.0, 1.5)[0]  # which has no use for it
+    for prior in ("1.5", "often"):
+        with pytest.raises(Told, match="prior: expected a share above 0 and below 1"):
+            calls.look(path, "red", "search", 3.0, prior)
+    assert calls.look(path, "all classes", "find all", 3.0, "1.5")[1]  # which has no use for it
+    with pytest.raises(Told, match=r"prior: expected None for models without the shares of their fit, got 0\.2"):
+        calls.look(path, "red", "search", 3.0, " 0.2 ")
+    assert calls.look(path, "red", "search", 3.0, " ")[1]
     cells: list[int] = []
-    for x, y in ((5, 5), (width - 5, height - 5)):
-        cells, clicked, seen, believed, words = calls.click(path, "red", cells, SimpleNamespace(index=(x, y)))
-        assert clicked.size == (width, height)
-        assert seen is not None
-        assert believed is not None
+    for x, y in ((5, height - 5), (width - 5, height - 5)):
+        cells, marks, words = calls.click(path, "wine glass", cells, (x, y))
+        assert marks
         assert words
-    assert cells == [0, agent.columns * agent.rows - 1]
-    assert calls.fresh(path)[0] == []
-    assert calls.fresh(None)[1] is None
+    count = agent.columns * agent.rows
+    assert cells == [count - agent.columns, count - 1]
+    assert calls.fresh(path, "red")[0] == []
+    assert calls.fresh(None, "red")[1] == ""
+
+
+def test_what_is_missing_is_asked_for_in_words_and_the_one_of_most_objects_is_usual(calls, photo):
+    assert calls.look(None, "red", "search", 3.0) == ("Give it a picture, or take an example.", "")
+    asked, page = calls.look(str(photo), "all classes", "search", 3.0)
+    assert asked.startswith("Choose a class")
+    assert page == ""
+    cells, marks, asked = calls.click(str(photo), calls.sought("all classes", ""), [3], (1, 1))
+    assert (cells, marks) == ([3], "")
+    assert asked.startswith("Choose a class")
+    assert calls.sought("all classes", "red") == "red"
+    assert calls.sought("wine glass", "red") == "wine glass"
+
+
+def test_examples_come_in_turn_with_the_class_that_suits_the_task():
+    calls = _Calls(small.agent(small.Coloured(("car", "person"))))
+    picture, target, usual, following = calls.take(0, "find all")
+    people = [int((scene.labels == 2).sum()) for scene in calls.examples]
+    cars = [int((scene.labels == 1).sum()) for scene in calls.examples]
+    assert picture.size == calls.examples[0].size
+    assert (target, following) == ("all classes", 1)
+    assert usual == ("person" if people[0] > cars[0] else "car")
+    for number in range(len(calls.examples)):
+        expected = "person" if people[number] > cars[number] else "car"
+        assert calls.take(number, "search")[1:3] == (expected, expected)
+    assert calls.take(len(calls.examples), "find all")[0].tobytes() == picture.tobytes()
+
+
+def test_a_detector_of_other_classes_has_no_examples(calls):
+    assert calls.take(0, "search") == (None, "all classes", "", 0)
+
+
+@pytest.mark.parametrize(("task", "target"), [("search", "red"), ("find all", "all classes"), ("explore", "red")])
+def test_a_page_says_its_outcome_once(calls, photo, task, target):
+    _, page = calls.look(str(photo), target, task, 3.0)
+    document = unescape(re.search('srcdoc="(.*)"', page, re.DOTALL)[1])
+    markup = document.split('<script type="application/json"')[0]
+    heading = unescape(re.search("<h1>(.*?)</h1>", markup)[1])
+    assert heading
+    assert unescape(markup).count(heading.split(". ")[0]) == 2  # the title of the document, and the heading
+    assert 'class="outcome" data-about="decision"></p>' in markup
+
+
+def test_a_picture_that_was_removed_is_asked_for_again(calls, tmp_path):
+    with pytest.raises(Told, match="picture: expected it once more"):
+        calls.look(str(tmp_path / "gone.png"), "red", "search", 3.0)
 
 
 EPS = b"""%!PS-Adobe-3.0 EPSF-3.0
@@ -126,15 +145,15 @@ def test_files_that_only_other_programs_read_start_none(calls, tmp_path, monkeyp
         with pytest.raises(Told, match="not an image in a format that is read"):
             calls.look(path, "red", "search", 3.0)
         with pytest.raises(Told, match="not an image in a format that is read"):
-            calls.click(path, "red", [], SimpleNamespace(index=(1, 1)))
+            calls.click(path, "red", [], (1, 1))
         with pytest.raises(Told, match="not an image in a format that is read"):
-            calls.fresh(path)
+            calls.fresh(path, "red")
     assert not (tmp_path / "started").exists()
 
 
 def test_a_picture_for_which_everybody_would_wait_is_refused_by_its_size(calls, photo, monkeypatch):
     monkeypatch.setattr(app, "_MOST_PIXELS", 100)
-    for call in (calls.fresh, lambda path: calls.look(path, "red", "search", 3.0)):
+    for call in (lambda path: calls.fresh(path, "red"), lambda path: calls.look(path, "red", "search", 3.0)):
         with pytest.raises(Told, match=r"picture: expected at most 100 pixels, got \d+ × \d+; reduce it"):
             call(str(photo))
 
@@ -161,58 +180,31 @@ def test_a_visitor_stops_its_own_search(calls, agent, photo, monkeypatch):
     assert counts["impatient"] < counts["patient"] == 4
 
 
-@pytest.mark.parametrize(
-    ("host", "address", "origin", "admitted"),
-    [
-        ("127.0.0.1", "127.0.0.1:7860", None, True),
-        ("127.0.0.1", "localhost:7860", "http://localhost:7860", True),
-        ("127.0.0.1", "[::1]:7860", None, True),
-        ("127.0.0.1", "127.0.0.1:7860", "http://127.0.0.1:7861", False),
-        ("127.0.0.1", "127.0.0.1:7860", "https://elsewhere.org", False),
-        ("127.0.0.1", "127.0.0.1:7860", "null", False),
-        ("127.0.0.1", "elsewhere.org:7860", "http://elsewhere.org:7860", False),
-        ("127.0.0.1", "192.168.0.7:7860", None, False),
-        ("127.0.0.1", "", None, False),
-        ("127.0.0.1", "[", None, False),
-        ("192.168.0.7", "192.168.0.7:7860", "http://192.168.0.7:7860", True),
-        ("192.168.0.7", "192.168.0.8:7860", None, False),
-        ("lab.example.org", "LAB.example.org:7860", "http://lab.example.org:7860", True),
-        ("0.0.0.0", "192.168.0.8:7860", "http://192.168.0.8:7860", True),
-        ("0.0.0.0", "elsewhere.org", "http://elsewhere.org", False),
-        ("0.0.0.0", f"{socket.gethostname()}:7860", None, True),
-    ],
-)
-@pytest.mark.parametrize("kind", ["http", "websocket"])
-def test_requests_enter_by_the_address_that_was_asked_for_and_from_its_own_page(host, address, origin, admitted, kind):
-    """A page of another site may know the port, and may have a name of its own for this machine."""
-    entered, sent = [], []
-
-    async def page(scope, receive, send):
-        entered.append(scope)
-
-    async def send(message):
-        sent.append(message)
-
-    headers = [(b"host", address.encode()), *([(b"origin", origin.encode())] if origin else [])]
-    asyncio.run(_Doorkeeper(page, host)({"type": kind, "headers": headers}, None, send))
-    assert bool(entered) == admitted
-    assert bool(sent) != admitted
-    assert admitted or sent[0].get("status", 403) == 403
+def red_scene(name, classes):
+    """An example: a red square on grey noise, which is blurred or sharp."""
+    image = rand(1, 120, 160).expand(3, -1, -1).clone()
+    image[:, 8:28, 8:28] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    return Scene(name, name, image, torch.tensor([[8.0, 8, 28, 28]]), torch.tensor([1]))
 
 
 @pytest.fixture
-def served(agent, tmp_path, monkeypatch):
-    """The page of the agent of squares, opened in Chromium on a telephone; it may print and request nothing."""
-    gradio = pytest.importorskip("gradio", reason='needs Gradio (pip install "semfov[app]")')
+def opened(agent, tmp_path, monkeypatch):
+    """Serves the page of the agent of squares, with a token or None; returns its address."""
+    pytest.importorskip("gradio", reason='needs Gradio (pip install "semfov[app]")')
+    monkeypatch.setenv("GRADIO_TEMP_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(app, "example_scene", red_scene)
+    page = app._make_page(agent)
+    yield lambda token: app._launched(page, "127.0.0.1", None, token)
+    page.close()
+
+
+@pytest.fixture
+def served(opened):
+    """The page, opened in Chromium on a telephone; it may print and request nothing."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
     if CHROMIUM is None:
         pytest.skip("needs Chromium (apt-get install chromium, or set $CHROMIUM)")
-    from semfov.cli.app import _launched, _make_page
-
-    assert gradio
-    monkeypatch.setenv("GRADIO_TEMP_DIR", str(tmp_path / "kept"))
-    page, told = _make_page(agent), []
-    address = _launched(page, "127.0.0.1", None)
+    address, told = opened(None), []
     with playwright.sync_playwright() as program:
         browser = program.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         view = browser.new_page(viewport={"width": 390, "height": 900})
@@ -224,29 +216,146 @@ def served(agent, tmp_path, monkeypatch):
         yield view
         assert told == []
         browser.close()
-    page.close()
+
+
+def give_file(served, path):
+    """Take the example away, and give a file instead."""
+    served.wait_for_selector("#picture img")
+    served.get_by_label("Remove Image").click()
+    served.set_input_files("#picture input[type=file]", str(path))
+
+
+def press_look(served):
+    """Press *Look*; returns the first heading of the page that comes."""
+    served.get_by_role("button", name="Look", exact=True).click()
+    served.wait_for_selector(".page iframe", timeout=60_000)
+    heading = served.frame_locator(".page iframe").get_by_role("heading", level=1)
+    heading.wait_for()
+    return heading
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # those of Gradio and of what it imports
-def test_a_picture_a_search_and_a_click_on_the_width_of_a_telephone(served, photo):
-    served.set_input_files("input[type=file]", str(photo))
-    served.get_by_role("button", name="Look", exact=True).click()
-    served.get_by_text("class: expected one to search for, got all classes").wait_for(timeout=60_000)
-    served.get_by_label("Class").click()
-    served.get_by_role("option", name="red").click()
-    served.get_by_role("button", name="Look", exact=True).click()
-    served.wait_for_selector(".page iframe", timeout=60_000)
-    frame = served.frame_locator(".page iframe")
-    frame.get_by_role("heading", level=1).wait_for()
-    assert "red" in frame.get_by_role("heading", level=1).inner_text()
-    served.get_by_role("tab", name="Look yourself").click()
-    own = served.locator("#own img")
-    for number in (1, 2):
-        box = own.bounding_box()
-        own.click(position={"x": 0.1 * number * box["width"], "y": 0.1 * box["height"]})
-        served.get_by_text(f"Look {number}", exact=True).wait_for(timeout=60_000)
+def test_the_first_press_shows_a_result_on_the_first_screen_of_a_telephone(served):
+    served.wait_for_selector("#picture img")  # an example is there
+    heading = press_look(served)
+    assert heading.inner_text().startswith("1 object found.")
+    assert served.get_by_text("Error").count() == 0
+    picture = served.frame_locator(".page iframe").locator(".large svg").first
+    assert picture.bounding_box()["y"] + 100 < 900
+    assert served.evaluate("window.scrollY") == 0
     assert served.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_fields_that_a_task_does_not_use_are_grey_on_a_telephone(served):
+    served.get_by_role("button", name="More settings").click()
+    used = {"find all": (True, True, False), "search": (True, True, True), "explore": (False, True, False)}
+    fields = ("Class", "number input for Looks at most", "Share of your pictures")
+    for task, expected in [*used.items(), ("gaze", (False, False, False)), ("find all", used["find all"])]:
+        served.get_by_label(task, exact=True).check()
+        for field, is_used in zip(fields, expected, strict=True):
+            expect_enabled(served.get_by_label(field).first, is_used)
+        if task == "search":
+            assert served.get_by_label("Class").first.input_value() == "red"  # that of most objects of the example
+
+
+def expect_enabled(field, is_used):
+    """Wait until a field can be used, or not."""
+    from playwright.sync_api import expect
+
+    (expect(field).to_be_enabled if is_used else expect(field).to_be_disabled)()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_picture_a_search_and_looks_of_ones_own_on_the_width_of_a_telephone(served, photo):
+    give_file(served, photo)
+    served.wait_for_selector("#picture img")
+    served.get_by_label("search", exact=True).check()
+    served.get_by_role("button", name="Look", exact=True).click()
+    served.get_by_text("Choose a class: a search looks for one.").wait_for(timeout=60_000)
+    served.get_by_label("Class").first.click()
+    served.get_by_role("option", name="red").click()
+    assert "red" in press_look(served).inner_text()
+    served.get_by_role("tab", name="Look yourself").click()
+    canvas = served.locator("#own canvas")
+    for number, (x, y) in enumerate([(0.9, 0.9), (0.11, 0.15)]):
+        served.wait_for_timeout(500)
+        box = canvas.bounding_box()
+        canvas.click(position={"x": x * box["width"], "y": y * box["height"]})
+        served.get_by_text(f"Look {number}", exact=True).wait_for(timeout=60_000)
+    served.get_by_text("You: found in 2 looks.").wait_for()
+    assert served.locator("#own .belief").count() == 48
+    assert served.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_fovea_follows_the_pointer_without_the_server_on_a_telephone(served):
+    served.get_by_role("tab", name="Look yourself").click()
+    served.get_by_text("Click to look: find “red”").wait_for()
+    canvas = served.locator("#own canvas")
+    asked = []
+    served.on("request", lambda each: asked.append(each.url))
+    views = []
+    for x, y in ((0.2, 0.2), (0.8, 0.7)):
+        box = canvas.bounding_box()
+        served.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        served.wait_for_timeout(300)
+        views.append(canvas.evaluate(SHARPNESS))
+    assert asked == []
+    assert views[0]["first"] > 2 * views[0]["second"]
+    assert views[1]["second"] > 2 * views[1]["first"]
+
+
+SHARPNESS = """canvas => {
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", {willReadFrequently: true});
+  copy.drawImage(canvas, 0, 0);
+  const sum = (x, y) => {
+    const {data} = copy.getImageData(x * canvas.width - 20, y * canvas.height - 20, 40, 40);
+    let total = 0;
+    for (let at = 4; at < data.length; at += 4) total += Math.abs(data[at] - data[at - 4]);
+    return total;
+  };
+  return {first: sum(0.2, 0.2), second: sum(0.8, 0.7)};
+}"""
+"""Sums of the differences of neighbouring pixels around two points of a canvas."""
+
+
+def look_over_http(address, photo, visitor):
+    """Give a picture and press *Look* by requests, as a browser does; returns the data of the answer."""
+    import httpx
+
+    with httpx.Client(base_url=address.partition("?")[0], follow_redirects=True, timeout=120) as client:
+        client.get(address).raise_for_status()  # and keep the cookie
+        look = next(each for each in client.get("config").json()["dependencies"] if len(each["inputs"]) == 5)
+        path = client.post("gradio_api/upload", files={"files": photo.read_bytes()}).json()[0]
+        picture = {"path": path, "meta": {"_type": "gradio.FileData"}}
+        given = {"data": [picture, "red", "search", 4, ""], "fn_index": look["id"], "session_hash": visitor}
+        client.post("gradio_api/queue/join", json=given).raise_for_status()
+        with client.stream("GET", "gradio_api/queue/data", params={"session_hash": visitor}) as answers:
+            for line in answers.iter_lines():
+                if "process_completed" in line:
+                    return json.loads(line.removeprefix("data:"))["output"]["data"]
+    raise AssertionError("the answers ended before the look")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_twenty_visitors_with_the_token_are_answered_and_none_without_it_on_a_telephone(opened, photo):
+    import httpx
+
+    address = opened("sesame")
+    assert address.endswith("/?token=sesame")
+    for wrong in (address.partition("?")[0], address.replace("sesame", "sesam")):
+        assert httpx.get(wrong, follow_redirects=True).status_code == 401
+    with ThreadPoolExecutor(20) as visitors:
+        answers = list(visitors.map(lambda number: look_over_http(address, photo, f"visitor{number}"), range(20)))
+    assert len(answers) == 20
+    for _, page in answers:
+        assert "“red” found" in unescape(unescape(page))
 
 
 @pytest.mark.slow
@@ -263,11 +372,11 @@ def test_strangers_and_large_files_are_turned_away_on_a_telephone(served, tmp_pa
         assert caught.value.code == 403
         caught.value.close()
     (tmp_path / "photo.png").write_bytes(EPS)
-    served.set_input_files("input[type=file]", str(tmp_path / "photo.png"))
+    give_file(served, tmp_path / "photo.png")
     served.get_by_text("not an image in a format that is read").first.wait_for(timeout=60_000)
     assert not (tmp_path / "started").exists()
     with (tmp_path / "large.png").open("wb") as file:
         file.truncate(app._MOST_BYTES + 1)
     served.reload()
-    served.set_input_files("input[type=file]", str(tmp_path / "large.png"))
+    give_file(served, tmp_path / "large.png")
     served.get_by_text("maximum").first.wait_for(timeout=60_000)
