@@ -24,7 +24,7 @@ TEMPLATE = """<div class="own">
 <div class="stage">
 <canvas tabindex="0" role="img" aria-label="What the fovea sees. Arrow keys move it, Enter looks."></canvas>
 <svg aria-hidden="true"></svg></div>
-<label><input type="checkbox" checked> Show the belief, orange</label>
+<label><input type="checkbox" checked> Show where it may be, in orange</label>
 </div>"""
 
 STYLE = """.stage { position: relative; line-height: 0; }
