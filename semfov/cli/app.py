@@ -68,7 +68,10 @@ footer { display: none !important; }
 .page iframe { width: 100%; height: max(30rem, calc(100vh - 8.5rem)); border: 0; border-radius: 8px; }
 #task .wrap { flex-wrap: nowrap; gap: 4px; }
 #task label { padding: 6px 8px; white-space: nowrap; }
+#task label:focus-within { outline: 2px solid var(--primary-600); }
 #press { flex-wrap: nowrap; align-items: stretch; gap: 8px; }
+#press .primary { background: var(--primary-600); }
+body:not(.dark) [role="tab"].selected { color: var(--primary-700) !important; }
 @media (max-width: 640px) {
   .main.fillable { padding: 8px !important; }
   .main.fillable :is(.row, .column) { gap: 8px; }

@@ -237,6 +237,7 @@ def press_look(served):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # those of Gradio and of what it imports
 def test_the_first_press_shows_a_result_on_the_first_screen_of_a_telephone(served):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="needs axe-playwright-python")
     served.wait_for_selector("#picture img")  # an example is there
     heading = press_look(served)
     assert heading.inner_text().startswith("1 object found.")
@@ -244,6 +245,10 @@ def test_the_first_press_shows_a_result_on_the_first_screen_of_a_telephone(serve
     picture = served.frame_locator(".page iframe").locator(".large svg").first
     assert picture.bounding_box()["y"] + 100 < 900
     assert served.evaluate("window.scrollY") == 0
+    served.get_by_role("tab", name="Look yourself").click()
+    served.locator("#own canvas").wait_for()
+    found = axe.Axe().run(served)
+    assert found.violations_count == 0, found.generate_report()
     assert served.evaluate("document.documentElement.scrollWidth") <= 390
 
 
