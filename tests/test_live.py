@@ -7,11 +7,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional as F
 
 import semfov
 from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
+from semfov.data.examples import example
 from semfov.data.sources import open_stream
 from semfov.episode import Forgetting
 from semfov.gaze.policies import Policy
@@ -343,3 +345,19 @@ def test_a_moment_that_nobody_keeps_makes_no_photograph(monkeypatch):
         moment = live.step(scene(20 * number), 0.2)
     assert moment.number == 5
     assert not reduced
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [0, 4, 12])
+def test_a_target_is_found_while_the_camera_moves(step):
+    """The closer look that is due is made in the next frame, where the camera has moved on."""
+    beach = F.interpolate(example("beach")[None], scale_factor=2, mode="bilinear")[0].clamp(0, 1)
+    live = ActivePerception.recommended().live("boat")
+    outcomes = []
+    for number in range(8):
+        left = 20 + step * number
+        frame = beach[:, 40:680, left : left + 960]
+        # The first pose is that of the scene.
+        moment = live.step(frame, pose=[[1.0, 0.0, float(-step * number)], [0.0, 1.0, 0.0]])
+        outcomes.append(None if moment.decision is None else moment.decision.outcome)
+    assert outcomes[-1] == "found"
