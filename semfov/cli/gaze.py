@@ -154,30 +154,37 @@ class _GazeJob:
 
     def write(self, *, complete: bool) -> None:
         """Write scanpaths, table of pictures and page of the pictures so far, and list all files."""
-        from semfov.human.fixations.table import write_table
-
         outcomes = dict(sorted(self.outcomes.items()))
         written: list[object] = [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
-        names = self._names()
         if self.table is not None and outcomes:
-            paths = [path for number, outcome in outcomes.items() for path in _fixations(names[number], outcome)]
-            write_table(self.table, paths)
-            pictures = self.table.with_name(_PICTURES if not self.kind else f"{self.table.stem}-{_PICTURES}")
-            write_text(
-                pictures, _table_of_pictures({names[number]: each["facts"] for number, each in outcomes.items()})
-            )
-            written[:0] = [self.table, pictures]
+            written[:0] = self._write_tables(self.table, outcomes)
         drafts = Drafts(*self.predictions.values()) if len(self.predictions) == 2 else None
         if drafts is not None:
             print(drafts.describe(self.areas))
             written += self._figure_of(drafts)
         if self.report is not None and outcomes:
-            for number, outcome in outcomes.items():
-                outcome["part"]["picture"]["name"] = names[number]
-            parts = [outcome["part"] for outcome in outcomes.values()]
-            before = "" if drafts is None else drafts_section(drafts, self.areas)
-            written.append(write_html(self.report, gaze_page_html("semfov: where people look", parts, before)))
+            written.append(self._write_page(self.report, outcomes, drafts))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
+
+    def _write_tables(self, table: Path, outcomes: Mapping[int, _Outcome]) -> list[Path]:
+        """Write the table of scanpaths, and beside it that of the pictures."""
+        from semfov.human.fixations.table import write_table
+
+        names = self._names()
+        paths = [path for number, outcome in outcomes.items() for path in _fixations(names[number], outcome)]
+        write_table(table, paths)
+        pictures = table.with_name(f"{table.stem}-{_PICTURES}" if self.kind else _PICTURES)
+        write_text(pictures, _table_of_pictures({names[number]: each["facts"] for number, each in outcomes.items()}))
+        return [table, pictures]
+
+    def _write_page(self, report: Path, outcomes: Mapping[int, _Outcome], drafts: Drafts | None) -> Path:
+        """Write the page of all pictures, which begins with the comparison of two drafts where there are some."""
+        names = self._names()
+        for number, outcome in outcomes.items():
+            outcome["part"]["picture"]["name"] = names[number]
+        parts = [outcome["part"] for outcome in outcomes.values()]
+        before = "" if drafts is None else drafts_section(drafts, self.areas)
+        return write_html(report, gaze_page_html("semfov: where people look", parts, before))
 
     def _figure_of(self, drafts: Drafts) -> list[Path]:
         """Write the figure of two drafts, where one is asked for."""

@@ -70,22 +70,34 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
             "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
         },
     }
-    # The facts about one of several episodes stand where it is chosen; a single one begins with its outcome.
-    is_chosen = bool(sections) or len(episodes) != 1
     script_draws = not episodes or any(isinstance(part, EpisodePart) for part in parts)
+    # A single episode begins with its outcome; the facts about one of several stand where it is chosen.
+    is_single = not sections and len(episodes) == 1
     contents = {
         "title": escape(title),
         "sections": sections,
-        "outcome": "" if is_chosen else _outcome_html(episodes[0]),
-        "heading": "" if is_chosen else ' class="unseen"',
-        "of_episode": _about_html(episodes) if is_chosen else "",
-        "details": "" if is_chosen else _details_html(episodes[0]),
-        "looks": "".join(part.looks_html(is_named=is_chosen) for part in parts),
+        "looks": "".join(part.looks_html(is_named=not is_single) for part in parts),
         "objects": "".join(part.section_html for part in parts),
         "least": f"{CONFIDENT:g}",
         "fixations": "" if script_draws else " hidden",
+        **(_of_single(episodes[0]) if is_single else _of_several(episodes)),
     }
     return filled("page", data, contents)
+
+
+def _of_single(episode: Data) -> dict[str, str]:
+    """Fill the places of a page that depend on how many episodes there are, for one."""
+    return {
+        "outcome": _outcome_html(episode),
+        "heading": ' class="unseen"',
+        "of_episode": "",
+        "details": _details_html(episode),
+    }
+
+
+def _of_several(episodes: Sequence[Data]) -> dict[str, str]:
+    """Fill them for several episodes, of which one is chosen."""
+    return {"outcome": "", "heading": "", "of_episode": _about_html(episodes), "details": ""}
 
 
 def _outcome_html(episode: Data) -> str:
