@@ -82,7 +82,7 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
 {_AGENT}
 {_LOOKS}
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a pass
-  --closer N           most closer looks (0: none); --prior P: share of your pictures with the target (default: half)
+  --closer N           most closer looks (0: none); --prior P: share of pictures with it (default: of the fit; 0.5: half)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
@@ -204,7 +204,7 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   --rate R             rate at which evidence fades, per second (0: never; default: 2.5 for a fovea, 0.75 for windows)
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a frame
   --closer N           most closer looks in the time until half of the evidence has faded (0: none)
-  --prior P            how often the target is there: the share of the frames that hold it (default: half)
+  --prior P            share of the frames that hold the target (default: as in the pictures of the fit; 0.5: one half)
 {_AGENT}
   --start 5,5          first cell as column,row, or its number; --seed N draws it
   --out FILE           video to write (.mp4 or .avi), with gaze and belief, or windows and objects
