@@ -1,9 +1,10 @@
 """What `semfov mcp` offers a language model: searches, crops and gaze in the pictures below one folder."""
 
+import math
 import threading
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
@@ -52,15 +53,16 @@ class Answer:
 
     `result` says it in words, and `ended` why no further look was taken. `expected` has the number of objects of each
     class that is expected in all, also where nobody looked, and `further` that of those which are not listed yet: what
-    further looks can bring.
+    further looks can bring. Both are None for a class of which no number is known, and empty for a search, whose
+    looks count nothing.
     """
 
     result: str
     ended: str
     probability: float | None
     objects: list[Found]
-    expected: dict[str, float]
-    further: dict[str, float]
+    expected: dict[str, float | None]
+    further: dict[str, float | None]
     passes: int
     size: list[int]
 
@@ -261,17 +263,24 @@ def _check_passes(passes: int) -> None:
 def _answer(record: Record) -> Answer:
     """Make the answer from a record."""
     listed = Counter(record.classes[label] for label in record.objects.labels.tolist())
-    further = {name: round(max(number - listed[name], 0.0), 2) for name, number in record.expected.items()}
+    # A search ends as soon as it is decided, so its looks say little of how many there are.
+    expected = record.expected if record.decision is None else {}
+    further = {name: max(number - listed[name], 0.0) for name, number in expected.items()}
     return Answer(
         result=record.describe(),
         ended=record.why_it_ended(),
         probability=None if record.decision is None else round(record.decision.probability, 4),
         objects=_rows(record.objects, record.classes),
-        expected={name: round(number, 2) for name, number in record.expected.items()},
-        further=further,
+        expected=_known_numbers(expected),
+        further=_known_numbers(further),
         passes=record.passes,
         size=list(record.size),
     )
+
+
+def _known_numbers(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    """Round numbers by class; None for NaN, which JSON does not have."""
+    return {name: None if math.isnan(number) else round(number, 2) for name, number in numbers.items()}
 
 
 def _rows(objects: Objects, classes: tuple[str, ...], corner: tuple[int, int] = (0, 0)) -> list[Found]:

@@ -92,6 +92,7 @@ def test_a_search_answers_as_the_agent_does(tools, agent):
     assert told["passes"] == record.passes
     assert told["size"] == [640, 499]
     assert [row["name"] for row in told["objects"]] == [agent.classes[label] for label in record.objects.labels]
+    assert told["expected"] == told["further"] == {}
 
 
 @pytest.mark.slow
@@ -106,6 +107,16 @@ def test_a_find_says_what_further_looks_can_bring(tools):
     for told in (few, many):
         more = told["expected"]["person"] - len(told["objects"])
         assert told["further"]["person"] == pytest.approx(max(more, 0), abs=0.01)
+
+
+def test_a_find_of_all_classes_has_no_number_where_none_is_known(tools, agent):
+    told = call(tools, "find", picture="sub/beach.png", classes=[], passes=2).structured_content
+    record = agent.find_all(tools.folder / "sub" / "beach.png", passes=2)
+    unknown = {name for name, number in record.expected.items() if math.isnan(number)}
+    assert unknown
+    for numbers in (told["expected"], told["further"]):
+        assert {name for name, number in numbers.items() if number is None} == unknown
+        assert numbers.keys() == record.expected.keys()
 
 
 @pytest.mark.slow
