@@ -82,7 +82,7 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
 {_AGENT}
 {_LOOKS}
   --confirm P          found from this probability on; --give-up P: no look below this probability is worth a pass
-  --closer N           most closer looks (0: none); --prior P: share of pictures with it (default: of the fit; 0.5: half)
+  --closer N           most closer looks (0: none); --prior P: share of pictures with it (default: the fit's; 0.5: half)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
