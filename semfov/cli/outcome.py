@@ -51,14 +51,14 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
 
 def _decision_text(record: Record, decision: Decision) -> str:
     """Say whether the target was found, and where."""
-    name = record.target_name
+    name = str(record.target_name)
     decided_by = record.words.decided_by
     measure = "probability that the picture holds it:" if decided_by == "probability" else decided_by
     probability = f"{measure} {decision.probability:.2f}"
     if decision.outcome == "absent":
-        return f"{name} is not there, {probability}"
+        return f"{name} is {record.words.doubt}not there, {probability}"
     if decision.outcome == "undecided":
-        return "; ".join(filter(None, (f"{name} undecided, {probability}", record.words.best_place)))
+        return "; ".join(filter(None, (f"{record.words.verdict(name)}, {probability}", record.words.best_place)))
     point = record.found_at
     place = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
     edges = "" if decision.box is None else f", box {box_text(decision.box.tolist())}"

@@ -74,9 +74,9 @@ class HeadWords(Words):
         """Describe the outcome in one line."""
         record = self.record
         outcome = self.objects
-        if record.decision is not None:
+        if record.decision is not None and record.target_name is not None:
             certainty = f"there with probability {record.decision.probability:.2f}"
-            outcome = f"{record.target_name}: {record.decision.outcome} ({certainty})"
+            outcome = f"{self.verdict(record.target_name, ':')} ({certainty})"
         looks = f"{len(record)} look{'s' if len(record) != 1 else ''}"
         turns = f"{record.turns} turn{'s' if record.turns != 1 else ''} of the head"
         seconds = record.seconds[-1] if record.looks else 0.0

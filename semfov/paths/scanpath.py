@@ -141,8 +141,10 @@ class ScanpathWords(Words):
             return f"“{record.target_name}” {'found after' if record.found else 'not found in'} {shifts}"
         if record.closer:
             shifts += f" and {len(record.closer)} closer look{'s' if len(record.closer) != 1 else ''}"
-        outcome = "not there" if record.decision.outcome == "absent" else record.decision.outcome
-        return f"“{record.target_name}” {outcome} after {shifts} ({self._certainty(record.decision)})"
+        name = f"“{record.target_name}”"
+        absent = record.decision.outcome == "absent"
+        verdict = f"{name} {self.doubt}not there" if absent else self.verdict(name)
+        return f"{verdict} after {shifts} ({self._certainty(record.decision)})"
 
     def _certainty(self, decision: Decision) -> str:
         """Say how sure the decision is."""

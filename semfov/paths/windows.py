@@ -97,9 +97,9 @@ class WindowWords(Words):
         """Describe the result in one line."""
         record = self.record
         looks = f"{record.passes} look{'s' if record.passes != 1 else ''}"
-        if record.decision is not None and record.target is not None:
+        if record.decision is not None and record.target_name is not None:
             certainty = f"there with probability {record.decision.probability:.2f}"
-            return f"{record.target_name}: {record.decision.outcome} ({certainty}) in {looks}"
+            return f"{self.verdict(record.target_name, ':')} ({certainty}) in {looks}"
         return f"{self.objects}. {looks}"
 
     def why_it_ended(self) -> str:

@@ -10,6 +10,8 @@ from semfov.detection.objects import box_text
 from semfov.paths.outcome import Outcome
 
 _MATTERS = 0.1  # change of the probability, at one half, from which on the assumed share is said
+_CLEAR = 0.5  # probability or score from which on a place was clearly seen as the target
+_DOUBTFUL = 0.1  # probability from which on an absent target is only probably absent
 
 
 class Words(ABC):
@@ -109,6 +111,41 @@ class Words(ABC):
     def _number_in_all(self, label: int) -> str:
         """Say how many objects of a class to expect, in brackets; empty where it is not known."""
         return ""
+
+    def verdict(self, name: str, colon: str = "") -> str:
+        """Say what was decided, such as `cup probably absent`, or `no cup clearly seen: undecided`.
+
+        A target that is common is undecided with a high probability even where no look shows one, so that is said
+        first.
+
+        Args:
+            name: the target, as it is written.
+            colon: what stands between it and what was decided.
+
+        Returns:
+            A few words.
+        """
+        decision = self.record.decision
+        assert decision is not None
+        if decision.outcome == "undecided" and not self._is_seen_clearly:
+            return f"no {name} clearly seen: undecided"
+        return f"{name}{colon} {self.doubt}{decision.outcome}"
+
+    @property
+    def doubt(self) -> str:
+        """The word `probably ` for a target that is absent, but not surely; otherwise empty."""
+        decision = self.record.decision
+        if decision is None or decision.outcome != "absent":
+            return ""
+        said = round(decision.probability, 2)  # as the sentences have it
+        return "probably " if said >= _DOUBTFUL else ""
+
+    @property
+    def _is_seen_clearly(self) -> bool:
+        """Whether a candidate or a closer look has at least one half for the target."""
+        record = self.record
+        places = [look.place for look in record.closer]
+        return max([*record.candidates.of(record.sought).scores.tolist(), *places], default=0.0) >= _CLEAR
 
     @property
     def best_place(self) -> str:

@@ -81,7 +81,8 @@ def _outcome_in_words(path: Record) -> str:
     if path.decision is not None:
         by_probability = path.words.decided_by == "probability"
         measure = "probability that the picture holds it" if by_probability else "best score"
-        result = f"“{path.target_name}” {path.decision.outcome}, {measure}: {path.decision.probability:.2f}."
+        verdict = path.words.verdict(f"“{path.target_name}”")
+        result = f"{verdict[0].upper()}{verdict[1:]}, {measure}: {path.decision.probability:.2f}."
     place = path.words.best_place.capitalize()
     sentences = [result, path.why_it_ended(), f"{place}." if place else "", path.words.assumption()]
     return " ".join(sentence for sentence in sentences if sentence)

@@ -235,7 +235,8 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
 
 
 @pytest.mark.parametrize(
-    ("presence", "outcome", "words"), [(0.2, "absent", "not there"), (0.7, "undecided", "undecided")]
+    ("presence", "outcome", "words"),
+    [(0.09, "absent", "not there"), (0.2, "absent", "probably not there"), (0.7, "undecided", "undecided")],
 )
 def test_search_gives_up_and_describes_the_outcome(image, presence, outcome, words):
     script = [(cells(c5=0.4), 0.3), (cells(rest=0.04, c5=0.6), presence)]

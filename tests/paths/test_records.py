@@ -204,6 +204,33 @@ def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
     assert both.why_it_ended() == "No closer look was sure enough, but the target is too probable to call it absent."
 
 
+def seen(record, score, place):
+    """A record of a search whose surest candidate has a score, and whose closer look has a probability."""
+    candidates = replace(record.candidates, scores=torch.full_like(record.candidates.scores, score))
+    closer = tuple(replace(look, place=place) for look in record.closer)
+    return replace(record, candidates=candidates, closer=closer)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "probability", "score", "place", "told"),
+    [
+        ("undecided", 0.98, 0.49, 0.49, "no cup clearly seen: undecided (there with probability 0.98)"),
+        ("undecided", 0.98, 0.51, 0.49, "cup: undecided (there with probability 0.98)"),
+        ("undecided", 0.98, 0.49, 0.51, "cup: undecided (there with probability 0.98)"),
+        ("absent", 0.42, 0.1, 0.1, "cup: probably absent (there with probability 0.42)"),
+        ("absent", 0.1, 0.1, 0.1, "cup: probably absent (there with probability 0.10)"),
+        ("absent", 0.0951, 0.1, 0.1, "cup: probably absent (there with probability 0.10)"),
+        ("absent", 0.09, 0.1, 0.1, "cup: absent (there with probability 0.09)"),
+    ],
+)
+def test_a_verdict_says_first_that_nothing_was_clearly_seen(outcome, probability, score, place, told):
+    record = seen(zoom_path(), score, place)
+    assert record.closer
+    assert len(record.candidates.of(record.sought))
+    decided = replace(record, decision=Decision(outcome, probability), ending="decision")
+    assert decided.describe() == f"{told} in 3 looks"
+
+
 def test_what_the_probability_assumes_is_said_where_it_matters():
     """The odds 99 with the share 0.9, whose odds are 9, are 11 at one half; 2 to 3 are then 2 to 27."""
     undecided = replace(zoom_path(), decision=Decision("undecided", 0.99), assumed=0.9)
