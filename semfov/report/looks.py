@@ -9,7 +9,7 @@ from semfov.report.episode import Data
 from semfov.report.markup import facts_html, framed, left_out, picture, rect, table_html
 from semfov.viz.labels import LabelBox, place_labels, place_within
 
-_NAMED = 25  # largest number of objects whose names are shown at first; more would cover the picture
+_NAMED = 12  # largest number of objects whose names are shown at first; more would cover the picture
 
 
 def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str], *, is_named: bool = True) -> str:
@@ -187,12 +187,13 @@ def _look_facts(look: Data, number: int) -> dict[str, str]:
         facts["Value when it was chosen"] = f"{look['value']:.2g}"
     elif number == 0:
         facts["Value when it was chosen"] = "none: the first look"
-    facts["Best seen in this look"] = look["brought"] or "no object"
+    if look["brought"]:
+        facts["Best seen in this look"] = look["brought"]
     if look["seconds"] is not None:
         warm_up = ", with the warm-up of the detector" if look["warm"] else ""
         facts["End"] = f"after {look['seconds']:.2f} s{warm_up}"
     if look["closer"] is not None:
-        facts["Closer look"] = look["closer"]
+        facts["Closer look" if number else "Shown closely"] = look["closer"]
     return facts
 
 

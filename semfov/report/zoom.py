@@ -112,9 +112,9 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
         "brought": brought,
         "status": " ".join(
             [
-                f"Look {look.number} of {len(path) - 1}{_where_in_words(path, look, magnification, turned)}.",
+                f"{_number_in_words(path, look)}{_where_in_words(path, look, magnification, turned)}.",
                 *([] if look.value is None else [f"Its value was {look.value:.2g}."]),
-                *([] if closer is None else [_closer_in_words(closer)]),
+                *([] if closer is None else [_closer_in_words(look, closer)]),
                 *([f"Best seen in this look: {brought}."] if brought else []),
             ]
         ),
@@ -127,8 +127,14 @@ def _closer_look(path: Record, look: RecordedLook) -> CloseUp | None:
     return max(closer, key=lambda close_up: close_up.place, default=None)
 
 
-def _closer_in_words(closer: CloseUp) -> str:
-    return f"It is a closer look: the target is there with a probability of {closer.place:.2f}."
+def _number_in_words(path: Record, look: RecordedLook) -> str:
+    return f"Look {look.number} of {len(path) - 1}" if len(path) > 1 else "The only look"
+
+
+def _closer_in_words(look: RecordedLook, closer: CloseUp) -> str:
+    """Tell what a closer look brought; a first look that shows the target closely enough is one, too."""
+    kind = "It is a closer look" if look.number else "It shows the target closely"
+    return f"{kind}: the target is there with a probability of {closer.place:.2f}."
 
 
 def _brought_in_words(path: Record, look: RecordedLook) -> str:

@@ -109,6 +109,23 @@ def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_pic
     assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
 
 
+def test_a_look_that_brought_nothing_has_no_line_of_what_it_brought(zoom_path, large_picture):
+    data = zoom_data(zoom_path, large_picture, name="field")
+    names = Elements(page_html("field", [data])).texts
+    assert names.count("Best seen in this look") == 2  # of three looks the first brought nothing
+
+
+def test_the_only_look_is_no_closer_one(zoom_path, large_picture):
+    shown = CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, number=0)
+    path = replace(
+        zoom_path, looks=zoom_path.looks[:1], closer=(shown,), ending="decision", candidates=zoom_path.candidates[:0]
+    )
+    (look,) = zoom_data(path, large_picture, name="field")["looks"]
+    assert look["status"].startswith("The only look, at the whole picture. It shows the target closely: ")
+    assert "closer look" not in look["status"]
+    assert "Shown closely" in Elements(page_html("field", [zoom_data(path, large_picture, name="field")])).texts
+
+
 def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     path = replace(
         zoom_path, closer=(CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, number=2),), ending="decision"
