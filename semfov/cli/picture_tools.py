@@ -53,7 +53,7 @@ class Answer:
 
     `result` says it in words, and `ended` why no further look was taken. `expected` has the number of objects of each
     class that is expected in all, also where nobody looked, and `further` that of those which are not listed yet: what
-    further looks can bring. Both are None for a class of which no number is known, and empty for a search, whose
+    further looks can bring. Both are None for a class whose number is not known, and empty for a search, whose
     looks count nothing.
     """
 

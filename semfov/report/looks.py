@@ -193,7 +193,7 @@ def _look_facts(look: Data, number: int) -> dict[str, str]:
         warm_up = ", with the warm-up of the detector" if look["warm"] else ""
         facts["End"] = f"after {look['seconds']:.2f} s{warm_up}"
     if look["closer"] is not None:
-        facts["Closer look" if number else "Shown closely"] = look["closer"]
+        facts["Closer look" if number else "Close enough to tell"] = look["closer"]
     return facts
 
 

@@ -132,8 +132,8 @@ def _number_in_words(path: Record, look: RecordedLook) -> str:
 
 
 def _closer_in_words(look: RecordedLook, closer: CloseUp) -> str:
-    """Tell what a closer look brought; a first look that shows the target closely enough is one, too."""
-    kind = "It is a closer look" if look.number else "It shows the target closely"
+    """Tell what a closer look brought; a first look that is close enough is one, too."""
+    kind = "It is a closer look" if look.number else "It is close enough to tell"
     return f"{kind}: the target is there with a probability of {closer.place:.2f}."
 
 

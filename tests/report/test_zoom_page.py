@@ -121,9 +121,9 @@ def test_the_only_look_is_no_closer_one(zoom_path, large_picture):
         zoom_path, looks=zoom_path.looks[:1], closer=(shown,), ending="decision", candidates=zoom_path.candidates[:0]
     )
     (look,) = zoom_data(path, large_picture, name="field")["looks"]
-    assert look["status"].startswith("The only look, at the whole picture. It shows the target closely: ")
+    assert look["status"].startswith("The only look, at the whole picture. It is close enough to tell: ")
     assert "closer look" not in look["status"]
-    assert "Shown closely" in Elements(page_html("field", [zoom_data(path, large_picture, name="field")])).texts
+    assert "Close enough to tell" in Elements(page_html("field", [zoom_data(path, large_picture, name="field")])).texts
 
 
 def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
