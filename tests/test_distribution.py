@@ -114,8 +114,8 @@ for words in (["search", "--target", "boat"], ["find", "--target", "person", "--
     assert main(words) == 0, words
 sys.modules["gradio"] = ModuleType("gradio")  # the page's calls need it only for their errors
 calls = _Calls(semfov.ActivePerception.recommended())
-for _ in calls.examples:
-    picture, name = calls.take()
+for number, _ in enumerate(calls.examples):
+    picture, name, *_ = calls.take(number, "search")
     picture.save("example.png")
     words, page = calls.look("example.png", name, "search", 2)
     print(name, words)

@@ -391,8 +391,9 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
     cell = views.gaze_cell[step.action]
     cells = belief.probability(target).double()
     located = place_known(cells[:, cell, None], torch.ones(1, 1, dtype=torch.bool), thresholds.place)
-    # The chance of a view assumes that the target is in it, which is one of many.
-    best = cells.masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
+    # The chance of a view assumes that the target is in it, which is one of many. It keeps the precision of the belief,
+    # in which a cell that was never seen has exactly the threshold.
+    best = belief.probability(target).masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
     outcome = int(settle(belief.presence(target).double(), located, best, thresholds))
     decision = conclude(outcome, belief, [step.detections], views.view_grid, target, step.action % views.cells)
     if decision.outcome != "found":

@@ -92,7 +92,7 @@ def seen_by(look: KeptLook, lattice: Lattice, sought: Sequence[int]) -> Seen:
         The boxes, each with its best class.
     """
     detected = detected_boxes([look.original], sought, shares=False)
-    detected = detected.of(detected.scores >= FAINTEST)
+    detected = detected.of((detected.scores >= FAINTEST) & detected.boxes.isfinite().all(-1))
     window = look.original.window
     return Seen(
         boxes=detected.boxes.double().numpy(),

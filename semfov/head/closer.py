@@ -53,7 +53,7 @@ class CloserLooks:
         """
         views = self.views
         pose = views.poses[action // views.cells]
-        field = float(pose[2])
+        field = views.field_of(pose)
         if action in self._cells:
             self._shown[self._cells[action]] = field
         scores = detections.scores[0, :, 1:].amax(-1) if self.target is None else detections.scores[0, :, self.target]

@@ -108,7 +108,7 @@ class Views:
         world = self.world
         number = len(self.poses)
         self.poses = torch.cat([self.poses, pose[None]])
-        self._field_numbers.append(self.fields.index(float(pose[2])))
+        self._field_numbers.append(self.fields.index(self.field_of(pose)))
         self.grid = self._strip()
         gaze = world.to_scene(self.view_grid.centres, pose)
         self.gaze = torch.cat([self.gaze, gaze])
@@ -123,6 +123,10 @@ class Views:
         self.points.append(points[inside])
         self.distances.append(self._distances(pose, points[inside]))
         return number
+
+    def field_of(self, pose: Tensor) -> float:
+        """Find the field of view of a pose, which has it in the precision of a tensor."""
+        return min(self.fields, key=lambda field: abs(field - float(pose[2])))
 
     def __len__(self) -> int:
         """Count the poses."""

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from semfov.errors import check
 from semfov.io.schema import Field
 from semfov.tracking.kalman import Kinematics
 from semfov.tracking.tracks import TRAIL, Tracks
@@ -57,11 +58,16 @@ def tracks_of(tensors: Mapping[str, Tensor]) -> Tracks:
     Returns:
         The objects; none where the file has none of the tensors.
 
+    Raises:
+        InputError: some of the tensors are missing.
+
     >>> len(tracks_of(track_tensors(Tracks.none())))
     0
     """
-    if _PREFIX + "place" not in tensors:
+    missing = [name for name in TRACK_FIELDS if name not in tensors]
+    if len(missing) == len(TRACK_FIELDS):
         return Tracks.none()
+    check(not missing, "tracks", "all tensors of tracked objects, or none", f"none named {', '.join(missing)}")
     arrays = {name: tensors[_PREFIX + name].numpy() for name in (*_KINEMATICS, *_COLUMNS, *_NUMBERS)}
     kinematics = Kinematics(**{name: arrays.pop(name) for name in _KINEMATICS})
     return Tracks(kinematics=kinematics, **arrays)

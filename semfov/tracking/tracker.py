@@ -53,10 +53,12 @@ class Tracker:
     r"""Tracks objects through a stream: Kalman filters of constant velocity, and a probability that each is there.
 
     The probability p follows the recursion of a Bernoulli filter (Ristic et al., 2013, IEEE Transactions on Signal
-    Processing 61:3406). After t seconds, and after a look that does not show an object which it shows with probability
-    d, it is
+    Processing 61:3406), in two parts. That by what was shown, q, is after t seconds
 
-    .. math:: p \leftarrow p \, (1 - \ell)^t, \qquad \frac{p}{1 - p} \leftarrow \frac{p}{1 - p} (1 - d)^w
+    .. math:: q \leftarrow q \, (1 - \ell)^t
+
+    and the odds p / (1 - p) are those of q, times a factor for each look since then that should have shown the object,
+    and did not (`TrackingModel`).
 
     Detections belong to the objects at whose predicted places they most probably lie, all of them jointly; others begin
     objects of their own. What no look covers stays as it was, so that objects go on while they are out of view.
@@ -79,7 +81,7 @@ class Tracker:
     def __init__(self, model: TrackingModel | None = None) -> None:
         self.model = model or TrackingModel()
         self.tracks = Tracks.none()
-        self._aside = Tracks.none()  # objects of a scene that the camera has lost and may find again
+        self._aside: Tracks | None = None  # objects of a scene that the camera has lost and may find again
         self._waited = 0.0  # seconds since then
         self._last = 0  # the last number that was given
 
@@ -92,17 +94,17 @@ class Tracker:
         """
         self._waited += seconds
         if camera is not None and camera.motion is None:
-            if not len(self._aside):
+            if self._aside is None:
                 self._aside = self.tracks
                 self._waited = seconds
             self.tracks = Tracks.none()
         else:
             self.tracks = self._after(self.tracks, seconds, None if camera is None else camera.motion)
-        if camera is not None and camera.recovered is not None:
+        if camera is not None and camera.recovered is not None and self._aside is not None:
             found = self._after(self._aside, self._waited, camera.recovered)
             self.tracks = found.joined(self.tracks)
         if camera is None or camera.recovered is not None or not camera.waits:
-            self._aside = Tracks.none()
+            self._aside = None
 
     def _after(self, tracks: Tracks, seconds: float, motion: Motion | None) -> Tracks:
         """Predict objects some seconds later, and forget those that are hardly there any more."""
@@ -221,8 +223,10 @@ class Tracker:
         # Imported here: torchvision takes a second, and most programs of this room are not streams.
         from torchvision.ops import batched_nms
 
+        # Torchvision keeps classes apart by shifting their boxes, which must not be negative for that.
+        boxes = self.tracks.boxes
         kept = batched_nms(
-            self.tracks.boxes,
+            boxes - boxes.amin() if len(boxes) else boxes,
             torch.from_numpy(self.tracks.log_odds).float(),
             torch.from_numpy(self.tracks.labels),
             _SAME,

@@ -94,7 +94,7 @@ class Tracks:
         squared = (self.kinematics.velocity**2).sum(-1)
         by_looks = np.log(self.speed**2 / variance) - squared / (2 * variance)
         prior = np.log(_STANDING / (1 - _STANDING))
-        return 1 / (1 + np.exp(-(prior + by_looks)))
+        return np.exp(-np.logaddexp(0, -(prior + by_looks)))
 
     @property
     def moves(self) -> NDArray[np.bool_]:
@@ -189,7 +189,9 @@ class Tracks:
             The objects in the pixels of the present frame.
         """
         scale = motion.scale_at(torch.from_numpy(self.kinematics.place)).numpy()
-        return replace(
+        # By a homography, what the camera has turned away from has no place in the frame.
+        is_ahead = self.kinematics.place @ motion.matrix[2, :2] + 1.0 > 0
+        carried = replace(
             self,
             kinematics=self.kinematics.carried(motion),
             speed=self.speed * scale,
@@ -197,6 +199,7 @@ class Tracks:
             log_size=self.log_size + np.log(scale)[:, None],
             trail=motion.points(torch.from_numpy(self.trail)).numpy(),
         )
+        return carried[is_ahead]
 
     def marked(self) -> "Tracks":
         """Write the present places to the trails.

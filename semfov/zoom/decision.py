@@ -16,6 +16,7 @@ from semfov.episode import Forgetting
 from semfov.motion import Motion
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.carrying import inside_frame
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, SearchLook
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import PhotographEvidence
@@ -268,6 +269,7 @@ class DecisionsByCloserLooks(DecisionsByPresence):
         self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior, verifier: Verifier[SearchLook]
     ) -> None:
         super().__init__(belief, thresholds, prior)
+        self.frame = belief.lattice.size
         self.verifier = verifier
         self.criterion = verifier.criterion
 
@@ -308,6 +310,9 @@ class DecisionsByCloserLooks(DecisionsByPresence):
 
     def follow(self, motion: Motion | None) -> None:
         self.verifier.follow(motion)
+        candidate = self.candidate
+        if candidate is not None and not bool(inside_frame(candidate.box, self.frame)):
+            self.verifier.candidate = None  # a closer look would show another place
 
 
 def decisions_of(
