@@ -12,6 +12,7 @@ import yaml
 
 _LINK = re.compile(r"\[([^\]]*)\](?:\([^)]*\)|\[[^\]]*\])")
 _FENCE = re.compile(r"(?ms)^( *```).*?^ *```$")
+_ALONE = "Pages"  # section of pages that are in none
 _LONGEST = 200  # characters of a first sentence
 
 
@@ -31,7 +32,8 @@ def contents(configuration: str, pages: Path) -> str:
     home = (pages / "index.md").read_text(encoding="utf-8")
     lines += ["", first_sentence(home)]
     chapter = None
-    for section, title, place in _entries(settings["nav"]):
+    # Pages of their own stand first, so that each section has one heading.
+    for section, title, place in sorted(_entries(settings["nav"]), key=lambda entry: entry[0] != _ALONE):
         if section == "Reference" or not (pages / place).is_file():
             continue
         if section != chapter:
@@ -46,9 +48,9 @@ def contents(configuration: str, pages: Path) -> str:
 def _entries(navigation: list[object]) -> Iterator[tuple[str, str, str]]:
     """Yield section, title and file of each page, in the order of the navigation."""
     for entry in navigation:
-        for title, content in _titled(entry, "Pages"):
+        for title, content in _titled(entry, _ALONE):
             if isinstance(content, str):
-                yield "Pages", title, content
+                yield _ALONE, title, content
             else:
                 yield from ((title, name, place) for name, place in _flat(content, title))
 

@@ -102,7 +102,12 @@ class _GazeJob:
     def _take_up(self, table: Path) -> SceneResults:
         """Read what an interrupted command has predicted of the same pictures."""
         settings = {name: value for name, value in self.options.plain().items() if name not in (*WHERE, "quiet")}
-        depends_on = {"options": settings, "detector": self.detector.settings(), "model": self.model}
+        depends_on = {
+            "options": settings,
+            "detector": self.detector.settings(),
+            "model": self.model,
+            "areas": self.areas,
+        }
         finished = unfinished(table, depends_on, self.sources)
         for number, values in finished.items(len(self.sources)):
             (outcome,) = values["records"]
@@ -162,7 +167,9 @@ class _GazeJob:
         if drafts is not None:
             print(drafts.describe(self.areas))
             written += self._figure_of(drafts)
-        if self.report is not None and outcomes:
+        # Of two drafts of which one cannot be read, an earlier comparison is not replaced.
+        is_whole = drafts is not None or not self.options.compare
+        if self.report is not None and outcomes and is_whole:
             written.append(self._write_page(self.report, outcomes, drafts))
         tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
 

@@ -67,11 +67,11 @@ def make_server(tools: PictureTools) -> "MCPServer[Any]":
         return tools.pictures()
 
     known = f"Classes: {', '.join(tools.agent.classes[1:])}"
-    decides = "Decide whether a thing is in a picture, and where; `prior` is how likely it is before anybody looks."
+    decides = "Decide whether a thing is in a picture, and where; `prior` is how likely it is before a look."
 
     @server.tool(description=f"{decides} {known}")
     @_telling
-    def search(picture: str, target: str, passes: int = 16, prior: float = 0.5) -> Answer:
+    def search(picture: str, target: str, passes: int = 16, prior: float | None = None) -> Answer:
         return tools.search(picture, target, passes, prior)
 
     @server.tool(description=f"Find all objects of some classes, or of all ([]), and how many to expect. {known}")

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
+from typing import Concatenate, NamedTuple, ParamSpec, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from semfov.data.large import open_large
 from semfov.data.sources import picture_files
 from semfov.data.windowed import resized
 from semfov.detection import Objects
-from semfov.errors import DataError, check, printable
+from semfov.errors import DataError, InputError, check, printable
 from semfov.paths import Record
 from semfov.report.episode import jpeg
 
@@ -29,6 +29,8 @@ MOST_PASSES = 64
 
 _SECONDS = 60.0  # longest time of one answer
 _MOST_PICTURES = 1000  # names in one answer
+_AS_LIKELY_AS_NOT = 0.5
+_WIDEST = 4096  # longest side in pixels of the picture of which a crop is shown: a wider one is seen by `find`
 _SIDE = 1024  # longest side in pixels of a crop that is shown
 _SMALLEST = 8  # shortest side in pixels of the picture of which a crop is shown
 _MAGNIFIED = 4.0  # largest magnification of a crop
@@ -86,6 +88,13 @@ class Gaze:
     size: list[int]
 
 
+class _Limits(TypedDict):
+    """Limits of a search."""
+
+    passes: int
+    seconds: float
+
+
 class View(NamedTuple):
     """A crop: its JPEG, its box in the picture, and what the detector shows in it."""
 
@@ -131,26 +140,36 @@ class PictureTools:
         with _other_files_ignored():
             files = picture_files(self.folder, recursive=True)
         inside = (file for file in files if self._is_inside(file))
-        names = [file.relative_to(self.folder).as_posix() for file in inside]
-        return names[:_MOST_PICTURES]
+        names = (file.relative_to(self.folder).as_posix() for file in inside)
+        # The protocol speaks UTF-8, which has not every name that a file can have.
+        said = [name for name in names if name.isprintable()]
+        return said[:_MOST_PICTURES]
 
     @_one_at_a_time
-    def search(self, picture: str, target: str, passes: int = 16, prior: float = 0.5) -> Answer:
+    def search(self, picture: str, target: str, passes: int = 16, prior: float | None = None) -> Answer:
         """Search a picture for one object of a class.
 
         Args:
             picture: its name.
             target: the class.
             passes: most passes of the detector.
-            prior: how likely the class is in the picture before anybody looks.
+            prior: how likely the class is in the picture before anybody looks; None for as likely as not, where the
+                models of the agent know how often it was there in their fit.
 
         Returns:
             The answer.
         """
         path = self._path(picture)
         _check_passes(passes)
-        record = self.agent.search(path, target, passes=passes, seconds=_SECONDS, prior=prior)
-        return _answer(record)
+        limits: _Limits = {"passes": passes, "seconds": _SECONDS}
+        if prior is not None:
+            return _answer(self.agent.search(path, target, prior=prior, **limits))
+        try:
+            return _answer(self.agent.search(path, target, prior=_AS_LIKELY_AS_NOT, **limits))
+        except InputError as error:
+            if not str(error).startswith("prior:"):
+                raise
+        return _answer(self.agent.search(path, target, **limits))
 
     @_one_at_a_time
     def find(self, picture: str, classes: list[str], passes: int = 24) -> Answer:
@@ -224,7 +243,7 @@ class PictureTools:
         path = self._path(fixations)
         options = CheckOptions(files=(str(path),), picture=str(self.folder), quiet=True)
         with _other_files_ignored():
-            report = fixation_report(path, options)
+            report = fixation_report(path, options, self._is_inside)
         return [report.content, *report.lines]
 
     def _path(self, name: str) -> Path:
@@ -295,7 +314,7 @@ def _rows(objects: Objects, classes: tuple[str, ...], corner: tuple[int, int] = 
 
 def _crop_box(size: tuple[int, int], x: float, y: float, width: float) -> tuple[int, int, int, int]:
     """Place a square crop in a picture; it is moved, and at most cut to the picture, where it would reach beyond it."""
-    longest = max(size)
+    longest = min(max(size), _WIDEST)
     check(_SMALLEST <= width <= longest, "width", f"{_SMALLEST} to {longest} pixels", width)
     for name, place, side in (("x", x, size[0]), ("y", y, size[1])):
         check(0 <= place <= side, name, f"0 to {side}, a pixel of the picture", place)

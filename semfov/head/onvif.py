@@ -8,10 +8,10 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from http.client import HTTPException
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit, urlunsplit
-from urllib.request import Request, urlopen
+from urllib.request import HTTPRedirectHandler, Request, build_opener
 from xml.etree import ElementTree as XML
 from xml.sax.saxutils import escape
 
@@ -46,6 +46,16 @@ class _Builder(XML.TreeBuilder):
     def doctype(self, name: str, public: str | None, system: str | None) -> None:
         """Refuse it."""
         raise DataError(f"camera: expected a message without a document type, got <!DOCTYPE {name}>")
+
+
+class _NoRedirects(HTTPRedirectHandler):
+    """What follows no answer to another address: a camera says nothing of other machines."""
+
+    def redirect_request(self, *_: Any) -> None:
+        """Follow nothing."""
+
+
+_OPENER = build_opener(_NoRedirects)
 
 
 class OnvifClient:
@@ -111,11 +121,11 @@ class OnvifClient:
         text = f'<s:Envelope xmlns:s="{_SOAP}"><s:Header>{head}</s:Header><s:Body>{body}</s:Body></s:Envelope>'
         request = Request(address, text.encode(), {"Content-Type": "application/soap+xml; charset=utf-8"})
         try:
-            with urlopen(request, timeout=self.timeout) as answer:
+            with _OPENER.open(request, timeout=self.timeout) as answer:
                 return _parsed(answer.read(_MOST_BYTES + 1))
         except HTTPError as error:
             raise DataError(f"camera: it refuses a command: {_reason(error)}") from None
-        except (URLError, HTTPException, OSError) as error:
+        except (URLError, HTTPException, OSError, ValueError) as error:
             raise DataError(f"camera: no answer from {address} ({error}); check the address") from None
 
     def _credentials(self, user: str) -> str:
@@ -147,7 +157,7 @@ def _reason(error: HTTPError) -> str:
     """Take the reason from the answer to a refused command."""
     try:
         reason = _parsed(error.read(_MOST_BYTES + 1)).find(f".//{{{_SOAP}}}Reason/{{{_SOAP}}}Text")
-    except (DataError, OSError):
+    except (DataError, HTTPException, OSError):
         reason = None
     return f"{error.code} {error.reason}" if reason is None or not reason.text else reason.text.strip()
 

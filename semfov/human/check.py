@@ -26,9 +26,9 @@ _FRAMES_NAMED = 3  # largest number of sizes of frames that are named
 class _PictureSizes(Mapping[str, tuple[int, int]]):
     """`(width, height)` of a picture or those in a folder, by names as tables have them: with any path and ending."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, keep: Callable[[Path], bool] | None = None) -> None:
         self._files: dict[str, Path] = {}
-        for path in picture_files(folder, recursive=True):
+        for path in filter(keep, picture_files(folder, recursive=True)):
             for name in (path.stem, path.name, path.relative_to(folder).as_posix()):
                 self._files[name.lower()] = path
         self._sizes: dict[Path, tuple[int, int]] = {}
@@ -135,12 +135,13 @@ class FixationReport(NamedTuple):
         return [f"nothing is suspicious{not_compared}"]
 
 
-def fixation_report(path: Path, options: CheckOptions) -> FixationReport:
+def fixation_report(path: Path, options: CheckOptions, keep: Callable[[Path], bool] | None = None) -> FixationReport:
     """Read one file of fixations, and say what is suspicious.
 
     Args:
         path: the file.
         options: what the file does not tell itself; its `files` are not read.
+        keep: whether a picture of the folder may be opened; None for all of them.
 
     Returns:
         The report.
@@ -148,13 +149,13 @@ def fixation_report(path: Path, options: CheckOptions) -> FixationReport:
     Raises:
         SemfovError: the file cannot be read.
     """
-    return _report(path, options, _reading_arguments(options), _sizes(options))
+    return _report(path, options, _reading_arguments(options), _sizes(options, keep))
 
 
-def _sizes(options: CheckOptions) -> _PictureSizes | None:
+def _sizes(options: CheckOptions, keep: Callable[[Path], bool] | None = None) -> _PictureSizes | None:
     """Find the sizes of the pictures that the options name; None where they name none."""
     place = None if options.picture is None else Path(options.picture)
-    return _PictureSizes(place) if place is not None and _shows_pictures(place) else None
+    return _PictureSizes(place, keep) if place is not None and _shows_pictures(place) else None
 
 
 def _report(

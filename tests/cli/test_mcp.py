@@ -5,6 +5,7 @@ import base64
 import io
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -17,6 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from semfov.agent import ActivePerception
+from semfov.cli import picture_tools
 from semfov.cli.main import main
 from semfov.cli.mcp import make_server
 from semfov.cli.picture_tools import PictureTools
@@ -218,6 +220,33 @@ def test_the_model_is_told_why_a_call_is_refused(tools, name, arguments, expecte
     answer = call(tools, name, **arguments)
     assert answer.is_error
     assert expected in answer.content[0].text
+
+
+def test_names_that_the_protocol_cannot_say_are_left_out(tools):
+    name = os.fsencode(tools.folder) + b"/caf\xe9.png"
+    with open(name, "wb") as file:
+        file.write((tools.folder / "sheet.png").read_bytes())
+    assert call(tools, "pictures").structured_content == {"result": ["sheet.png", "sub/beach.png"]}
+
+
+def test_a_crop_is_no_wider_than_can_be_shown(tools, monkeypatch):
+    monkeypatch.setattr(picture_tools, "_WIDEST", 500)
+    with pytest.raises(ValueError, match="width: expected 8 to 500 pixels, got 600"):
+        tools.look("sheet.png", 800, 500, 600)
+
+
+@pytest.mark.slow
+def test_an_agent_without_shares_of_its_fit_searches_without_a_prior(tools):
+    raw = PictureTools(tools.folder, ActivePerception.raw("yolox-nano"))
+    told = call(raw, "search", picture="sub/beach.png", target="boat", passes=4)
+    assert not told.is_error
+
+
+def test_a_check_opens_no_picture_by_a_link_out_of_the_folder(tools):
+    rows = [f"anna,link.png,{x},10,0.2" for x in range(10, 30)]
+    (tools.folder / "f.csv").write_text("\n".join(["subject,picture,x,y,duration", *rows]) + "\n")
+    told = call(tools, "check", fixations="f.csv")
+    assert "48 × 32" not in str(told.content)
 
 
 def test_a_folder_is_needed(tmp_path, agent):
