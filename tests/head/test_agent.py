@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.nn import functional as F
 
 from examples.pan_tilt import SimulatedCamera
 from semfov import ActivePerception, Detections, Eye, Flat, Foveation, HeadAgent, Panorama
 from semfov.agents.head import _decide_look
 from semfov.belief.observers import LearnedMap, Target
 from semfov.belief.target_evidence import Thresholds
+from semfov.data.examples import example
 from semfov.gaze.policies import Policy
 from semfov.head import CameraFrame, PanTiltCamera, PerSecond, SearchGain, Speeds, open_scene
 from semfov.head.belief import SceneBelief, SceneObserver
@@ -521,3 +523,20 @@ def test_fields_of_view_in_other_units_are_refused(fields, panorama):
     refused("fields: expected degrees", open_scene, camera)
     assert open_scene(type("Zooms", (Own,), {"fields": (*fields, 60.0)})(panorama)).fields == (*fields, 60.0)
     refused("reach: expected degrees", Panorama, panorama, reach=1.05)
+
+
+def test_a_narrow_field_that_is_no_number_of_a_tensor_is_aimed():
+    views = Views(Panorama(torch.rand(3, 64, 128), fields=(20.3, 60.1)))
+    action = views.aim(torch.tensor([0.0, 0.0, 1.0]), 20.3)
+    assert views.field_of(views.poses[action // views.cells]) == 20.3
+
+
+@pytest.mark.slow
+def test_a_target_is_not_absent_before_the_head_has_turned():
+    """There is nothing in front of it, and a street with people behind."""
+    scene = torch.full((3, 400, 800), 0.5)
+    market = F.interpolate(example("market")[None], size=(200, 246), mode="bilinear")[0]
+    scene[:, 100:300, 20:266] = market
+    agent = HeadAgent.recommended("yolox-nano")
+    first = agent.search(Panorama(scene), "person", SearchSettings(passes=1))
+    assert first.decision.outcome != "absent"

@@ -172,3 +172,43 @@ def test_a_window_is_worth_the_objects_that_it_puts_right():
         expected = (holds * torch.from_numpy(gains)).sum(-1).view(down, across)
         np.testing.assert_allclose(values, expected.numpy(), atol=1e-5)
         assert values.max() > 0
+
+
+def test_objects_of_a_disturbance_are_none_of_the_scene():
+    """Nothing was known when the camera lost the scene, so nothing comes back with it."""
+    tracker = Tracker()
+    for _ in range(2):
+        tracker.follow(0.1, CameraStep(None, waits=True))
+        tracker.see(look(box_at(100, 100)))
+    tracker.follow(0.1, CameraStep(None, Motion.similarity(shift=(50, 0)), waits=False))
+    assert not len(tracker.tracks)
+
+
+def test_classes_stay_apart_beyond_the_border_of_the_frame():
+    tracker = Tracker()
+    box = (-80.0, -60.0, -40.0, -1.0)
+    wide = (-200.0, -200.0, 400.0, 400.0)
+    tracker.see(look(box, region=wide, label=1))
+    tracker.see(look(box, region=wide, label=2))
+    assert sorted(tracker.tracks.labels.tolist()) == [1, 2]
+
+
+def test_what_the_camera_has_turned_away_from_does_not_come_back_mirrored():
+    """It turns by 180 degrees about an axis in the frame: then all that was in front of it is behind."""
+    focal = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    angle = np.radians(10)
+    turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+    step = CameraStep(Motion(focal @ turn @ np.linalg.inv(focal)))
+    tracker = Tracker()
+    tracker.see(look(box_at(300, 200)))
+    for _ in range(18):
+        tracker.follow(FRAME, step)
+    assert not len(tracker.tracks)
+
+
+def test_a_fast_object_moves_for_certain_and_without_a_warning():
+    tracker = Tracker()
+    for frame in range(30):
+        tracker.follow(1 / 30)
+        tracker.see(look(box_at(100 + 20 * frame, 300)))
+    assert tracker.tracks.standing.max() < 1e-6
