@@ -285,7 +285,7 @@ def test_command_runs_as_printed(line, folder, run):
 
 @pytest.mark.slow
 @pytest.mark.lab
-def test_the_three_commands_for_a_custom_detector_run(folder, run):
+def test_the_commands_for_a_custom_detector_run(folder, run):
     """As printed, except for a tiny fit and a detector of colours instead of cups; and the study of a checkout."""
     page = (ROOT / "docs/detectors.md").read_text(encoding="utf-8")
     assert all(line in page for line in OWN)
@@ -294,11 +294,12 @@ def test_the_three_commands_for_a_custom_detector_run(folder, run):
     for name, instances in (("PHOTOS", "instances.json"), ("OTHERS", "others.json")):
         (folder / name).mkdir()
         write_photographs(folder / name).rename(folder / instances)
-    fit, find, search = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
+    fit, *looks = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
     tiny = [*SMALL, *["--data.limit", "6", "--holdout", "3", "--steps", "3", "--map_steps", "3", "--fixations", "2"]]
     assert written_files(run(once([*fit, *tiny])))
-    assert "red" in run(find)
-    assert "red" in run(search)
+    assert len(looks) >= 1
+    for words in looks:
+        assert "red" in run(words)
     task = (ROOT / "docs/tasks/own-detector.md").read_text(encoding="utf-8")
     assert all(line in task for line in OWN)
     (block,) = re.findall(r"```python\n(.*?)```", task, re.S)
