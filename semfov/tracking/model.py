@@ -24,7 +24,7 @@ class TrackingModel:
     .. math:: \max_j \bigl(e_0 + e_1 \operatorname{logit} c_j\bigr) + w \sum_i \log\bigl(1 - d(s_i)\bigr)
 
     Objects that are hard to see are missed again and again, so that w is less than 1. What a look as close has shown is
-    seen again with the probability a p, where p is that of its best detection, and a miss counts in full.
+    seen again with the probability :math:`\rho q`, where q is that of what was shown, and a miss counts in full.
 
     Attributes:
         speed: standard deviation of each coordinate of an object's velocity, in sides a second.
@@ -40,7 +40,7 @@ class TrackingModel:
         offset: :math:`e_0`.
         score: :math:`e_1`.
         miss: w.
-        again: a.
+        again: :math:`\rho`.
         loss: share of the objects that cease to be there in a second.
         least: probability below which an object is forgotten.
 
