@@ -188,18 +188,18 @@ class Tracks:
         Returns:
             The objects in the pixels of the present frame.
         """
-        scale = motion.scale_at(torch.from_numpy(self.kinematics.place)).numpy()
         # By a homography, what the camera has turned away from has no place in the frame.
         is_ahead = self.kinematics.place @ motion.matrix[2, :2] + 1.0 > 0
-        carried = replace(
-            self,
-            kinematics=self.kinematics.carried(motion),
-            speed=self.speed * scale,
-            magnification=self.magnification / scale,
-            log_size=self.log_size + np.log(scale)[:, None],
-            trail=motion.points(torch.from_numpy(self.trail)).numpy(),
+        ahead = self[is_ahead]
+        scale = motion.scale_at(torch.from_numpy(ahead.kinematics.place)).numpy()
+        return replace(
+            ahead,
+            kinematics=ahead.kinematics.carried(motion),
+            speed=ahead.speed * scale,
+            magnification=ahead.magnification / scale,
+            log_size=ahead.log_size + np.log(scale)[:, None],
+            trail=motion.points(torch.from_numpy(ahead.trail)).numpy(),
         )
-        return carried[is_ahead]
 
     def marked(self) -> "Tracks":
         """Write the present places to the trails.
