@@ -32,6 +32,13 @@ class _Verdict(NamedTuple):
     age: float = 0
 
 
+class _JudgedPlace(NamedTuple):
+    """A closer look, and the present probability that the target is at its place."""
+
+    verdict: _Verdict
+    probability: float
+
+
 class Verifier(Generic[LookType]):
     r"""Decides one search, with closer looks at the places that seem to hold the target; close_up `(4,)`.
 
@@ -80,6 +87,7 @@ class Verifier(Generic[LookType]):
         self.verdicts: list[_Verdict] = []
         self.candidate: CandidatePlace | None = None
         self._is_last = False  # whether no look of the search follows the last one
+        self._judged: list[_JudgedPlace] | None = None  # computed when it is asked for after a change
 
     @property
     def looks(self) -> list[CloseUp]:
@@ -87,12 +95,14 @@ class Verifier(Generic[LookType]):
 
     def wait(self, passed: float = FRAME) -> None:
         """Let seconds pass. In a stream, call it before every frame."""
+        self._judged = None
         self.places.wait(passed)
         aged = (verdict._replace(age=verdict.age + passed) for verdict in self.verdicts)
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
     def follow(self, motion: Motion | None) -> None:
         """Carry the candidate and examined places along, or forget them where a frame fits none before."""
+        self._judged = None
         self.places.follow(motion)
         if motion is None:
             self.candidate = None
@@ -107,6 +117,7 @@ class Verifier(Generic[LookType]):
 
     def see(self, look: LookType, *, last: bool = False) -> None:
         """Take in a look of the search, and choose the place that is to be looked at closely."""
+        self._judged = None
         self.places.see(look)
         if self.places.forgetting.rate:
             for number, verdict in enumerate(self.verdicts):
@@ -128,6 +139,7 @@ class Verifier(Generic[LookType]):
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [verdict for verdict in self.verdicts if not self._is_replaced(verdict, look)]
         self.verdicts.append(_Verdict(look))
+        self._judged = None
         self._choose()
         return look
 
@@ -162,7 +174,7 @@ class Verifier(Generic[LookType]):
         """Decide whether the search ends with the last look: a number of `OUTCOMES`, or `GO_ON`."""
         if self.is_over:
             return self._final_outcome()
-        return FOUND if self._is_found_at_once(self.verdicts) else GO_ON
+        return FOUND if self._is_found_at_once(self._judged_places) else GO_ON
 
     def decision(self) -> Decision:
         """Make the decision as it stands. As long as the search goes on, it is `found` or `undecided`."""
@@ -190,13 +202,14 @@ class Verifier(Generic[LookType]):
         without = self.places.presence
         telling = self._recent
         if self.places.exhaustive:
-            telling = sorted(telling, key=self._place)[-1:]
-        return max((self._faded(verdict.look.presence, without, verdict.age) for verdict in telling), default=without)
+            telling = sorted(telling, key=_probability)[-1:]
+        faded = (self._faded(judged.verdict.look.presence, without, judged.verdict.age) for judged in telling)
+        return max(faded, default=without)
 
     @property
     def best(self) -> CloseUp:
         """The closer look with the largest probability of the place; there must be one."""
-        return max(self.verdicts, key=self._place).look
+        return max(self._judged_places, key=_probability).verdict.look
 
     def _decision(self, *, is_over: bool) -> Decision:
         """Make the decision; a place from `confirm` on is found at any time, the rest is decided when it is over."""
@@ -204,20 +217,19 @@ class Verifier(Generic[LookType]):
         outcome = OUTCOMES[self._final_outcome()]
         if outcome != "found":
             return Decision(outcome if is_over else "undecided", presence)
-        best = self.best
-        place = max(self._place(verdict) for verdict in self.verdicts)
-        return Decision("found", max(presence, place), best.cell, best.box, place)
+        best, place = max(self._judged_places, key=_probability)
+        return Decision("found", max(presence, place), best.look.cell, best.look.box, place)
 
     def _final_outcome(self) -> int:
         """Decide as if the search were over."""
-        places = [self._place(verdict) for verdict in self.verdicts]
+        places = [judged.probability for judged in self._judged_places]
         return final_outcome(places, self.presence, self.thresholds.confirm)
 
-    def _is_found_at_once(self, verdicts: Sequence[_Verdict]) -> bool:
+    def _is_found_at_once(self, judged_places: Sequence[_JudgedPlace]) -> bool:
         """Whether one of the places ends the search, though it is not over."""
         if self.places.exhaustive:
             return False
-        places = [self._place(verdict) for verdict in verdicts]
+        places = [judged.probability for judged in judged_places]
         if len(self._recent) >= MOST_CLOSER:
             return bool(places) and max(places) >= self.thresholds.confirm
         return found_at_once(places, self.thresholds.confirm)
@@ -236,9 +248,16 @@ class Verifier(Generic[LookType]):
         return self.places.hit_chance < self.thresholds.give_up
 
     @property
-    def _recent(self) -> list[_Verdict]:
-        """The closer looks of which at least half of the evidence is left."""
-        return [verdict for verdict in self.verdicts if verdict.age <= self.places.forgetting.span]
+    def _judged_places(self) -> list[_JudgedPlace]:
+        """The closer looks that are not forgotten, in order."""
+        if self._judged is None:
+            self._judged = [_JudgedPlace(verdict, self._place(verdict)) for verdict in self.verdicts]
+        return self._judged
+
+    @property
+    def _recent(self) -> list[_JudgedPlace]:
+        """Those of which at least half of the evidence is left."""
+        return [judged for judged in self._judged_places if judged.verdict.age <= self.places.forgetting.span]
 
     def _is_replaced(self, verdict: _Verdict, look: CloseUp) -> bool:
         """Whether a closer look has a new verdict on the place of an old one, of which less than half is left."""
@@ -270,6 +289,10 @@ class Verifier(Generic[LookType]):
             return fresh
         logit = weight * _log_odds(fresh) + (1 - weight) * _log_odds(without)
         return 1 / (1 + math.exp(-logit))
+
+
+def _probability(judged: _JudgedPlace) -> float:
+    return judged.probability
 
 
 def _log_odds(probability: float) -> float:

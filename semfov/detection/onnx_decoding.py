@@ -14,6 +14,8 @@ from semfov.detection.onnx_signature import selected_outputs
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError, check, check_shape, values_known
 
+_FEW = 64  # cells
+
 
 def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candidates:
     """Decode offsets from cells and logarithms of sizes (YOLOX, Ge et al. 2021).
@@ -36,8 +38,9 @@ def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candi
     check_shape(raw, "raw", None, None, None)
     if values_known(raw) and raw.numel():
         # Exports with boxes as fractions of the canvas have the same shape.
-        least, greatest = map(float, raw[..., :4].detach().aminmax())
-        are_fractions = 0 <= least < greatest <= 1
+        # Mostly a few cells tell, and not all need to be read.
+        are_fractions = _lie_in_unit(raw[:, :_FEW, :4]) and _lie_in_unit(raw[..., :4])
+        are_fractions = are_fractions and bool((raw[..., :4] != raw[0, 0, 0]).any())
         expected = "offsets from cells and logarithms of sizes, some of them below 0"
         got = "numbers from 0 to 1, as fractions of the canvas"
         check(not are_fractions, "output of the head", expected, got)
@@ -48,6 +51,12 @@ def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candi
     size = raw[..., 2:4].exp() * stride
     boxes = corners(torch.cat([centre, size], -1))
     return Candidates(boxes, classes=raw[..., 5:], objectness=raw[..., 4])
+
+
+def _lie_in_unit(numbers: Tensor) -> bool:
+    """Whether all numbers lie from 0 to 1."""
+    least, greatest = map(float, numbers.detach().aminmax())
+    return least >= 0 and greatest <= 1
 
 
 def decode_yolov5(rows: Tensor) -> Candidates:

@@ -1,6 +1,7 @@
 """Maps between two frames of a stream: where points and boxes of one frame lie in the other."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -180,3 +181,18 @@ def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     half_size = (bottom_right - top_left) / 2 * scale[..., None]
     moved = torch.cat([moved_centre - half_size, moved_centre + half_size], -1)
     return moved.to(boxes), scale.to(boxes)
+
+
+def moved_together(parts: Sequence[Tensor], motion: Motion) -> list[Tensor]:
+    """Map boxes that are kept in parts all at once, which takes the time of one.
+
+    Args:
+        parts: boxes, `(N, 4)` each, in pixels of the first frame.
+        motion: the motion.
+
+    Returns:
+        The boxes of each part in pixels of the second frame.
+    """
+    if not parts:
+        return []
+    return list(motion.boxes(torch.cat(list(parts))).split([len(boxes) for boxes in parts]))

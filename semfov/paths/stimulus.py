@@ -96,7 +96,8 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     if isinstance(picture, Tensor):
         return in_bytes(picture if scale == 1 else resize(picture[None], reduced_size)[0])
     pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
-    return resized(pixels, reduced_size[::-1])[0].contiguous()
+    # Frames may share the memory of a camera; a copy in the order of memory is made ten times faster than another.
+    return resized(pixels, reduced_size[::-1])[0].clone()
 
 
 def in_bytes(image: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
-from semfov.motion import Motion
+from semfov.motion import Motion, moved_together
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
 from semfov.zoom.hints import DETECTION_SCORE
@@ -152,7 +152,9 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         """Carry the boxes of the target along, too."""
         super().follow(motion)
         if motion is not None:
-            self._looks = [(time, (motion.boxes(boxes), scores)) for time, (boxes, scores) in self._looks]
+            moved = moved_together([boxes for _, (boxes, _) in self._looks], motion)
+            pairs = zip(self._looks, moved, strict=True)
+            self._looks = [(time, (boxes, scores)) for (time, (_, scores)), boxes in pairs]
 
     def probability(self, look: CloseUp) -> float:
         """Compute the present probability that the target is at the place of a closer look.
