@@ -22,7 +22,7 @@ OPTIONS = _by_word(
         "model": "models",
         "device": "gpu cuda",
         "half": "fp16 float16",
-        "out": "csv format json output project save",
+        "out": "csv figure format json output pdf plot png project save show svg",
         "report": "html page",
         "crops": "crop save_crop save_crops",
         "labels": "label_dir save_txt txt yolo_labels",

@@ -45,8 +45,8 @@ _LOOKS = """\
 
 _OUTPUT = f"""\
   --out FILE           {suffixes_in_words()}; - is stdout
-  --out FOLDER         results and figures of each picture; --draw scanpath,animation or none, for looks of a fovea
-                       also views,belief, and in a search belief_bars
+  --out FOLDER         results and figures of each picture (NAME.png: the figure of one); --draw scanpath,animation or
+                       none, for looks of a fovea also views,belief, and in a search belief_bars
   --report PAGE.html   a page in which to step through the looks; --looks prints them; --quiet: errors alone
   --crops FOLDER       what the box of each object shows, as JPEG; --labels FOLDER: labels in the format of YOLO
   --workers N          processes (--scheduler tcp://HOST:8786: of a Dask cluster); --device cuda; --half: 16 bits

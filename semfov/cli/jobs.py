@@ -78,6 +78,8 @@ class PictureJob(ABC, Generic[_Options]):
             first = "none for find, which begins with the whole picture"
             check(options.start is None, "start", first, repr(options.start))
         _check_outputs(options)
+        expected = f"a folder for the figures of {len(self.sources):,} pictures"
+        check(options.figure is None or not self.several, "out", expected, options.figure)
         # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
         self.aim(detector_classes(options) if agent is None else agent.classes[1:])
         self.agent = make_agent(options) if agent is None else agent
@@ -282,7 +284,9 @@ def _plain_attributes(part: torch.nn.Module) -> dict[str, object]:
 
 def _check_outputs(options: PictureOptions) -> None:
     """Raise an error for outputs that cannot be written or do not go together, before anything is loaded."""
-    out = options.out
+    if options.figure is not None:
+        check_writable(options.figure)
+    out = options.results
     if out is not None and out != STDOUT:
         check_writable(out, folder=kind_of(out) is None)
     if options.report is not None:

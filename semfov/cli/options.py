@@ -26,6 +26,9 @@ from semfov.settings import (
 ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 """Figures that are drawn unless others are named."""
 
+FIGURES = (".png", ".pdf", ".svg")
+"""Ends of the name of a figure of one picture."""
+
 AreasText = Annotated[
     str, Form("areas", "as NAME:LEFT,TOP,RIGHT,BOTTOM, with blanks between them, or a file .json", r".+:[\d.,-]+")
 ]
@@ -100,7 +103,8 @@ class PictureOptions(LookSettings, AgentOptions):
         bands: bands of a TIFF or a raster that are red, green and blue, as `4,3,2`, or one as grey (none: those that
             the file names).
         out: file of results, in a format that `--help` lists, or a folder for figures and results; `-` writes JSON
-            lines to standard output, and everything else to standard error.
+            lines to standard output, and everything else to standard error. A name that ends in `.png`, `.pdf` or
+            `.svg` gets the figure of one picture.
         draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
             where), `belief_bars` (of a search) and `animation`; `none` draws nothing (not given: all but `belief_bars`,
             if `out` is a folder). Windows and a head have only `scanpath` and `animation`. If `out` is a file, they are
@@ -130,6 +134,16 @@ class PictureOptions(LookSettings, AgentOptions):
     looks: bool = False
     workers: Workers = 1
     scheduler: str | None = None
+
+    @property
+    def figure(self) -> Path | None:
+        """File of the figure of one picture, where `out` names one."""
+        return self.out if self.out is not None and self.out.suffix.lower() in FIGURES else None
+
+    @property
+    def results(self) -> Path | None:
+        """File or folder of results, where `out` names one."""
+        return self.out if self.figure is None else None
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ class PictureOutcome:
         Returns:
             The outcome.
         """
-        out = options.out
+        out = options.results
         form = None if out is None else results_format(out, truth=truth)
         text = _outcome_text(record, source.name, seconds)
         boxes = None if source.scene is None else source.scene.boxes
@@ -191,8 +191,17 @@ class PictureOutcome:
             episode=episode,
             names=tuple(figures),
             figures=figures,
-            files=_labels(record, source, options) | _crops(record, source, options),
+            files=_figure(record, options) | _labels(record, source, options) | _crops(record, source, options),
         )
+
+
+def _figure(record: Record, options: PictureOptions) -> dict[str, bytes]:
+    """Draw the figure of one picture, if it is wanted; returns the file by its path."""
+    if options.figure is None:
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        drawn = save_figure(record.plot(), Path(folder) / options.figure.name)
+        return {str(options.figure): drawn.read_bytes()}
 
 
 def _labels(record: Record, source: PictureSource, options: PictureOptions) -> dict[str, bytes]:

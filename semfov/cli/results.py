@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from semfov.cli.formats import FORMATS, CocoResults, JsonLines, ResultsFormat, Row, suffix_of, suffixes
+from semfov.cli.options import FIGURES
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
 from semfov.errors import DataError, check
@@ -38,7 +39,8 @@ def kind_of(path: Path) -> str | None:
         return JsonLines.suffix
     suffix = suffix_of(path.name)
     is_folder = not path.suffix or path.is_dir()
-    check(suffix is not None or is_folder, "out", f"a folder, or a file that ends in {', '.join(suffixes())}", path)
+    ends = ", ".join([*FIGURES, *suffixes()])
+    check(suffix is not None or is_folder, "out", f"a folder, or a file that ends in {ends}", path)
     return suffix
 
 

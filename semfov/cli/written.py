@@ -31,7 +31,9 @@ class PictureFiles:
         self._episodes: dict[int, dict[str, Any]] = {}
         self._results: ResultsFile | None = None
         self._folder: Path | None = None
-        out = job.options.out
+        if job.options.figure is not None:
+            self._written = [job.options.figure]
+        out = job.options.results
         if out is None:
             return
         kind = kind_of(out)

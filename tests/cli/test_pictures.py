@@ -82,6 +82,19 @@ def test_nothing_is_written_unless_it_is_asked_for(run, photo, tmp_path):
     assert written_files(printed) == [str(tmp_path / "out/results.json")]
 
 
+def test_a_name_of_a_picture_gets_the_figure_of_one(run, photo, folder, tmp_path):
+    code, printed = run("search", photo, "--target", "red", "--start", 47, "--out", tmp_path / "found.png")
+    assert code == 0
+    assert written_files(printed) == [str(tmp_path / "found.png")]
+    with Image.open(tmp_path / "found.png", formats=["PNG"]) as figure:
+        assert figure.width > 400
+    run("find", photo, "--how", "fovea", "--shifts", 1, "--out", tmp_path / "found.svg")
+    assert "<svg" in (tmp_path / "found.svg").read_text("utf-8")
+    code, printed = run("search", folder, "--target", "red", "--out", tmp_path / "all.png")
+    assert code != 0
+    assert "out: expected a folder for the figures of 3 pictures, got" in printed.err
+
+
 @pytest.mark.parametrize("task", ["search", "explore"])
 def test_only_the_named_figures_are_drawn(run, photo, tmp_path, task):
     more, draw = ("--shifts", 1), "belief"

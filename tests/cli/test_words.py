@@ -53,7 +53,7 @@ REFUSED = {
     "search --target cup --confirm 50": "confirm: expected a probability from 0 to 1, got 50",
     "search --target cup --give-up -1": "give_up: expected a probability from 0 to 1, got -1",
     "search --target cup --seed -1": "seed: expected a whole number from 0",
-    "search --target cup --out a.xls": "out: expected a folder, or a file that ends in .coco.json, .json, .jsonl, .csv",
+    "search --target cup --out a.xls": "a file that ends in .png, .pdf, .svg, .coco.json, .json, .jsonl, .csv",
     "search --target cup --report a.pdf": "report: expected a file that ends in .html or .htm, got a.pdf",
     "search --target cup --draw scanpath": "draw: expected --out FOLDER beside --draw, got none",
     "search --target cup --detector yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
