@@ -57,7 +57,7 @@ def large_search() -> Run:
         return candidates[-1]
 
     def search() -> ZoomPath:
-        return agent.search(picture, "person", SearchSettings(passes=16, confirm=1.0, give_up=0.0, closer=0))
+        return agent.search(picture, "person", SearchSettings(passes=16, confirm=1.0, stop_below=0.0, closer=0))
 
     vars(detector)["propose_bytes"] = remembered
     search()

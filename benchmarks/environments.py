@@ -76,8 +76,8 @@ def looking(task: str, scenery: Scenery) -> Run:
     image = scenery.image(0)
     if task == "search":
         # No probability passes these thresholds, so the search does not end early.
-        return lambda: agent.search(image, "person", start=0, shifts=STEPS - 1, confirm=1.0, give_up=0.0)
-    return lambda: agent.explore(image, start=0, shifts=STEPS - 1, worth=0.0)
+        return lambda: agent.search(image, "person", start=0, shifts=STEPS - 1, confirm=1.0, stop_below=0.0)
+    return lambda: agent.explore(image, start=0, shifts=STEPS - 1, min_gain=0.0)
 
 
 def programs(task: str, scenery: Scenery, sizes: Sequence[int]) -> dict[str, tuple[Run, int]]:

@@ -93,7 +93,7 @@ def detected(detector: Detector, canvases: Sequence[Tensor], view: View) -> list
 def large_pictures(files: Iterable[Path], weights: str | None) -> _Parts:
     """Find all people in large pictures, and write the records as JSON."""
     agent, parts = ZoomAgent.recommended("yolox-nano", weights=weights), _Parts()
-    find = partial(agent.find_all, target="person", settings=FindSettings(passes=PASSES, worth=0.0))
+    find = partial(agent.find_all, target="person", settings=FindSettings(passes=PASSES, min_gain=0.0))
     for file in files:
         picture = open_large(file)
         parts.timed("decoding", picture.read, (0, 0, 1, 1))

@@ -34,8 +34,9 @@ from eval.zoom.run import SEMFOV, ZoomConfig, ZoomRun
 from semfov.agents.windows import ZoomAgent
 from semfov.data.images import to_bytes
 from semfov.detection.objects import FAINTEST, Objects
-from semfov.fit.window_looking import TileSize, right_boxes
+from semfov.fit.window_looking import TileSize
 from semfov.io.files import write_text
+from semfov.observation.matching import right_boxes
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.looks import one_thread
@@ -217,7 +218,7 @@ def _slicer(run: ZoomRun, side: int, pixels: _Pixels) -> tuple[Objects, int]:
 
 def _chosen(run: ZoomRun, passes: int, pixels: _Pixels) -> tuple[Objects, int]:
     """Objects that `find_all` finds in a picture `(H, W, 3)` with so many passes, and the passes that it took."""
-    path = ZoomAgent(run.eye, run.evidence).find_all(pixels, run.target, FindSettings(passes=passes, worth=0.0))
+    path = ZoomAgent(run.eye, run.evidence).find_all(pixels, run.target, FindSettings(passes=passes, min_gain=0.0))
     return path.candidates, path.passes
 
 

@@ -46,11 +46,13 @@ def programs(agent: ZoomAgent, bare: BareYolox, side: int, height: int) -> dict[
     """For each task: the program of the agent, the plain loop, and the number of passes."""
     picture = mosaic(agent, side, height)
     tasks = {
-        "explore": lambda: agent.explore(picture, ExploreSettings(passes=PASSES, worth=0.0)),
-        "find all": lambda: agent.find_all(picture, "person", FindSettings(passes=PASSES, worth=0.0)),
+        "explore": lambda: agent.explore(picture, ExploreSettings(passes=PASSES, min_gain=0.0)),
+        "find all": lambda: agent.find_all(picture, "person", FindSettings(passes=PASSES, min_gain=0.0)),
         # In mosaics without closer looks, which would end it early.
         "search": lambda: agent.search(
-            picture, "person", SearchSettings(passes=PASSES, confirm=1.0, give_up=0.0, closer=0 if side > 1 else None)
+            picture,
+            "person",
+            SearchSettings(passes=PASSES, confirm=1.0, stop_below=0.0, closer=0 if side > 1 else None),
         ),
     }
     made: dict[str, tuple[Run, Run, int]] = {}
@@ -76,7 +78,7 @@ def from_file(agent: ZoomAgent, bare: BareYolox, path: Path) -> tuple[Run, Run, 
     """Find all people in a JPEG: the program of the agent, the plain loop, and the number of passes."""
 
     def task() -> ZoomPath:
-        return agent.find_all(path, "person", FindSettings(passes=PASSES, worth=0.0))
+        return agent.find_all(path, "person", FindSettings(passes=PASSES, min_gain=0.0))
 
     record = task()
     places = windows(record)

@@ -84,7 +84,7 @@ def main() -> None:
     )
     for step in steps:
         (x, y), best = step.fixation[0].tolist(), float(step.belief.probability(dog).max())
-        print(f"fixation {step.shift} at ({x:.0f}, {y:.0f}), best score of a dog so far {best:.2f}")
+        print(f"fixation {step.shift + 1} at ({x:.0f}, {y:.0f}), best score of a dog so far {best:.2f}")
     print("found" if goal[step.cell] else "not found")
 
 

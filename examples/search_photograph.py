@@ -25,7 +25,7 @@ def main() -> None:
     image = semfov.read_image(arguments.photo) if arguments.photo else semfov.example("beach")
     scanpath = agent.search(image, arguments.target, start=0)
 
-    for number, (x, y) in enumerate(scanpath.as_fixations("photograph").points.tolist()):
+    for number, (x, y) in enumerate(scanpath.as_fixations("photograph").points.tolist(), 1):
         print(f"fixation {number} at ({x:.0f}, {y:.0f})")
     print(scanpath.describe())
     viz.save_figure(scanpath.plot(), arguments.out)

@@ -326,7 +326,7 @@ class ActivePerception(nn.Module):
         seed: int = 0,
         boxes: Tensor | Sequence[Sequence[float]] | None = None,
         confirm: float | None = None,
-        give_up: float | None = None,
+        stop_below: float | None = None,
         closer: int | None = None,
         prior: float | None = None,
         color: Color = "rgb",
@@ -377,7 +377,7 @@ class ActivePerception(nn.Module):
             start=start,
             seed=seed,
             confirm=confirm,
-            give_up=give_up,
+            stop_below=stop_below,
             closer=closer,
             prior=prior,
             boxes=boxes,
@@ -403,8 +403,8 @@ class ActivePerception(nn.Module):
         seconds: float | None = None,
         duration: float | None = None,
         on_look: OnLook | None = None,
-        worth: float | None = None,
-        least: float | None = None,
+        min_gain: float | None = None,
+        score_threshold: float | None = None,
         batch: int = 1,
         color: Color = "rgb",
         white: White | None = None,
@@ -438,8 +438,8 @@ class ActivePerception(nn.Module):
             seconds=seconds,
             duration=duration,
             on_look=on_look,
-            worth=worth,
-            least=least,
+            min_gain=min_gain,
+            score_threshold=score_threshold,
             batch=batch,
         )
         opened = OpenedPicture.of(picture, color, white, bands)
@@ -457,8 +457,8 @@ class ActivePerception(nn.Module):
         seconds: float | None = None,
         duration: float | None = None,
         on_look: OnLook | None = None,
-        worth: float | None = None,
-        least: float | None = None,
+        min_gain: float | None = None,
+        score_threshold: float | None = None,
         start: Start = None,
         policy: str | None = None,
         seed: int = 0,
@@ -468,7 +468,7 @@ class ActivePerception(nn.Module):
     ) -> Record:
         """Explore a picture: learn which classes are where, without a target.
 
-        It ends at the first limit that is reached, or when no look is expected to gain at least `worth`.
+        It ends at the first limit that is reached, or when no look is expected to gain at least `min_gain`.
 
         Args:
             picture: as for `search`.
@@ -480,7 +480,7 @@ class ActivePerception(nn.Module):
             The record, without target and decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
 
         Raises:
-            InputError: an argument does not fit the kind of look, or `worth` is given without a learned map.
+            InputError: an argument does not fit the kind of look, or `min_gain` is given without a learned map.
             DataError: the file of the picture cannot be read.
         """
         settings = ExploreSettings(
@@ -492,8 +492,8 @@ class ActivePerception(nn.Module):
             on_look=on_look,
             start=start,
             seed=seed,
-            worth=worth,
-            least=least,
+            min_gain=min_gain,
+            score_threshold=score_threshold,
             policy=policy,
         )
         of_fovea = any(value is not None for value in (start, policy, shifts))
@@ -544,10 +544,10 @@ class ActivePerception(nn.Module):
         start: Start = None,
         seed: int = 0,
         confirm: float | None = None,
-        give_up: float | None = None,
+        stop_below: float | None = None,
         closer: int | None = None,
         prior: float | None = None,
-        least: float | None = None,
+        score_threshold: float | None = None,
         color: Color = "rgb",
         white: White | None = None,
     ) -> LivePerception:
@@ -571,10 +571,10 @@ class ActivePerception(nn.Module):
             start=start,
             seed=seed,
             confirm=confirm,
-            give_up=give_up,
+            stop_below=stop_below,
             closer=closer,
             prior=prior,
-            least=least,
+            score_threshold=score_threshold,
             color=color,
         )
         classes = class_numbers(target, self.classes[1:], "target")

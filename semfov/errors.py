@@ -2,7 +2,8 @@
 
 import math
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
@@ -13,7 +14,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from semfov.words import meant_options, other_method
+from semfov.words import FORMER, meant_options, note_of_former, other_method
 
 __all__ = ["DataError", "InputError", "SemfovError"]
 
@@ -234,6 +235,28 @@ def _nearest_options(name: str, known: list[str]) -> str:
     return f"did you mean {' or '.join(f'{option}=' for option in options)}?"
 
 
+def _rename_former(options: dict[str, object], known: Collection[str]) -> None:
+    """Give options of a call their present names, with a warning for each that has an earlier one."""
+    for former in FORMER.keys() & options.keys():
+        present = FORMER[former]
+        if present in known:
+            check(present not in options, present, "one value", f"another as {former}, its earlier name")
+            warnings.warn(note_of_former(former, present), FutureWarning, stacklevel=3)
+            options[present] = options.pop(former)
+
+
+def former_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """Decorate a function so that it takes settings by their earlier names, too, with a warning."""
+    known = signature(function).parameters
+
+    @wraps(function)
+    def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
+        _rename_former(options, known)
+        return function(*arguments, **options)
+
+    return call
+
+
 def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
     """Decorate a method so that unknown or missing arguments raise `InputError` with a suggestion."""
     form = signature(function)
@@ -244,6 +267,7 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
 
     @wraps(function)
     def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
+        _rename_former(options, known)
         check_options(options, known, name)
         try:
             form.bind(*arguments, **options)

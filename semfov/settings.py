@@ -6,9 +6,9 @@ the kind of look and the models of the agent.
 
                       LookSettings    StartSettings    DecisionSettings    its own
     SearchSettings         x                x                 x            boxes
-    FindSettings           x                                               worth, least, batch
-    ExploreSettings        x                x                              worth, least, policy
-    StreamSettings                          x                 x            how, rate, least, color
+    FindSettings           x                                               min_gain, score_threshold, batch
+    ExploreSettings        x                x                              min_gain, score_threshold, policy
+    StreamSettings                          x                 x            how, rate, score_threshold, color
 """
 
 import re
@@ -142,7 +142,7 @@ class DecisionSettings(CheckedSettings):
         confirm: least probability of the target for `found`: with closer looks, that it is at the place; otherwise,
             that the picture holds it (None: the threshold that was chosen when the model was fitted, or a score of 0.5
             for agents without a fitted belief).
-        give_up: probability of the target below which a look is not worth a pass (None: the threshold of the model).
+        stop_below: chance of a new hit below which the search stops (None: the threshold of the model).
         closer: largest number of closer looks, in which a window around a place that seems to hold the target is
             enlarged to the detector's input, each a pass (None: 3 in a photograph, all that there are passes for in a
             large picture, 2 for a fovea); 0 makes none.
@@ -153,11 +153,11 @@ class DecisionSettings(CheckedSettings):
         InputError: a value is out of range.
 
     >>> DecisionSettings(closer=0)
-    DecisionSettings(confirm=None, give_up=None, closer=0, prior=None)
+    DecisionSettings(confirm=None, stop_below=None, closer=0, prior=None)
     """
 
     confirm: Probability | None = None
-    give_up: Probability | None = None
+    stop_below: Probability | None = None
     closer: CloserLooks | None = field(default=None, metadata=_only_for("fovea", "windows", instead="confirm"))
     prior: PriorShare | None = None
 
@@ -188,21 +188,21 @@ class FindSettings(LookSettings):
     """Settings of the search for all objects of a picture (`ActivePerception.find_all`).
 
     Args:
-        worth: least expected gain of a look that is worth a pass: of windows the new objects (None: 0.01), of a head
-            the further right cells (None: 0).
-        least: score from which on an object counts; in windows its probability, or its score in the whole picture
-            (None: 0.5 there).
+        min_gain: least expected gain of another look; below it the episode ends. For windows it counts new objects
+            (None: 0.01), for a head cells that are newly classified right (None: 0).
+        score_threshold: score from which on an object is listed; in windows its probability, or its score in the whole
+            picture (None: 0.5 there).
         batch: number of windows that are chosen jointly and pass the detector together.
 
     Raises:
         InputError: a value is out of range, or the kind of look is unknown.
 
-    >>> FindSettings(worth=0.05).batch
+    >>> FindSettings(min_gain=0.05).batch
     1
     """
 
-    worth: Weight | None = field(default=None, metadata=_only_for("windows", "head", instead="passes"))
-    least: Probability | None = None
+    min_gain: Weight | None = field(default=None, metadata=_only_for("windows", "head", instead="passes"))
+    score_threshold: Probability | None = None
     batch: Annotated[int, Range(1, MOST_PASSES)] = 1
 
 
@@ -211,11 +211,11 @@ class ExploreSettings(LookSettings, StartSettings):
     """Settings of an exploration of a picture (`ActivePerception.explore`).
 
     Args:
-        worth: least expected gain of a look that is worth a pass: of a fovea with a learned map the cells that are
-            named right (None: 0.1), of a head the same (None: 0), of windows the new objects (None: 0.01); 0 makes all
-            looks.
-        least: score from which on an object counts; in windows its probability, or its score in the whole picture
-            (None: 0.5 there).
+        min_gain: least expected gain of another look; below it the episode ends. For a fovea with a learned map it
+            counts cells that are newly classified right (None: 0.1), for a head likewise (None: 0), for windows new
+            objects (None: 0.01). 0 makes all looks.
+        score_threshold: score from which on an object is listed; in windows its probability, or its score in the whole
+            picture (None: 0.5 there).
         policy: `people` moves a fovea as people move their gaze (`semfov.gaze.Viewer`); None as the agent does.
 
     Raises:
@@ -225,8 +225,8 @@ class ExploreSettings(LookSettings, StartSettings):
     'people'
     """
 
-    worth: Weight | None = None
-    least: Probability | None = None
+    min_gain: Weight | None = None
+    score_threshold: Probability | None = None
     policy: str | None = field(default=None, metadata=_only_for("fovea", instead="none"))
 
     def __post_init__(self) -> None:
@@ -244,14 +244,14 @@ class StreamSettings(DecisionSettings, StartSettings):
         rate: rate at which evidence fades, per second; 0: never (None: 2.5 for a fovea, 0.75 for windows).
         confirm: the target is found from this probability on, with closer looks that of its place (None: that of the
             model).
-        give_up: probability of the target below which a look is not worth a frame (None: that of the belief alone, as
-            a belief that fades can reach it, or with rate 0 that of a search).
+        stop_below: chance of a new hit below which no closer look is made (None: that of the belief alone, as a belief
+            that fades can reach it, or with rate 0 that of a search).
         closer: largest number of closer looks in the time until half of the evidence has faded (None: 2 for a fovea, 3
             for windows of small frames, as many as there are frames for those of large ones); 0: none.
         prior: how often the target is there: the share of the frames that hold it (None: as often as in the searches of
             the fit).
-        least: probability from which on an object counts in windows (None: 0.5); with a lower one a tracker or a curve
-            of precision over recall gets fainter objects, too.
+        score_threshold: probability from which on an object is listed in windows (None: 0.5); with a lower one a
+            tracker or a curve of precision over recall gets fainter objects, too.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
     Raises:
@@ -263,7 +263,7 @@ class StreamSettings(DecisionSettings, StartSettings):
 
     how: How = "auto"
     rate: Rate | None = None
-    least: Probability | None = None
+    score_threshold: Probability | None = None
     color: Color = "rgb"
 
     def __post_init__(self) -> None:

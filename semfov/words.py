@@ -3,6 +3,7 @@
 Each table has our words, and beside them those of others, separated by blanks.
 """
 
+import warnings
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,7 +15,9 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
 
 OPTIONS = _by_word(
     {
-        "least confirm": "conf conf_thres confidence min_score score threshold",
+        "score_threshold confirm": "conf conf_thres confidence min_score score threshold",
+        "min_gain": "expected_gain gain min_improvement tol tolerance",
+        "stop_below": "stop stop_threshold stopping_threshold",
         "target": "class class_name classes cls label labels name query targets",
         "picture": "file image img path photo source",
         "grid": "cells columns rows",
@@ -40,6 +43,15 @@ OPTIONS = _by_word(
     }
 )
 """Options of methods and of the command, several where the word of others can mean each of them."""
+
+FORMER = {"least": "score_threshold", "give_up": "stop_below", "worth": "min_gain", "price": "look_cost"}
+"""Present names of settings by those that they had in earlier versions, which are still taken, with a note."""
+
+
+def note_of_former(former: str, present: str) -> str:
+    """Say that a setting has another name now."""
+    return f"{former} is called {present} now; the earlier name will go"
+
 
 _OTHER_METHODS = {
     ("explore", "target"): "find_all(picture, target) lists what is there of a class, search(picture, target) decides",
@@ -156,4 +168,8 @@ class OtherWords:
         def __getattr__(self, name: str) -> Any:
             if hasattr(type(self), name):
                 return object.__getattribute__(self, name)  # a property that has failed tells its own error
+            present = FORMER.get(name)
+            if present is not None and hasattr(self, present):
+                warnings.warn(note_of_former(name, present), FutureWarning, stacklevel=2)
+                return getattr(self, present)
             raise missing(type(self).__name__, name, self._other_words)

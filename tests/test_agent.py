@@ -86,16 +86,16 @@ def test_the_map_of_all_classes_is_made_when_it_is_read(agent, image, monkeypatc
 
 @pytest.mark.parametrize("how", ["fovea", "windows"])
 def test_objects_count_from_the_asked_score_on(agent, image, how):
-    every = agent.find_all(image, how=how, passes=2, least=0.0)
+    every = agent.find_all(image, how=how, passes=2, score_threshold=0.0)
     middle = float(every.candidates.scores.median())
     start = {"start": 0} if how == "fovea" else {}
     for some in (
-        agent.find_all(image, how=how, passes=2, least=middle),
-        agent.explore(image, how=how, passes=2, least=middle, **start),
+        agent.find_all(image, how=how, passes=2, score_threshold=middle),
+        agent.explore(image, how=how, passes=2, score_threshold=middle, **start),
     ):
-        assert some.least == middle
+        assert some.score_threshold == middle
         assert len(some.objects) == int((some.candidates.scores >= middle).sum())
-    refused("least", agent.find_all, image, how=how, passes=2, least=1.5)
+    refused("score_threshold", agent.find_all, image, how=how, passes=2, score_threshold=1.5)
 
 
 def test_predictive_policies_search_for_one_class_only(image):

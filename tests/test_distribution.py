@@ -152,6 +152,6 @@ def test_the_wheel_works_in_a_separate_environment(built, tmp_path):
     printed = run(python, "-W", "error", "-c", CODE, cwd=tmp_path)
     assert printed.split()[:2] == [semfov.__version__, "8"]
     assert "yolox-nano" in printed
-    assert "--give_up" in printed
+    assert "--stop_below" in printed
     command = home / "bin" / "semfov"
     assert run(command, "--version", cwd=tmp_path) == f"semfov {semfov.__version__}\n"

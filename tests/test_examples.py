@@ -70,7 +70,7 @@ def test_the_pyramid_for_kornia_has_the_numbers_the_borders_and_the_gradients_of
 
 def test_searching_draws_the_scanpath(run, tmp_path):
     output = run("search_photograph", "--out", tmp_path / "scanpath.png")
-    assert "fixation 0 at (32, 24)" in output
+    assert "fixation 1 at (32, 24)" in output
     said = r"“boat” (found|not there|undecided) after \d+ gaze shifts?( and \d closer looks?)? \(prob"
     assert re.search(said, output)
     with Image.open(tmp_path / "scanpath.png") as picture:

@@ -103,8 +103,8 @@ def test_a_prior_changes_the_fovea_in_a_search_and_in_a_stream_by_the_odds(one_t
     agent, image = agent_with(Target(model)), scene(100, 80)
     live = agent.live("green", rate=0, start=3, seed=5, how="fovea", prior=0.2)
     with torch.inference_mode():
-        usual = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", give_up=0.0)
-        rare = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", prior=0.2, give_up=0.0)
+        usual = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", stop_below=0.0)
+        rare = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", prior=0.2, stop_below=0.0)
         several = agent.search(image, ["red", "green"], shifts=1, how="fovea")
     moments = [live.step(image) for _ in range(5)]
     assert (usual.prior, usual.assumed) == (None, pytest.approx(0.9))
@@ -129,7 +129,7 @@ def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration
     ).eval()
     live, image = agent.live(rate=0, start=3), scene(60, 60)
     with torch.inference_mode():
-        explored = agent.explore(image, start=3, shifts=6, worth=0)
+        explored = agent.explore(image, start=3, shifts=6, min_gain=0)
     for cell, map_, _ in zip(explored.cells, explored.probabilities, range(7), strict=True):
         moment = live.step(image)
         assert moment.cell == cell
@@ -307,10 +307,15 @@ def test_fainter_objects_are_listed_from_the_probability_that_is_asked_for():
     agent = ActivePerception.recommended()
     frame = semfov.example("sheet")
     usual = agent.live(["person"]).step(frame)
-    fainter = agent.live(["person"], least=0.05).step(frame)
+    fainter = agent.live(["person"], score_threshold=0.05).step(frame)
     shown = usual.candidates.scores
     assert len(fainter.objects) == int((shown >= 0.05).sum()) > len(usual.objects) == int((shown >= 0.5).sum())
-    refused("least: expected None for a fovea, or how='windows', got 0.05", agent.live, how="fovea", least=0.05)
+    refused(
+        "score_threshold: expected None for a fovea, or how='windows', got 0.05",
+        agent.live,
+        how="fovea",
+        score_threshold=0.05,
+    )
 
 
 def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once():

@@ -28,7 +28,7 @@ from semfov.data.inputs import FRAME
 from semfov.decision import MOST_CLOSER
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
-from semfov.detection.objects import FAINTEST, LEAST
+from semfov.detection.objects import FAINTEST, SCORE_THRESHOLD
 from semfov.head import Speeds
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
@@ -170,7 +170,7 @@ KNOWN = {
     "docs/pan-tilt.md": {"from -1 to 1": "a range", "(40 by default)": "code, tested with the agent"},
     "docs/testing.md": {f"longer than {MOST_LINES} lines": "code", "97.2 %": "coverage when it was last measured"},
     "docs/command.md": {
-        f"from score {LEAST}": "code",
+        f"from score {SCORE_THRESHOLD}": "code",
         f"at least {LIKELY} are": "code",
         "in 16 bits": "a type",
         "begin with 0": "a rule",
@@ -182,7 +182,7 @@ KNOWN = {
         "is 1 once": "a rule",
         "whole picture (0) to native pixels (1)": "a range",
         "score of 0.1 and overlaps": "what found means",
-        f"score of {LEAST}, and an": "code",
+        f"score of {SCORE_THRESHOLD}, and an": "code",
     },
     "docs/guides/live.md": {
         f"at least {LIKELY} are listed": "code",
@@ -194,7 +194,7 @@ KNOWN = {
         "of 16 bits": "a type",
     },
     "docs/guides/records.md": {
-        f"which is {LEAST} unless": "code",
+        f"which is {SCORE_THRESHOLD} unless": "code",
         f"begin at {FAINTEST}": "code",
     },
     "docs/guides/robots.md": {"ROS 2": "a name", "version 4": "of vision_msgs"},

@@ -73,7 +73,7 @@ def choose_patience(model: GlimpseEvidence, fit: MosaicFit) -> list[list[str]]:
     passes: dict[float, float] = {}
     for value in track(_PATIENCES, "choosing patience", "value"):
         model.patience = value
-        passes[value] = _mean_passes(model, opened, slots, fit.eye.detector.least)
+        passes[value] = _mean_passes(model, opened, slots, fit.eye.detector.score_threshold)
         for looks in opened:
             looks.save()
     model.patience = min(passes, key=passes.__getitem__)

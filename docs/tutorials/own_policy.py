@@ -44,7 +44,7 @@ agents = {
     for policy in (policies.Policy("keep-away"), closer, policies.Policy("random"))
 }
 scenes = semfov.EmbeddedScenes(recommended.classes[1:], count=4)
-explored = agents["keep-away"].explore(scenes[1].image, start=0, shifts=6, worth=0)
+explored = agents["keep-away"].explore(scenes[1].image, start=0, shifts=6, min_gain=0)
 viz.plot_episode(explored)
 
 # %% [markdown]
@@ -63,7 +63,7 @@ for index in range(len(scenes)):
     for start in (0, 99):
         cells += int(answers.any(-1).sum())
         for name, agent in agents.items():
-            path = agent.explore(scene.image, start=start, shifts=looks, worth=0)
+            path = agent.explore(scene.image, start=start, shifts=looks, min_gain=0)
             right[name] += right_cells(path.probabilities[..., 1:], answers).sum(-1)
 share = {name: counts / cells for name, counts in right.items()}
 print({name: f"{100 * counts[-1]:.0f} %" for name, counts in share.items()})

@@ -75,7 +75,7 @@ class DecideConfig(ComparedConfig):
         protocol: the protocol; `shifts` and `seed` are used.
         confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
             in the image for a search without closer looks (None: the model's own threshold).
-        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
+        stop_below: a search gives up when, in every cell not fixated yet, the probability of the target is below this
             value (None: the model's own threshold).
         place: least probability of a cell that is worth a closer look, or, without closer looks, of the fixated cell
             for a find (None: the model's own threshold).
@@ -95,7 +95,7 @@ class DecideConfig(ComparedConfig):
     unused = ("saliency", "policies")
     policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
     confirm: Share | None = None
-    give_up: Share | None = None
+    stop_below: Share | None = None
     place: Share | None = None
     closer: Annotated[int, Range(0, 100)] = MOST_CLOSER
     windows: str | None = None
@@ -134,7 +134,7 @@ class DecisionRun(ComparedLooking):
         evidence = self.models.evidence
         assert evidence is not None
         chosen = evidence.thresholds or Thresholds(0.9, 0.05)
-        self.thresholds = chosen.changed(config.confirm, config.give_up, config.place)
+        self.thresholds = chosen.changed(config.confirm, config.stop_below, config.place)
         # The shipped model was fitted with the shipped evidence.
         if config.closer and (config.verification or config.belief.target_model is None):
             self.verification = if_shipped(partial(make_learned, Verification), config.verification, self.eye)
@@ -175,7 +175,7 @@ class DecisionRun(ComparedLooking):
         assert self.verification is not None
         assert self.verification.thresholds is not None
         config = self.config
-        thresholds = self.verification.thresholds.changed(config.confirm, config.give_up, config.place)
+        thresholds = self.verification.thresholds.changed(config.confirm, config.stop_below, config.place)
         candidates = CandidateCells(grid, target)
         return Verifier(
             self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
@@ -186,7 +186,7 @@ class DecisionRun(ComparedLooking):
         config, target = self.config, search.target
         assert self.windows is not None
         goal = Goal.of(("background", *self.eye.detector.classes), target)
-        decisions = DecisionSettings(config.confirm, config.give_up, None if config.closer else 0)
+        decisions = DecisionSettings(config.confirm, config.stop_below, None if config.closer else 0)
         path = WindowEpisode(WindowTask(goal, self.windows, decisions), source, EpisodeLimits(PASSES)).run()
         decision = path.decision
         assert decision is not None
@@ -206,7 +206,7 @@ class DecisionRun(ComparedLooking):
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""
         config = self.config
-        settings = [config.confirm, config.give_up, config.place, config.closer, config.rules, config.references]
+        settings = [config.confirm, config.stop_below, config.place, config.closer, config.rules, config.references]
         return {
             **super().depends_on(),
             "decisions": settings,

@@ -21,8 +21,8 @@ from semfov.data.classes import class_index
 from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.errors import check
-from semfov.fit.window_looking import right_boxes
 from semfov.io.ranges import Count, Positive, Range, Seed, Whole
+from semfov.observation.matching import right_boxes
 from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.progress import track
 from semfov.runs.results import ResultRecord

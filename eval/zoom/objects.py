@@ -16,9 +16,8 @@ from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.detection.selection import Selection, suppress
-from semfov.fit.window_looking import right_boxes
 from semfov.metrics.calibration import BinarySums
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, right_boxes
 from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import table

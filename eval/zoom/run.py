@@ -23,7 +23,7 @@ from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
-from semfov.detection.objects import LEAST
+from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.protocols import choose_classes
 from semfov.fit.window_looking import (
@@ -31,9 +31,9 @@ from semfov.fit.window_looking import (
     WindowLooking,
     WindowLookingConfig,
     found_in,
-    right_boxes,
 )
 from semfov.io.ranges import Count, Range
+from semfov.observation.matching import right_boxes
 from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
@@ -158,7 +158,7 @@ class ZoomRun(WindowLooking, SceneRun):
             }
         seen = {name: looked(look_by_look(source, order, None)) for name, order in orders.items()}
         goal = Goal.of(("background", *self.scenes.classes), None, targets)
-        episode = WindowEpisode(WindowTask(goal, self.evidence, worth=0.0), source)
+        episode = WindowEpisode(WindowTask(goal, self.evidence, min_gain=0.0), source)
         paths: dict[int, ZoomPath] = {}
         while episode.passes < config.passes and episode.look() is not None:
             if episode.passes in self.numbers:
@@ -252,7 +252,7 @@ class ZoomRun(WindowLooking, SceneRun):
     def _first_hits(self, index: int, source: WindowLooks) -> list[ResultRecord]:
         """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
         cut = self.slices(index, source.lattice)
-        presence = torch.stack([look.show for look in source.see(cut)]) >= LEAST
+        presence = torch.stack([look.show for look in source.see(cut)]) >= SCORE_THRESHOLD
         closest = min(window.level for window in cut)
         limit = len(cut) + 1
         records: list[ResultRecord] = []
@@ -272,7 +272,7 @@ class ZoomRun(WindowLooking, SceneRun):
                 passes, hit = 0, False
                 for look in (step.look for step in islice(steps, limit)):
                     passes += 1
-                    hit = look.window.level >= closest and float(look.show[target - 1]) >= LEAST
+                    hit = look.window.level >= closest and float(look.show[target - 1]) >= SCORE_THRESHOLD
                     if hit:
                         break
                 records.append(

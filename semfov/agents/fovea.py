@@ -17,7 +17,7 @@ from semfov.gaze.acquisition import ExpectedGain
 from semfov.paths import GazePrediction, Scanpath
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 
-_WORTH = 0.1  # default for the least gain of a look by a learned map, in cells that are classified correctly
+_MIN_GAIN = 0.1  # default for the least gain of a look by a learned map, in cells that are classified correctly
 RATE = 2.5  # default rate at which the belief fades in a stream, per second
 _CONFIRM = 0.5  # default for the score of a detection that ends a search without thresholds
 
@@ -87,10 +87,10 @@ class FoveaAgent(GazeParts):
         """
         limits = EpisodeLimits.of(settings)
         observer = on_cpu(self.exploring.observer)
-        worth, policy = settings.worth, settings.policy
-        if worth and not isinstance(observer, LearnedMap):
+        min_gain, policy = settings.min_gain, settings.policy
+        if min_gain and not isinstance(observer, LearnedMap):
             raise InputError(
-                f"worth: expected None for an agent without a learned map, got {worth}; use the recommended agent"
+                f"min_gain: expected None for an agent without a learned map, got {min_gain}; use the recommended agent"
             )
         plan = GazePlan(
             self,
@@ -101,9 +101,9 @@ class FoveaAgent(GazeParts):
         )
 
         def criterion(grid: Grid) -> StoppingCriterion:
-            if not isinstance(observer, LearnedMap) or (policy is not None and worth is None):
+            if not isinstance(observer, LearnedMap) or (policy is not None and min_gain is None):
                 return StoppingCriterion()
-            return LittleGain(ExpectedGain(observer.model, grid), _WORTH if worth is None else worth)
+            return LittleGain(ExpectedGain(observer.model, grid), _MIN_GAIN if min_gain is None else min_gain)
 
         return FoveaEpisode(plan, image, limits, criterion).run()
 
@@ -137,7 +137,12 @@ class FoveaAgent(GazeParts):
         Raises:
             InputError: a setting is for windows alone.
         """
-        check(settings.least is None, "least", "None for a fovea, or how='windows'", settings.least)
+        check(
+            settings.score_threshold is None,
+            "score_threshold",
+            "None for a fovea, or how='windows'",
+            settings.score_threshold,
+        )
         rate = RATE if settings.rate is None else settings.rate
         plan = GazePlan(self, target, start=settings.start, seed=settings.seed, decisions=settings, rate=rate)
         return FoveaStream(plan, settings.color)

@@ -139,8 +139,8 @@ class GazePlan:
             return None
         if self.forgetting is not None and self.forgetting.rate and of_belief is not None:
             # A belief that fades stays less certain than in a search, and would give up at once.
-            fitted = fitted.changed(give_up=of_belief.give_up)
-        return fitted.changed(decisions.confirm, decisions.give_up)
+            fitted = fitted.changed(stop_below=of_belief.stop_below)
+        return fitted.changed(decisions.confirm, decisions.stop_below)
 
     @property
     def goal(self) -> Goal:
@@ -267,7 +267,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
     ) -> None:
         super().__init__(plan.goal, limits)
         eye = plan.agent.eye
-        self._trace = Trace(plan.grid(image), self.goal.classes, plan.target, plan.beside, eye.detector.least)
+        self._trace = Trace(plan.grid(image), self.goal.classes, plan.target, plan.beside, eye.detector.score_threshold)
         self._gaze = FoveaGaze(plan, image, self._trace.look_closely, criterion)
         self._plan = plan
         self._stimulus = Stimulus.of(eye, image)

@@ -114,9 +114,9 @@ class HeadAgent(nn.Module):
         """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerSecond`).
 
         The target is found when the gaze is on a cell that holds it with a probability of at least `confirm` (None:
-        0.7). It is absent if every cell that the views show was fixated, or is less probable than `give_up` (None: than
-        a cell that was never seen), and no cell holds it with a probability of one half. Both end the search. A search
-        that a limit ends is undecided (`semfov.decision.settle`).
+        0.7). It is absent if every cell that the views show was fixated, or is less probable than `stop_below` (None:
+        than a cell that was never seen), and no cell holds it with a probability of one half. Both end the search. A
+        search that a limit ends is undecided (`semfov.decision.settle`).
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
@@ -137,7 +137,7 @@ class HeadAgent(nn.Module):
         settings = SearchSettings() if settings is None else settings
         settings.check_suitable(HEAD)
         index = class_index(target, self.classes[1:], "target")
-        check_thresholds(settings.confirm, settings.give_up)
+        check_thresholds(settings.confirm, settings.stop_below)
         check_number(foresight, "foresight", 0, 1e6)
         limits = EpisodeLimits.of(settings, _PASSES)
         views = self.views(scene, color)
@@ -147,7 +147,7 @@ class HeadAgent(nn.Module):
         gain = SearchGain(views, foresight)
         observer = SceneObserver(Target(evidence, prior=known), views, prior=never_seen)
         sure = _CONFIRM if settings.confirm is None else settings.confirm
-        thresholds = Thresholds(sure, never_seen if settings.give_up is None else settings.give_up, sure)
+        thresholds = Thresholds(sure, never_seen if settings.stop_below is None else settings.stop_below, sure)
         return HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=_first_action(settings), duration=_duration(settings),
@@ -218,13 +218,13 @@ class HeadAgent(nn.Module):
             ExploreGain(views, evidence),
             None,
             targets,
-            worth=0.0 if settings.worth is None else settings.worth,
+            min_gain=0.0 if settings.min_gain is None else settings.min_gain,
             limits=limits,
             start=start,
             duration=_duration(settings),
             seed=seed,
         ).run()
-        return path if settings.least is None else replace(path, least=settings.least)
+        return path if settings.score_threshold is None else replace(path, score_threshold=settings.score_threshold)
 
 
 def _duration(settings: LookSettings) -> float:
@@ -249,7 +249,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         gain: expected gain of a look.
         target: class 1..K to search for; None finds all objects.
         targets: classes 1..K whose objects are all to be found; none: of all classes.
-        worth: least expected gain for which a look is worth it.
+        min_gain: least expected gain for which a look is worth it.
         thresholds: thresholds of the decision of a search; None decides nothing.
         limits: where the episode ends, unless it decides before.
         start: first action (`Views`); None looks straight ahead.
@@ -266,7 +266,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         target: int | None,
         targets: tuple[int, ...] = (),
         *,
-        worth: float = 0.0,
+        min_gain: float = 0.0,
         thresholds: Thresholds | None = None,
         limits: EpisodeLimits | None = None,
         start: int | None = None,
@@ -285,7 +285,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         self.views = views
         self.thresholds = thresholds
         self.duration = duration
-        self.least = agent.eye.detector.least
+        self.score_threshold = agent.eye.detector.score_threshold
         self._detector = agent.eye.detector.name
         self._prior = prior
         self._steps = look_around(
@@ -298,7 +298,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
             closer=CloserLooks(gain, speeds, self.goal.target) if zooms else None,
             passes=MOST_PASSES,
             duration=duration,
-            worth=worth,
+            min_gain=min_gain,
             seed=seed,
         )
         self._last: HeadStep | None = None
@@ -341,7 +341,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
     def _end(self, limit: Ending | None) -> None:
         step = self._last
         assert step is not None
-        usual: Ending = "duration" if step.seconds + step.ahead > self.duration else "worth"
+        usual: Ending = "duration" if step.seconds + step.ahead > self.duration else "min_gain"
         if len(self._looks) == len(self.views.grid):
             usual = "cells"
         self.ending = self.ending or limit or usual
@@ -353,7 +353,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
             views=self.views,
             target=self.goal.target,
             classes=self.goal.classes,
-            least=self.least,
+            score_threshold=self.score_threshold,
             looks=self.looks,
             maps=torch.stack(self._maps) if self._maps else torch.zeros(0, len(self.views.world.scene)),
             found=decision is not None and decision.outcome == "found",

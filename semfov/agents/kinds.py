@@ -101,12 +101,12 @@ class FoveaKind(KindOfLook):
     def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
         fovea = self.parts.fovea
         record = fovea.find_all(picture.image(fovea.eye.sensor.like), targets, settings)
-        return _counted_from(picture.named(record), settings.least)
+        return _counted_from(picture.named(record), settings.score_threshold)
 
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
         fovea = self.parts.fovea
         record = fovea.explore(picture.image(fovea.eye.sensor.like), settings)
-        return _counted_from(picture.named(record), settings.least)
+        return _counted_from(picture.named(record), settings.score_threshold)
 
     def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
         remedy = "for all objects of several classes use how='windows', and for one of them a class without a list"
@@ -147,9 +147,9 @@ class HeadKind(KindOfLook):
         return self.parts.head.explore(picture.world, settings)
 
 
-def _counted_from(record: Record, least: float | None) -> Record:
+def _counted_from(record: Record, score_threshold: float | None) -> Record:
     """Count the objects of a record from a probability or score on; None leaves the record as it is."""
-    return record if least is None else replace(record, least=least)
+    return record if score_threshold is None else replace(record, score_threshold=score_threshold)
 
 
 def _one_class(target: TargetLike) -> str | int:

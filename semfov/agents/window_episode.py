@@ -24,7 +24,7 @@ from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp, Decision
-from semfov.detection import LEAST, Detections, Objects
+from semfov.detection import SCORE_THRESHOLD, Detections, Objects
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check
 from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
@@ -62,19 +62,19 @@ class WindowTask:
         evidence: predicts from a look what closer looks will find; None looks at slices in the order of the overview's
             scores, and then nothing is `absent`.
         decisions: settings of the decision of a search.
-        worth: an exploration ends when no look is expected to find more new objects than this; None for the usual
+        min_gain: an exploration ends when no look is expected to find more new objects than this; None for the usual
             number. In a photograph, and without evidence, all slices are looked at, and it means nothing.
         batch: number of windows that are chosen jointly and pass the detector together; in a photograph one.
-        least: probability, without evidence score, from which on objects count; None for the usual one.
+        score_threshold: probability, without evidence score, from which on objects count; None for the usual one.
         detector: name of the detector; None if it is not known.
     """
 
     goal: Goal
     evidence: GlimpseEvidence | None = None
     decisions: DecisionSettings = field(default_factory=DecisionSettings)
-    worth: float | None = None
+    min_gain: float | None = None
     batch: int = 1
-    least: float | None = None
+    score_threshold: float | None = None
     detector: str | None = None
 
     def __post_init__(self) -> None:
@@ -157,13 +157,13 @@ class WindowSession:
             belief = ZoomBelief(source.lattice, evidence, goal.target, source.blank)
             self.decisions = decisions_of(belief, self._close_up, task.decisions, self.forgetting)
             return search_windows(source, belief, forgetting=self.forgetting)
-        worth = NEW_OBJECTS if task.worth is None else task.worth
+        min_gain = NEW_OBJECTS if task.min_gain is None else task.min_gain
         return find_everything(
             source,
             evidence,
             goal.target,
             batch=task.batch,
-            worth=worth,
+            min_gain=min_gain,
             forgetting=self.forgetting,
             known=None if self.tracker is None else self._value_of_known,
         )
@@ -255,7 +255,7 @@ class WindowSession:
             "candidates": merged.objects if self.tracker is None else self._tracked(self.tracker.tracks, places),
             "unseen": merged.unseen,
             "spread": SPREAD if self._certainty is None else self._certainty.spread,
-            "least": self._least,
+            "score_threshold": self._score_threshold,
             "detector": task.detector,
             "closer": _renumbered(self.decisions.looks, places),
         }
@@ -270,10 +270,10 @@ class WindowSession:
         return Tracks.none() if self.tracker is None else self.tracker.tracks
 
     @property
-    def _least(self) -> float:
+    def _score_threshold(self) -> float:
         """Probability, or score, from which on objects count."""
-        usual = LEAST if self._certainty is None else LIKELY
-        return usual if self.task.least is None else self.task.least
+        usual = SCORE_THRESHOLD if self._certainty is None else LIKELY
+        return usual if self.task.score_threshold is None else self.task.score_threshold
 
     def _merged(self, looks: Sequence[LookAtWindow]) -> MergedLooks:
         """Make what merges the objects of looks when they are asked for; what changes is computed now."""
@@ -353,7 +353,7 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
         decisions = self.session.decisions
         self._concluded = decisions.conclude()
         is_sliced = self.session.task.takes_slices(self.source.lattice)
-        usual: Ending = "windows" if self.goal.searches or is_sliced else "worth"
+        usual: Ending = "windows" if self.goal.searches or is_sliced else "min_gain"
         is_found = self._concluded is not None and self._concluded.outcome == "found"
         self.ending = decisions.ending if is_found or decisions.outcome else limit or usual
 

@@ -116,7 +116,7 @@ class ZoomAgent(nn.Module):
 
         With fitted evidence the scores of objects are the probabilities that box and class are right
         (`semfov.zoom.certainty`), and those from 0.5 on count. Without evidence they are the detector's, and count from
-        0.3 on. In a photograph, and without evidence, slices are looked at, and `worth` and `batch` mean nothing.
+        0.3 on. In a photograph, and without evidence, slices are looked at, and `min_gain` and `batch` mean nothing.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
@@ -135,7 +135,9 @@ class ZoomAgent(nn.Module):
         settings.check_suitable(WINDOWS)
         limits = EpisodeLimits.of(settings, PASSES)
         targets = class_numbers(target, self.classes[1:], "target")
-        task = self.task(targets=targets, worth=settings.worth, batch=settings.batch, least=settings.least)
+        task = self.task(
+            targets=targets, min_gain=settings.min_gain, batch=settings.batch, score_threshold=settings.score_threshold
+        )
         return self.episode(picture, task, limits).run()
 
     def explore(self, picture: _Picture, settings: ExploreSettings | None = None) -> ZoomPath:
@@ -155,7 +157,9 @@ class ZoomAgent(nn.Module):
         settings = ExploreSettings() if settings is None else settings
         settings.check_suitable(WINDOWS)
         limits = EpisodeLimits.of(settings, PASSES)
-        return self.episode(picture, self.task(worth=settings.worth, least=settings.least), limits).run()
+        return self.episode(
+            picture, self.task(min_gain=settings.min_gain, score_threshold=settings.score_threshold), limits
+        ).run()
 
     def task(self, target: int | None = None, targets: tuple[int, ...] = (), **settings: Any) -> WindowTask:
         """Say what is looked for, with the evidence of the agent.
@@ -207,5 +211,5 @@ class ZoomAgent(nn.Module):
         """
         settings = StreamSettings() if settings is None else settings
         rate = RATE if settings.rate is None else settings.rate
-        task = self.task(target, targets, decisions=settings, least=settings.least)
+        task = self.task(target, targets, decisions=settings, score_threshold=settings.score_threshold)
         return WindowStream(task, self.eye, rate, color=settings.color, follows=follows)

@@ -1,7 +1,7 @@
 """Learned evidence for a target: in a cell from one look, in a cell from all looks, and in the whole image."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -26,26 +26,57 @@ class Thresholds:
 
     Attributes:
         confirm: least probability of the picture, or of a place after a closer look, for `found`.
-        give_up: probability of a cell or a place below which it is not worth a look.
+        stop_below: probability of a cell or a place below which it is not worth a look.
         place: least probability of the place of a target that is found, or of one that is worth a closer look.
     """
 
     confirm: float
-    give_up: float
+    stop_below: float
     place: float = 0.0
 
     def changed(
-        self, confirm: float | None = None, give_up: float | None = None, place: float | None = None
+        self, confirm: float | None = None, stop_below: float | None = None, place: float | None = None
     ) -> "Thresholds":
         """Copy with other values; None keeps a value."""
-        values = {"confirm": confirm, "give_up": give_up, "place": place}
+        values = {"confirm": confirm, "stop_below": stop_below, "place": place}
         return replace(self, **{name: value for name, value in values.items() if value is not None})
 
 
 THRESHOLDS = Maybe(
     Object({"confirm": Number(0, 1), "give_up": Number(0, 1), "place": Number(0, 1)}, required=("confirm", "give_up"))
 )
-"""Schema of thresholds in the file of a model."""
+"""Schema of thresholds in the file of a model, which keeps the earlier name of `stop_below`: all files are alike."""
+
+
+def thresholds_record(thresholds: Thresholds | None) -> dict[str, float] | None:
+    """Write thresholds as values of a file (`THRESHOLDS`).
+
+    Args:
+        thresholds: the thresholds; None for none.
+
+    Returns:
+        The values by name.
+
+    >>> thresholds_record(Thresholds(0.7, stop_below=0.1))
+    {'confirm': 0.7, 'give_up': 0.1, 'place': 0.0}
+    """
+    if thresholds is None:
+        return None
+    return {"confirm": thresholds.confirm, "give_up": thresholds.stop_below, "place": thresholds.place}
+
+
+def thresholds_of(record: Mapping[str, float] | None) -> Thresholds | None:
+    """Read thresholds from values of a file.
+
+    Args:
+        record: the values by name, as `thresholds_record` writes them.
+
+    Returns:
+        The thresholds; None for none.
+    """
+    if record is None:
+        return None
+    return Thresholds(record["confirm"], record["give_up"], record.get("place", 0.0))
 
 
 class TargetEvidence(Evidence):
@@ -181,17 +212,15 @@ class TargetEvidence(Evidence):
 
     def _record(self) -> dict[str, Any]:
         """List what a file holds beside tensors."""
-        thresholds = None if self.thresholds is None else asdict(self.thresholds)
-        return {**super()._record(), "thresholds": thresholds}
+        return {**super()._record(), "thresholds": thresholds_record(self.thresholds)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """Make the model of a file."""
-        thresholds = record["thresholds"]
         model = cls(
             *record["widths"],
             components=record["components"],
-            thresholds=None if thresholds is None else Thresholds(**thresholds),
+            thresholds=thresholds_of(record["thresholds"]),
             shares=tensors.get("shares"),
             metadata=record["metadata"],
         )

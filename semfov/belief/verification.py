@@ -1,14 +1,13 @@
 """Verification: what a closer look at a place says about the target there."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.target_evidence import THRESHOLDS, Thresholds
+from semfov.belief.target_evidence import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
 from semfov.detection.detections import Detections
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Field, Schema
@@ -35,7 +34,7 @@ class Verification(PretrainedForEye):
     Args:
         thresholds: thresholds at which searches decide; None if none were chosen. `confirm` is the least probability
             that the target is at the examined place, for `found`. `place` is the least probability of a cell that is
-            worth a closer look. `give_up` has the same meaning as without closer looks.
+            worth a closer look. `stop_below` has the same meaning as without closer looks.
         metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was fitted for).
 
     >>> model = Verification()  # not fitted yet
@@ -73,13 +72,12 @@ class Verification(PretrainedForEye):
 
     def _record(self) -> dict[str, Any]:
         """List what a file holds beside tensors."""
-        return {"thresholds": None if self.thresholds is None else asdict(self.thresholds)}
+        return {"thresholds": thresholds_record(self.thresholds)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """Make the model of a file."""
-        thresholds = None if record["thresholds"] is None else Thresholds(**record["thresholds"])
-        model = cls(thresholds=thresholds, metadata=record["metadata"])
+        model = cls(thresholds=thresholds_of(record["thresholds"]), metadata=record["metadata"])
         model.load_state_dict(tensors)
         return model
 

@@ -81,7 +81,7 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
   --embeddings FILE    word vectors; the target may then be a description, such as "something to drink from"
 {_AGENT}
 {_LOOKS}
-  --confirm P          found from this probability on; --give-up P: no look below this probability is worth a pass
+  --confirm P          found from this probability on; --stop-below P: stop if the chance of a new hit is lower
   --closer N           most closer looks (0: none); --prior P: share of pictures with it (default: the fit's; 0.5: half)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
@@ -110,8 +110,8 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
   --target CLASSES     a class, or several with commas (default: all classes)
 {_AGENT}
 {_LOOKS}
-  --worth N            a look is worth a pass if it is expected to show this many new objects (default 0.01)
-  --least P            objects count from this probability on, without fitted models from this score (default 0.5)
+  --min-gain N         stop when the next look is expected to show fewer new objects than this (default 0.01)
+  --score-threshold P  objects are listed from this probability on, without fitted models from this score (default 0.5)
   --batch N            windows that are looked at together
 {_OUTPUT}
 """,
@@ -137,8 +137,8 @@ usage: semfov explore [PICTURE ...] [options]
   PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
 {_AGENT}
 {_LOOKS}
-  --worth N            a look is worth a pass if it is expected to name this many more cells right, or in a large
-                       picture to show this many new objects (default 0.1 and 0.01)
+  --min-gain N         stop when the next look is expected to show fewer new objects than this, or with a fovea to
+                       classify fewer more cells right (default 0.01 and 0.1)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
@@ -202,7 +202,7 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   --how KIND           auto (default: windows of any frame), fovea, or windows
   --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
   --rate R             rate at which evidence fades, per second (0: never; default: 2.5 for a fovea, 0.75 for windows)
-  --confirm P          found from this probability on; --give-up P: no look below this probability is worth a frame
+  --confirm P          found from this probability on; --stop-below P: no closer look if the chance of a hit is lower
   --closer N           most closer looks in the time until half of the evidence has faded (0: none)
   --prior P            share of the frames that hold the target (default: as in the pictures of the fit; 0.5: one half)
 {_AGENT}

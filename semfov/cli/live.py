@@ -107,7 +107,7 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
                     lines.append(_mot_lines(moment))
                 if speed.frames == 1 and live.criterion is not None:
                     print(f"  found: when {live.criterion} (--confirm)")
-                    print("  absent: when p is below one half, and no look is worth a frame (--give-up)")
+                    print("  absent: when p is below one half, and no closer look is worth a frame (--stop-below)")
                 rate = speed.recent()
                 print(f"  {_moment_line(moment)}  {rate}", flush=True)
                 if add_frame is not None:

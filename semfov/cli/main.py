@@ -16,7 +16,7 @@ from typing import Any
 
 from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
-from semfov.words import OPTIONS, meant_options
+from semfov.words import FORMER, OPTIONS, meant_options, note_of_former
 
 _LOOKING = tuple(name for name, command in SUBCOMMANDS.items() if command.looking)
 """Subcommands that look at pictures or frames."""
@@ -60,6 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if text is not None:
         print(text, end="")
         return 0
+    if name in SUBCOMMANDS:
+        rest = _with_present_names(name, rest)
     refused = _of_others(name, rest) if name in SUBCOMMANDS else _unknown(name)
     if refused is not None:
         print(f"error: {refused}", file=sys.stderr)
@@ -155,6 +157,21 @@ def _message_options(name: str) -> list[str]:
         return names
     detector = resolve_name("semfov.runs.config:DetectorConfig")
     return [*(f"detector.{field.name}" for field in fields(detector) if field.name not in names), *names]
+
+
+def _with_present_names(command: str, words: Sequence[str]) -> list[str]:
+    """Replace earlier names of options by the present ones, each with a note."""
+    known = _option_names(command)
+    renamed = []
+    for word in words:
+        option, equals, value = word.partition("=")
+        present = FORMER.get(option.removeprefix("--").replace("-", "_"), "")
+        if option.startswith("--") and present in known:
+            dashed = f"--{present.replace('_', '-')}"
+            print(f"note: {note_of_former(option, dashed)}", file=sys.stderr)
+            word = dashed + equals + value
+        renamed.append(word)
+    return renamed
 
 
 def _of_others(command: str, words: Sequence[str]) -> str | None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from semfov.agent import ActivePerception
 from semfov.cli.outcome import table_lines
 from semfov.detection import Candidates, Detector, Objects, score_vectors
-from semfov.detection.objects import LEAST, box_text
+from semfov.detection.objects import SCORE_THRESHOLD, box_text
 from semfov.detection.onnx import OnnxDetector
 from semfov.detection.selection import suppress
 from semfov.observation.matching import box_iou
@@ -50,7 +50,7 @@ class Trial:
         proposals = detector.propose(canvas).precise()
         confidence = proposals.confidence[0]
         labels = proposals.classes[0].argmax(-1)
-        confident = (confidence >= LEAST).nonzero()[:, 0]
+        confident = (confidence >= SCORE_THRESHOLD).nonzero()[:, 0]
         boxes = proposals.boxes[0, confident]
         chosen = suppress(boxes, confidence[confident], labels[confident], detector.selection)
         # From the canvas, where the photograph lies between two corners, to its pixels.
@@ -69,12 +69,13 @@ def try_detector(agent: ActivePerception, photo: Path) -> None:
     """
     detector = agent.eye.detector
     bare = Trial.of(agent, photo)
-    record = agent.find_all(photo, how="windows", passes=1, least=LEAST)
+    record = agent.find_all(photo, how="windows", passes=1, score_threshold=SCORE_THRESHOLD)
     rows = _rows(bare, record.objects, agent.classes)
     listed = sum("-" not in row[1:3] for row in rows)
     print(f"{detector.name}: {_settings(detector)}")
     print(
-        f"{photo.name}: the bare detector shows {len(bare.scores)} from {LEAST:g} on, and semfov lists {listed} of them"
+        f"{photo.name}: the bare detector shows {len(bare.scores)} from {SCORE_THRESHOLD:g} on, "
+        f"and semfov lists {listed} of them"
     )
     if rows:
         print("\n".join(table_lines([["class", "bare", record.words.measure, "box"], *rows])))
@@ -149,4 +150,6 @@ def _about_colours(bare: Trial, agent: ActivePerception, photo: Path) -> list[st
         detector.preprocessing = usual
     if float(swapped.scores.sum()) < _MORE * float(bare.scores.sum()) or not len(swapped.scores):
         return []
-    return [f"with --colour {other} it shows {len(swapped.scores)} from {LEAST:g} on; other photographs will tell"]
+    return [
+        f"with --colour {other} it shows {len(swapped.scores)} from {SCORE_THRESHOLD:g} on; other photographs will tell"
+    ]

@@ -11,7 +11,7 @@ does (`settle`):
 
     what                     fovea                       large picture               photograph by windows
     -----------------------  --------------------------  --------------------------  ---------------------------
-    hit_chance < give_up:    of the best cell that was   of the best window that     of the best place that was
+    hit_chance < stop_below: of the best cell that was   of the best window that     of the best place that was
     no look is worth a pass  not fixated                 was not looked at           not examined, times (1 - the
                                                                                      largest place so far)
     >= confirm, with         place of a closer look      as a fovea                  as a fovea
@@ -20,7 +20,7 @@ does (`settle`):
                              cell is nearly the most     shows the target
                              probable one
     a closer look is due     at a cell from              at a box from the confirm   where the hit chance of
-                             Thresholds.place on, if a   of the presence on; at the  that place >= give_up
+                             Thresholds.place on, if a   of the presence on; at the  that place >= stop_below
                              fixated cell is nearly the  last look from
                              most probable one, or at    Thresholds.place on
                              the last look
@@ -28,7 +28,7 @@ does (`settle`):
     at once                  way between confirm and 1                               be surer
                              on, after MOST_CLOSER
                              closer looks from confirm
-    the search is over       hit_chance < give_up, or    as a fovea                  as a fovea
+    the search is over       hit_chance < stop_below, or as a fovea                  as a fovea
                              all closer looks were made
     at a limit               closer looks that are due   it ends as it is            as a large picture
                              are made with the passes

@@ -109,7 +109,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Find the place that is to be looked at closely now.
 
         Args:
-            thresholds: least probability of a place (`place`), and least chance of a hit (`give_up`).
+            thresholds: least probability of a place (`place`), and least chance of a hit (`stop_below`).
             last: whether no other look of the search follows.
 
         Returns:

@@ -52,13 +52,13 @@ class CloseUp:
     """A closer look at a place that seemed to hold the target, and what it says.
 
     Attributes:
-        fixation: number of the fixation after which it was made; None for windows.
+        fixation: place of the fixation after which it was made, from 0; None for windows.
         target: class 1..K that was looked for.
         cell: cell that the box covers most, where places are cells.
         box: box `(4,)` of the target, or the examined one where the look does not show the target.
         place: probability that the target is there, after the look.
         presence: probability that the picture holds the target, after the look.
-        number: number of the look that it is, where closer looks are numbered as all others are.
+        number: place in the record, from 0, of the look that it is, where closer looks are looks as all others are.
     """
 
     fixation: int | None
@@ -105,14 +105,14 @@ def settle(presence: Tensor, located: Tensor, hit_chance: Tensor, thresholds: Th
         presence: `(A,)`, probability that the picture holds the target.
         located: `(A,)` boolean, whether a look has shown the target's place.
         hit_chance: `(A,)`, chance that the best remaining look shows the target, if no look so far has.
-        thresholds: `confirm` for the presence, and `give_up` for the hit chance.
+        thresholds: `confirm` for the presence, and `stop_below` for the hit chance.
 
     Returns:
         `(A,)`, numbers of `OUTCOMES`, `GO_ON` for a search that goes on.
     """
     is_found = (presence >= thresholds.confirm) & located
     without_find = torch.where(presence < _ABSENT, ABSENT, UNDECIDED)
-    unfound = torch.where(hit_chance < thresholds.give_up, without_find, GO_ON)
+    unfound = torch.where(hit_chance < thresholds.stop_below, without_find, GO_ON)
     return torch.where(is_found, FOUND, unfound)
 
 
@@ -212,9 +212,9 @@ def final_outcome(places: Sequence[float], presence: float, confirm: float) -> i
     return ABSENT if presence < _ABSENT else UNDECIDED
 
 
-def check_thresholds(confirm: float | None, give_up: float | None, closer: int | None = None) -> None:
+def check_thresholds(confirm: float | None, stop_below: float | None, closer: int | None = None) -> None:
     """Raise `InputError` unless each threshold is None or a probability, and closer looks are None or 0 to 100."""
-    for name, value in (("confirm", confirm), ("give_up", give_up)):
+    for name, value in (("confirm", confirm), ("stop_below", stop_below)):
         check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
     check_whole(0 if closer is None else closer, "closer", 0, 100)
 

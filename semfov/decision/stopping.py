@@ -29,7 +29,7 @@ class StoppingCriterion(DecisionState):
         ending: reason for an end that it makes.
     """
 
-    ending: Literal["box", "worth", "detection", "decision"] = "worth"
+    ending: Literal["box", "min_gain", "detection", "decision"] = "min_gain"
 
     def see(self, step: Step) -> None:
         """Take in a fixation."""

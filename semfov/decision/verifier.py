@@ -59,7 +59,7 @@ class Verifier(Generic[LookType]):
 
     Attributes:
         places: the places that closer looks are chosen from.
-        thresholds: `confirm` for places, `place` and `give_up` for candidates.
+        thresholds: `confirm` for places, `place` and `stop_below` for candidates.
         most: largest number of closer looks that count at one time.
         criterion: what the decision `found` needs, in words.
         verdicts: the closer looks that are not forgotten, in order, each with its age.
@@ -245,7 +245,7 @@ class Verifier(Generic[LookType]):
     @property
     def _gives_up(self) -> bool:
         """Whether no look of the search is worth a pass."""
-        return self.places.hit_chance < self.thresholds.give_up
+        return self.places.hit_chance < self.thresholds.stop_below
 
     @property
     def _judged_places(self) -> list[_JudgedPlace]:

@@ -3,7 +3,7 @@
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import FeatureMaps
-from semfov.detection.objects import LEAST, Objects, merge_boxes
+from semfov.detection.objects import SCORE_THRESHOLD, Objects, merge_boxes
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
 from semfov.detection.selection import Selection
@@ -14,7 +14,7 @@ __all__ = [
     "Detections",
     "Detector",
     "FeatureMaps",
-    "LEAST",
+    "SCORE_THRESHOLD",
     "Objects",
     "Placement",
     "Selection",

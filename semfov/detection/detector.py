@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.feature_maps import FeatureMaps, no_features
-from semfov.detection.objects import LEAST
+from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
@@ -41,7 +41,7 @@ class Detector(StatedModule, ABC):
         stretch: whether images are stretched to the canvas instead of letterboxed.
         corner: whether letterboxed images are in the upper left corner of the canvas instead of its middle.
         faint: confidence from which on a candidate is a hint of where to zoom in (`semfov.zoom.hints`).
-        least: score from which on a detection counts: two of three are right.
+        score_threshold: score from which on a detection counts: two of three are right.
         digest: sha256 of the weights, `""` for random weights.
 
     A detector that proposes the whole canvas as one box:
@@ -72,7 +72,7 @@ class Detector(StatedModule, ABC):
         stretch: bool = False,
         corner: bool = False,
         faint: float = FAINT,
-        least: float = LEAST,
+        score_threshold: float = SCORE_THRESHOLD,
         digest: str = "",
     ) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class Detector(StatedModule, ABC):
         self.stretch = stretch
         self.corner = corner
         self.faint = faint
-        self.least = least
+        self.score_threshold = score_threshold
         self.digest = digest
 
     @abstractmethod

@@ -19,7 +19,7 @@ NO_TRACK = -1
 _Column = NDArray[np.float32]
 _Index = NDArray[np.intp]
 
-LEAST = 0.3
+SCORE_THRESHOLD = 0.3
 """Score from which on objects are shown, printed, drawn and counted, unless the detector or the user gives another."""
 
 FAINTEST = 0.05  # score from which on boxes are merged into candidates
@@ -36,7 +36,7 @@ class Objects(OtherWords):
         boxes: `(M, 4)`, `(x1, y1, x2, y2)` in picture pixels.
         scores: `(M,)`, score of the class.
         labels: `(M,)`, classes 1..K.
-        passes: `(M,)`, number of the look that each box comes from; the first one is 0.
+        passes: `(M,)`, place in the record, from 0, of the look that each box comes from.
         track_ids: `(M,)`, numbers that stay with the objects of a stream; None in a picture.
         classes: names of the classes, background first, for the text form; none where only numbers are known.
 
@@ -62,9 +62,9 @@ class Objects(OtherWords):
         lines = [f"{len(self)} object{'s' if len(self) != 1 else ''}"]
         shown = self[:_PRINTED]
         columns = (shown.labels.tolist(), shown.scores.tolist(), shown.boxes.tolist(), shown.passes.tolist())
-        for label, score, box, look in zip(*columns, strict=True):
+        for label, score, box, index in zip(*columns, strict=True):
             name = self.classes[label] if self.classes else f"class {label}"
-            lines.append(f"{name} {score:.2f}, box {box_text(box)}, look {look}")
+            lines.append(f"{name} {score:.2f}, box {box_text(box)}, look {index + 1}")
         if len(self) > _PRINTED:
             lines.append(f"and {len(self) - _PRINTED} more")
         return "\n  ".join(lines)

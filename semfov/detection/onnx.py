@@ -80,7 +80,7 @@ class OnnxDetector(Detector):
             stretch=preprocessing.stretch,
             corner=preprocessing.corner,
             faint=kind.faint,
-            least=kind.least,
+            score_threshold=kind.score_threshold,
             digest=digest,
         )
         # A model with a fixed input takes the whole canvas, however much of it is padding.

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detector import FAINT
-from semfov.detection.objects import LEAST
+from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.detection.onnx_cells import STRIDES, Canvas, box_counts, cell_count
 from semfov.detection.onnx_decoding import (
     decode_detr,
@@ -59,7 +59,7 @@ class Head(ABC):
         preprocessing: what its networks expect, unless a model's settings say otherwise.
         background: background policy of its scores.
         faint: confidence from which on a candidate is a hint of where to zoom in.
-        least: score from which on a detection counts.
+        score_threshold: score from which on a detection counts.
         selects: whether its networks select boxes themselves, and return one class and score for each.
     """
 
@@ -67,7 +67,7 @@ class Head(ABC):
     preprocessing: ClassVar[Preprocessing] = _LETTERBOX
     background: ClassVar[BackgroundPolicy] = "residual"
     faint: ClassVar[float] = FAINT
-    least: ClassVar[float] = LEAST
+    score_threshold: ClassVar[float] = SCORE_THRESHOLD
     selects: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -261,7 +261,7 @@ class _NanodetPlus(_RowsHead):
     preprocessing = _NANODET
     background = "normalised"
     faint = 0.02
-    least = 0.2
+    score_threshold = 0.2
 
     def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
         in_four_levels = rows.cells == (1, 4) and not rows.boxes_are_columns

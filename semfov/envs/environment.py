@@ -16,7 +16,7 @@ from semfov.envs.gazes import Arrays, GazeSettings, check_options_of_reset
 from semfov.envs.scenery import Scenery, ZoomScenery, open_scenery, open_zoom_scenery, scenery_or_open
 from semfov.envs.state import EnvState, check_state
 from semfov.envs.windows import WindowGaze
-from semfov.errors import InputError, check, lookup
+from semfov.errors import InputError, check, former_keywords, lookup
 from semfov.gaze.acquisition.base import Task
 
 _ROW = torch.tensor([0])  # the only row of a batch of one episode
@@ -161,7 +161,7 @@ class GazeEnv(EpisodeEnv):
 
     Args:
         scenery: scenes, looks and belief (`open_scenery`), which several environments may share; None opens one.
-        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        look_cost: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or for a complete map.
         belief: whether observations contain the belief, as planes `(C, Y, X)` in [0, 1].
         glimpse: side in pixels of the foveated image that observations contain; None leaves it out.
@@ -184,11 +184,12 @@ class GazeEnv(EpisodeEnv):
     gazes: CellGazes
     scenery: Scenery
 
+    @former_keywords
     def __init__(
         self,
         scenery: Scenery | None = None,
         *,
-        price: float | None = None,
+        look_cost: float | None = None,
         find: float = 1.0,
         belief: bool = False,
         glimpse: int | None = None,
@@ -196,12 +197,12 @@ class GazeEnv(EpisodeEnv):
         **options: object,
     ) -> None:
         self.scenery = scenery_or_open(scenery, open_scenery, options, self.task)
-        settings = GazeSettings(price, find, belief, glimpse)
+        settings = GazeSettings(look_cost, find, belief, glimpse)
         pictures = render_mode is not None
         super().__init__(CellGazes(self.scenery, self.task, settings, pictures=pictures), render_mode)
         # The scenery instead of the options: a copy shares what the scenery has opened.
         EzPickle.__init__(
-            self, self.scenery, price=price, find=find, belief=belief, glimpse=glimpse, render_mode=render_mode
+            self, self.scenery, look_cost=look_cost, find=find, belief=belief, glimpse=glimpse, render_mode=render_mode
         )
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -216,8 +217,8 @@ class GazeEnv(EpisodeEnv):
 class GazeSearch(GazeEnv):
     """Search for an object of a class: look around until the gaze is on one.
 
-    The reward of a step is `find` if the gaze lands on a cell that an object of the class overlaps, minus `price`. The
-    episode ends with the find, or after the largest number of gaze shifts.
+    The reward of a step is `find` if the gaze lands on a cell that an object of the class overlaps, minus `look_cost`.
+    The episode ends with the find, or after the largest number of gaze shifts.
 
     Args:
         scenery: this and all other arguments are those of `GazeEnv`.
@@ -235,8 +236,8 @@ class GazeSearch(GazeEnv):
 class GazeExplore(GazeEnv):
     """Explore a scene: look around until the map names the class of every cell with objects.
 
-    The reward of a step is `find` times the increase of the map's success rate, minus `price`. The success rate is the
-    fraction of the cells with objects whose most probable class is that of one of these objects.
+    The reward of a step is `find` times the increase of the map's success rate, minus `look_cost`. The success rate is
+    the fraction of the cells with objects whose most probable class is that of one of these objects.
 
     Args:
         scenery: this and all other arguments are those of `GazeEnv`.
@@ -259,13 +260,13 @@ class ZoomEnv(EpisodeEnv):
     at the nearest window of `semfov.zoom.Lattice`. The first look of an episode is the whole picture.
 
     The reward of a step is `find` if an object of the class is found (a box with a score of 0.1 and an overlap of 0.5),
-    or in an exploration `find` times the increase of the fraction of objects that are found; minus `price`. A search
-    ends with the find, or after the largest number of looks.
+    or in an exploration `find` times the increase of the fraction of objects that are found; minus `look_cost`. A
+    search ends with the find, or after the largest number of looks.
 
     Args:
         task: `search` or `exploration`.
         scenery: pictures and looks (`open_zoom_scenery`), which several environments may share; None opens one.
-        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        look_cost: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or all objects.
         belief: whether observations contain the belief, as planes `(C, Y, X)` in [0, 1].
         grid: number of columns and rows of the belief's planes.
@@ -287,12 +288,13 @@ class ZoomEnv(EpisodeEnv):
     gazes: WindowGaze
     scenery: ZoomScenery
 
+    @former_keywords
     def __init__(
         self,
         task: Task,
         scenery: ZoomScenery | None = None,
         *,
-        price: float | None = None,
+        look_cost: float | None = None,
         find: float = 1.0,
         belief: bool = False,
         grid: tuple[int, int] = (10, 10),
@@ -302,13 +304,13 @@ class ZoomEnv(EpisodeEnv):
     ) -> None:
         lookup(task, get_args(Task), "task")
         self.scenery = scenery_or_open(scenery, open_zoom_scenery, options)
-        settings = GazeSettings(price, find, belief, glimpse)
+        settings = GazeSettings(look_cost, find, belief, glimpse)
         super().__init__(WindowGaze(self.scenery, task, settings, grid), render_mode)
         EzPickle.__init__(
             self,
             task,
             self.scenery,
-            price=price,
+            look_cost=look_cost,
             find=find,
             belief=belief,
             grid=grid,

@@ -20,7 +20,7 @@ from semfov.gaze.acquisition.base import Task
 Arrays = dict[str, Any]
 """Arrays by name, or dictionaries of them, as Gymnasium takes observations and infos."""
 
-_PRICES: dict[Task, float] = {"search": 0.05, "exploration": 0.01}  # cost of a look by default
+_LOOK_COSTS: dict[Task, float] = {"search": 0.05, "exploration": 0.01}  # cost of a look by default
 
 
 @dataclass(frozen=True)
@@ -28,23 +28,23 @@ class GazeSettings:
     """What looks cost and bring, and what observations contain.
 
     Args:
-        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        look_cost: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or for a complete result.
         belief: whether observations contain the belief.
         glimpse: side in pixels of the image that observations contain; None leaves it out.
 
     Raises:
-        InputError: a price, a reward or a side is out of range.
+        InputError: a cost, a reward or a side is out of range.
     """
 
-    price: float | None = None
+    look_cost: float | None = None
     find: float = 1.0
     belief: bool = False
     glimpse: int | None = None
 
     def __post_init__(self) -> None:
-        if self.price is not None:
-            check_number(self.price, "price", 0, 1e9)
+        if self.look_cost is not None:
+            check_number(self.look_cost, "look_cost", 0, 1e9)
         check_number(self.find, "find", 0, 1e9)
         if self.glimpse is not None:
             check_whole(self.glimpse, "glimpse", 1, 4096)
@@ -109,7 +109,7 @@ class Gazes(ABC, Generic[_Episode]):
         shift: `(B,)`, number of gaze shifts so far.
         result: `(B,)`, 1 once the target is found, or the fraction of the map that is right, or of the objects that are
             found.
-        price: cost of a look.
+        look_cost: cost of a look.
         find: reward for an increase of `result` by 1.
     """
 
@@ -126,7 +126,7 @@ class Gazes(ABC, Generic[_Episode]):
         self.scenery = scenery
         self.task = task
         self.searching = task == "search"
-        self.price = _PRICES[task] if settings.price is None else settings.price
+        self.look_cost = _LOOK_COSTS[task] if settings.look_cost is None else settings.look_cost
         self.find = settings.find
         self.count = count
         self.episodes: list[_Episode] = []
@@ -198,7 +198,7 @@ class Gazes(ABC, Generic[_Episode]):
         done = self._look(rows, actions)
         gain = self.result[rows] - result_before
         truncated = ~done & (self.shift[rows] >= self.scenery.shifts)
-        return Outcome(self.find * gain.double() - self.price, done, truncated)
+        return Outcome(self.find * gain.double() - self.look_cost, done, truncated)
 
     def save(self) -> SavedGazes:
         """Save the state of all episodes.

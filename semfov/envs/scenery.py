@@ -19,7 +19,7 @@ from semfov.data.large import open_large
 from semfov.data.mosaics import Mosaics
 from semfov.data.pictures import Pictures
 from semfov.data.sources import PHOTOGRAPHS
-from semfov.detection.objects import LEAST
+from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, InputError, check, check_options, check_whole
 from semfov.eye import Eye, View
@@ -381,7 +381,7 @@ class ZoomScenery(_Surroundings[WindowEye]):
     def found(self, looks: Sequence[WindowLook], scene: int, target: int) -> bool:
         """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
         if not self.annotated:
-            return any(float(look.show[target - 1]) >= LEAST for look in looks)
+            return any(float(look.show[target - 1]) >= SCORE_THRESHOLD for look in looks)
         annotation = self.pictures.annotation(scene)
         is_target = annotation.labels == target
         objects = Annotation(
@@ -392,7 +392,7 @@ class ZoomScenery(_Surroundings[WindowEye]):
     def share(self, looks: Sequence[WindowLook], scene: int) -> float:
         """Compute the share of a picture's objects that looks have found; without annotations their number."""
         if not self.annotated:
-            return float(len(merge(looks, None, score=LEAST)))
+            return float(len(merge(looks, None, score=SCORE_THRESHOLD)))
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
 
 

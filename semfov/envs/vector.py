@@ -16,7 +16,7 @@ from semfov.envs.cells import CellGazes
 from semfov.envs.gazes import Arrays, GazeSettings, check_options_of_reset
 from semfov.envs.scenery import Scenery, open_scenery, scenery_or_open
 from semfov.envs.state import EnvState, check_state
-from semfov.errors import InputError, check, check_whole, lookup
+from semfov.errors import InputError, check, check_whole, former_keywords, lookup
 from semfov.gaze.acquisition.base import Task
 
 
@@ -33,7 +33,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         task: `search` or `exploration`.
         num_envs: number of episodes.
         scenery: scenes, looks and belief, which several environments may share; None opens one.
-        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        look_cost: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or for a complete map.
         belief: whether observations contain the belief.
         glimpse: side in pixels of the foveated image that observations contain; None leaves it out.
@@ -54,13 +54,14 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         print(observations["belief"].shape)  # (64, 3, 10, 10)
     """
 
+    @former_keywords
     def __init__(
         self,
         task: str,
         num_envs: int = 1,
         scenery: Scenery | None = None,
         *,
-        price: float | None = None,
+        look_cost: float | None = None,
         find: float = 1.0,
         belief: bool = False,
         glimpse: int | None = None,
@@ -82,7 +83,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
             task,
             num_envs,
             self.scenery,
-            price=price,
+            look_cost=look_cost,
             find=find,
             belief=belief,
             glimpse=glimpse,
@@ -90,7 +91,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
             together=together,
             autoreset_mode=mode,
         )
-        settings = GazeSettings(price, find, belief, glimpse)
+        settings = GazeSettings(look_cost, find, belief, glimpse)
         self.gazes = CellGazes(self.scenery, self.task, settings, num_envs, together=together)
         self.single_observation_space = self.gazes.observation_space
         self.single_action_space = self.gazes.action_space

@@ -308,7 +308,7 @@ def _evidence_report(judged: list[dict[str, float]], thresholds: Thresholds, tra
             "",
             f"Thresholds: the target counts as found if the probability of its presence is at least "
             f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search gives up "
-            f"if no other cell has a probability of at least {thresholds.give_up:.2f}.",
+            f"if no other cell has a probability of at least {thresholds.stop_below:.2f}.",
             "",
         ]
     )

@@ -214,7 +214,7 @@ def _report_on_decisions(decisions: Mapping[str, Sequence[_Decision]], threshold
     return section(
         f"Decisions of {len(decisions['fitted'])} searches for present and for absent classes. A target "
         f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
-        f"cell has a probability of {thresholds.give_up:.2f} or more. These thresholds were chosen on the "
+        f"cell has a probability of {thresholds.stop_below:.2f} or more. These thresholds were chosen on the "
         "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "
         "search gives up.",
         rows,

@@ -305,10 +305,10 @@ def _fit_closer_looks(
     if closer_looks is None:
         return "None, since there are no places that hold the target, or none that do not.\n"
     folds = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(_FOLDS)]
-    decisions = list(verify(searches, folds, Thresholds(1.0, config.worth, config.worth), None))
+    decisions = list(verify(searches, folds, Thresholds(1.0, config.stop_below, config.stop_below), None))
     confirm = choose_confirm(decisions, _FALSE_ALARMS, config.surest)
     fitted = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
-    fitted.thresholds = Thresholds(confirm, config.worth, config.worth)
+    fitted.thresholds = Thresholds(confirm, config.stop_below, config.stop_below)
     evidence.verification = fitted
     pictures = f"{len({search.picture for search in searches})} photographs"
     return verification_report(VerificationInFolds(fitted, folds, closer_looks, decisions), pictures).text

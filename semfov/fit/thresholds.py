@@ -16,7 +16,7 @@ SUREST_OF_FEW = 0.9
 _FOUND = OUTCOMES.index("found")
 _CONFIRMS = torch.arange(0.99, 0.49, -0.01).tolist()  # the highest first
 _PLACES = torch.arange(0.95, 0.04, -0.05).tolist()
-_GIVE_UPS = (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001)
+_STOPS_BELOW = (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001)
 
 
 class Bounds(Protocol):
@@ -32,7 +32,7 @@ class Bounds(Protocol):
 
     @property
     def lost(self) -> float:
-        """Largest share of targets that may be missed because of `place`, and then because of `give_up`."""
+        """Largest share of targets that may be missed because of `place`, and then because of `stop_below`."""
 
 
 class _Searches:
@@ -41,20 +41,20 @@ class _Searches:
     Attributes:
         presence: `(n, E)`, probability that the picture holds the target.
         place: `(n, E)`, probability of the target at the place that is known, 0 where none is.
-        worth: `(n, E)`, probability of the best place that is left to look at.
+        hit_chance: `(n, E)`, probability of the best place that is left to look at.
         there: `(E,)` boolean, whether the picture holds the target.
     """
 
-    def __init__(self, presence: Tensor, place: Tensor, worth: Tensor, there: Tensor) -> None:
+    def __init__(self, presence: Tensor, place: Tensor, hit_chance: Tensor, there: Tensor) -> None:
         self.presence = presence
         self.place = place
-        self.worth = worth
+        self.hit_chance = hit_chance
         self.there = there
 
     def found(self, thresholds: Thresholds) -> Tensor:
         """Tell which searches find their target, `(E,)` boolean: their first look that ends them says so."""
         known = (self.place > 0) & (self.place >= thresholds.place)
-        outcomes = settle(self.presence, known, self.worth, thresholds)
+        outcomes = settle(self.presence, known, self.hit_chance, thresholds)
         first = (outcomes > 0).int().argmax(0)
         return outcomes.gather(0, first[None])[0] == _FOUND
 
@@ -76,31 +76,31 @@ class _Searches:
         return Thresholds(min(confirm, bounds.surest), 0.0, place)
 
 
-def choose_thresholds(bounds: Bounds, presence: Tensor, place: Tensor, worth: Tensor, there: Tensor) -> Thresholds:
+def choose_thresholds(bounds: Bounds, presence: Tensor, place: Tensor, hit_chance: Tensor, there: Tensor) -> Thresholds:
     """Choose thresholds with few false alarms and few missed targets.
 
     `confirm` is the lowest with few enough false alarms, `place` the highest that misses few of the targets that are
-    found without one, and `give_up` the highest that misses few of those.
+    found without one, and `stop_below` the highest that misses few of those.
 
     Args:
         bounds: shares of false alarms and missed targets.
         presence: `(n, E)`, probability that the picture holds the target, after each look of each search.
         place: `(n, E)`, probability of the target at the place that is known, 0 where none is.
-        worth: `(n, E)`, probability of the best place that is left to look at.
+        hit_chance: `(n, E)`, probability of the best place that is left to look at.
         there: `(E,)` boolean, whether the picture holds the target.
 
     Returns:
         The thresholds.
     """
-    searches = _Searches(presence, place, worth, there)
+    searches = _Searches(presence, place, hit_chance, there)
     most_lost = bounds.lost * int(there.sum())
     chosen = without_place = searches.confirming(0.0, bounds)
     for candidate in (searches.confirming(least, bounds) for least in _PLACES):
         if searches.hits(without_place) - searches.hits(candidate) <= most_lost:
             chosen = candidate
             break
-    for give_up in _GIVE_UPS:
-        candidate = chosen.changed(give_up=give_up)
+    for stop_below in _STOPS_BELOW:
+        candidate = chosen.changed(stop_below=stop_below)
         if searches.hits(chosen) - searches.hits(candidate) <= most_lost:
             return candidate
     return chosen

@@ -37,7 +37,7 @@ class VerificationConfig(FitOnCellsConfig):
         max_target_area: classes that cover a larger share of the image are not searched for.
         looks: number of looks in a search.
         place: least probability of a cell that is worth a closer look.
-        give_up: least probability of a cell that is worth a fixation.
+        stop_below: least probability of a cell that is worth a fixation.
         false_alarms: maximum share of absent targets that may be reported as found; it determines `confirm`.
         folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
     """
@@ -47,7 +47,7 @@ class VerificationConfig(FitOnCellsConfig):
     max_target_area: Positive = 0.2
     looks: Annotated[int, Range(2, 10_000)] = 12
     place: Share = 0.2
-    give_up: Share = 0.2
+    stop_below: Share = 0.2
     false_alarms: Share = 0.01
     folds: Annotated[int, Range(2, 1000)] = 5
 
@@ -150,10 +150,10 @@ def fit_in_folds(
     model = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
     again = photograph_searches(photographs, evidence, config.looks, "verifying")
     # No place is sure, so that a search makes all its closer looks, and any threshold can be applied to it afterwards.
-    limits = Thresholds(1.0, config.give_up, config.place)
+    limits = Thresholds(1.0, config.stop_below, config.place)
     searches = list(verify(again, folds, limits, evidence.thresholds))
     confirm = choose_confirm(searches, config.false_alarms, surest)
-    model.thresholds = Thresholds(confirm, config.give_up, config.place)
+    model.thresholds = Thresholds(confirm, config.stop_below, config.place)
     return VerificationInFolds(model, folds, closer_looks, searches)
 
 
@@ -187,7 +187,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
 
 def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:
     """Look closely at the most evident places after some numbers of looks; yields features `(7,)` and box `(4,)`."""
-    least = Thresholds(confirm=1.0, give_up=_LEAST_CHANCE, place=_LEAST_CHANCE)
+    least = Thresholds(confirm=1.0, stop_below=_LEAST_CHANCE, place=_LEAST_CHANCE)
     for looks in search.after:
         if looks > len(search):
             return

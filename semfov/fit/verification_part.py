@@ -72,8 +72,8 @@ class VerificationFit(PartFit):
         """Return the settings for so many photographs, and for evidence with its thresholds."""
         assert evidence.thresholds is not None
         # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
-        give_up = min(self.settings.give_up, evidence.thresholds.give_up)
-        return replace(self.settings, folds=min(self.settings.folds, photographs), give_up=give_up)
+        stop_below = min(self.settings.stop_below, evidence.thresholds.stop_below)
+        return replace(self.settings, folds=min(self.settings.folds, photographs), stop_below=stop_below)
 
 
 def _compare(fitted: VerificationInFolds) -> tuple[Difference, str]:

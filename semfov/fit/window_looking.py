@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
-import torch
 from torch import Tensor
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
-from semfov.detection.objects import Objects
 from semfov.errors import DataError
 from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.ranges import Range, Seed, Side, Whole
-from semfov.observation.matching import box_iou, match
+from semfov.observation.matching import SAME_OBJECT, box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, make_scenes
@@ -22,8 +20,6 @@ from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge
-
-_SAME = 0.5  # overlap (IoU) from which on boxes are of the same object, and share of a box that lies in a crowd
 
 TileSize = Annotated[int, Range(16, 16_384)]  # side of a part of a picture in pixels
 
@@ -108,38 +104,5 @@ def found_in(looks: Sequence[WindowLook], annotation: Annotation, target: int | 
         `(M,)` boolean.
     """
     objects = merge(looks, target, score=DETECTION_SCORE)
-    hits = (box_iou(objects.boxes, annotation.boxes) >= _SAME) & (objects.labels[:, None] == annotation.labels)
+    hits = (box_iou(objects.boxes, annotation.boxes) >= SAME_OBJECT) & (objects.labels[:, None] == annotation.labels)
     return hits.any(0)
-
-
-def right_boxes(objects: Objects, annotation: Annotation) -> Tensor:
-    """Compare objects with the annotated ones, class by class.
-
-    Args:
-        objects: N objects, in descending confidence.
-        annotation: the annotated objects; one matches one object, a crowd any number.
-
-    Returns:
-        `(N,)`, 1 for right objects, 0 for wrong ones, and -1 for those in a crowd of their class.
-    """
-    verdicts = torch.zeros(len(objects), dtype=torch.long)
-    for label in objects.labels.unique().tolist():
-        numbers = (objects.labels == label).nonzero()[:, 0]
-        boxes = objects.boxes[numbers]
-        is_label = annotation.labels == label
-        single = annotation.boxes[is_label & ~annotation.crowd]
-        crowds = annotation.boxes[is_label & annotation.crowd]
-        of_one_class = torch.ones(len(single)).long()
-        hits = (match(boxes, single.to(boxes), of_one_class, iou=_SAME) > 0).long()
-        if len(crowds):
-            hits[(hits == 0) & (_share_inside(boxes, crowds) >= _SAME).any(-1)] = -1
-        verdicts[numbers] = hits
-    return verdicts
-
-
-def _share_inside(boxes: Tensor, others: Tensor) -> Tensor:
-    """Compute the share of the area of each box `(N, 4)` that lies in each other box `(M, 4)`, `(N, M)`."""
-    low = torch.maximum(boxes[:, None, :2], others[:, :2])
-    high = torch.minimum(boxes[:, None, 2:], others[:, 2:])
-    area = (boxes[:, 2:] - boxes[:, :2]).prod(-1, keepdim=True).clamp(min=1e-6)
-    return (high - low).clamp(min=0).prod(-1) / area

@@ -137,7 +137,7 @@ class MosaicFit:
     def _examples(self, kind: str) -> list[ZoomExample]:
         """Collect the looks at the pictures of a kind that have closer looks."""
         pictures = self.pictures[kind]
-        least = self.eye.detector.least
+        least = self.eye.detector.score_threshold
         return [
             ZoomExample.of(pictures, index, looks, least)
             for index, looks in enumerate(self.opened(kind))
@@ -190,7 +190,7 @@ class MosaicFit:
             *rows,
             "",
             f"Thresholds: a target counts as found from a probability of {model.thresholds.confirm:.2f} on. The search "
-            f"gives up when the best remaining look has a value below {model.thresholds.give_up:g}.",
+            f"gives up when the best remaining look has a value below {model.thresholds.stop_below:g}.",
             "",
         ]
 

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from semfov.data.scene import Annotation, Scenes
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.window_looking import right_boxes
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
+from semfov.observation.matching import right_boxes
 from semfov.runs.progress import track
 from semfov.runs.tables import table
 from semfov.zoom import GlimpseEvidence, Lattice

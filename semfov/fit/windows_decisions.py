@@ -85,24 +85,24 @@ class _Known(NamedTuple):
     best: float
     case: Tensor
     detected: bool
-    worth: float
+    hit_chance: float
 
 
 class WindowSearches(NamedTuple):
-    """E searches of n looks; one that ends early is padded with its last values, and with 0 for `worth`.
+    """E searches of n looks; one that ends early is padded with its last values, and with 0 for `hit_chance`.
 
     Attributes:
         best: `(E, n)`, highest score of the target.
         case: `(E, n, 10)`, what the probability of presence is computed from, beside `best`.
         detected: `(E, n)` boolean, whether a detection shows the target.
-        worth: `(E, n)`, value of the best look that is left.
+        hit_chance: `(E, n)`, value of the best look that is left.
         there: `(E,)` boolean, whether the picture holds the target.
     """
 
     best: Tensor
     case: Tensor
     detected: Tensor
-    worth: Tensor
+    hit_chance: Tensor
     there: Tensor
 
     @classmethod
@@ -122,13 +122,13 @@ class WindowSearches(NamedTuple):
                 _Known(facts.best, facts.case(step.next_value), facts.detected, step.next_value)
                 for step, facts in search.steps
             ]
-            known += [known[-1]._replace(worth=0.0)] * (config.passes - len(known))
+            known += [known[-1]._replace(hit_chance=0.0)] * (config.passes - len(known))
             rows.append(
                 (
                     torch.tensor([after.best for after in known]),
                     torch.stack([after.case for after in known]),
                     torch.tensor([after.detected for after in known]),
-                    torch.tensor([after.worth for after in known]),
+                    torch.tensor([after.hit_chance for after in known]),
                     torch.tensor(bool((search.annotation.labels == search.target).any())),
                 )
             )
@@ -177,7 +177,7 @@ def judge_searches(model: GlimpseEvidence, searches: WindowSearches, bounds: Bou
     """
     presence = model.anywhere(searches.best, searches.case).sigmoid()
     there = searches.there
-    chosen = choose_thresholds(bounds, presence.mT, searches.detected.mT.to(presence), searches.worth.mT, there)
+    chosen = choose_thresholds(bounds, presence.mT, searches.detected.mT.to(presence), searches.hit_chance.mT, there)
     # The place is known as soon as a detection shows the target; there is no probability to put a threshold on.
     model.thresholds = chosen.changed(place=0.0)
     rows = [["looks", "area under ROC", "NLL", "Brier", "ECE", "ECE of the highest score"]]
@@ -243,8 +243,8 @@ class _MosaicSearch(TargetSearch[SearchLook]):
     def outcome(self, index: int, thresholds: Thresholds) -> int:
         after = self.steps[index]
         detected = self.boxes[index] is not None
-        presence, known, worth = (torch.tensor([value]) for value in (after.presence, detected, after.hit_chance))
-        return int(settle(presence, known, worth, thresholds))
+        presence, known, hit_chance = (torch.tensor([value]) for value in (after.presence, detected, after.hit_chance))
+        return int(settle(presence, known, hit_chance, thresholds))
 
     def found_right(self, index: int) -> bool:
         """Tell whether the box with the highest score is that of an object."""
@@ -290,11 +290,11 @@ def fit_closer_looks(
     if training is None or held_out is None:
         return "None, since there are no places that hold the target, or none that do not.\n"
     assert model.thresholds is not None
-    give_up = model.thresholds.give_up
+    stop_below = model.thresholds.stop_below
     fitted = fit_to_closer_looks(training, training.fold == 0, prior)
-    decisions = list(verify(judged, [fitted], Thresholds(1.0, give_up, config.place), model.thresholds))
+    decisions = list(verify(judged, [fitted], Thresholds(1.0, stop_below, config.place), model.thresholds))
     confirm = choose_confirm(decisions, config.false_alarms, config.surest)
-    fitted.thresholds = Thresholds(confirm, give_up, config.place)
+    fitted.thresholds = Thresholds(confirm, stop_below, config.place)
     model.verification = fitted
     _save_looks(pictures)
     report = verification_report(

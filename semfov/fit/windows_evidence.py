@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
-from semfov.detection.objects import LEAST
+from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.fit.training import descend
 from semfov.observation.matching import box_iou
 from semfov.runs.tables import table
@@ -64,13 +64,13 @@ class ZoomExample(NamedTuple):
         lattice: the lattice of its windows.
         labels: `(M,)`, classes of its objects.
         looks: the looks; the overview is the first with a gist.
-        least: score from which on a look shows a class.
+        score_threshold: score from which on a look shows a class.
     """
 
     lattice: Lattice
     labels: Tensor
     looks: tuple[_WindowResult, ...]
-    least: float = LEAST
+    score_threshold: float = SCORE_THRESHOLD
 
     @staticmethod
     def windows(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
@@ -83,7 +83,9 @@ class ZoomExample(NamedTuple):
         return windows
 
     @classmethod
-    def of(cls, pictures: Scenes, index: int, source: WindowLooks, least: float = LEAST) -> "ZoomExample":
+    def of(
+        cls, pictures: Scenes, index: int, source: WindowLooks, score_threshold: float = SCORE_THRESHOLD
+    ) -> "ZoomExample":
         """Look at all windows of a picture, and collect which objects are shown with a detection of their class."""
         annotation = pictures.annotation(index)
         looks = []
@@ -94,7 +96,7 @@ class ZoomExample(NamedTuple):
             labels = detections.labels[0, is_sure]
             hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
             looks.append(_WindowResult(look.window, look.gist, look.show, hits.any(0)))
-        return cls(source.lattice, annotation.labels, tuple(looks), least)
+        return cls(source.lattice, annotation.labels, tuple(looks), score_threshold)
 
     @property
     def predicting(self) -> list[_WindowResult]:
@@ -198,7 +200,7 @@ def pair_windows(examples: Sequence[ZoomExample]) -> Windows:
                         scores,
                         summary,
                         steps=torch.tensor(closer.steps),
-                        presence=closer.result.show >= example.least,
+                        presence=closer.result.show >= example.score_threshold,
                         before=torch.tensor(-1 if is_overview else by_overview[closer.number]),
                         slot=torch.tensor(closer.result.window.within is not None),
                         mosaic=torch.tensor(number),
@@ -289,7 +291,7 @@ def _rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
 def _drawn_targets(example: ZoomExample) -> Tensor:
     """Draw classes of a picture, 1..K: some that its looks show, and some that they only hint at; at least one."""
     strongest = torch.stack([look.show for look in example.looks]).amax(0)
-    is_shown = strongest >= example.least
+    is_shown = strongest >= example.score_threshold
     is_hinted = (strongest >= _HINT) & ~is_shown
     targets = torch.cat(
         [

@@ -123,7 +123,7 @@ def look_around(
     closer: CloserLooks | None = None,
     passes: int = 100,
     duration: float = math.inf,
-    worth: float = 0.0,
+    min_gain: float = 0.0,
     seed: int | Sequence[int] = 0,
 ) -> Iterator[HeadStep]:
     """Run an episode look by look; the caller may stop at any time. What was seen fades at the rate of the scene.
@@ -138,7 +138,7 @@ def look_around(
         closer: offers closer looks of a head that zooms; None for none.
         passes: largest number of looks.
         duration: seconds after which no look ends.
-        worth: least gain of a look; 0 for any.
+        min_gain: least gain of a look; 0 for any.
         seed: one number or several, for ties.
 
     Yields:
@@ -171,7 +171,7 @@ def look_around(
         ahead = float(views.durations(action, speeds)[following])
         gain = float(values[0, following])
         yield HeadStep(action, spent, belief, look.detections(), chosen_for, ahead)
-        is_over = spent + ahead > duration or gain <= OUT or (worth > 0 and gain * ahead < worth)
+        is_over = spent + ahead > duration or gain <= OUT or (min_gain > 0 and gain * ahead < min_gain)
         if is_over or bool(memory.visited.all()):
             return
         action = following

@@ -4,7 +4,12 @@ import torch
 from torch import Tensor
 
 from semfov.data.inputs import as_positions
+from semfov.data.scene import Annotation
+from semfov.detection.objects import Objects
 from semfov.errors import check_shape
+
+SAME_OBJECT = 0.5
+"""Overlap (IoU) from which on boxes are of the same object, and share of a box in a crowd from which on it is of it."""
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
@@ -68,3 +73,36 @@ def match(boxes: Tensor, truth: Tensor, labels: Tensor, *, iou: float = 0.5) -> 
             matched[detection] = labels[index]
             overlap[:, index] = -1.0
     return matched
+
+
+def right_boxes(objects: Objects, annotation: Annotation) -> Tensor:
+    """Compare objects with the annotated ones, class by class.
+
+    Args:
+        objects: N objects, in descending confidence.
+        annotation: the annotated objects; one matches one object, a crowd any number.
+
+    Returns:
+        `(N,)`, 1 for right objects, 0 for wrong ones, and -1 for those in a crowd of their class.
+    """
+    verdicts = torch.zeros(len(objects), dtype=torch.long)
+    for label in objects.labels.unique().tolist():
+        numbers = (objects.labels == label).nonzero()[:, 0]
+        boxes = objects.boxes[numbers]
+        is_label = annotation.labels == label
+        single = annotation.boxes[is_label & ~annotation.crowd]
+        crowds = annotation.boxes[is_label & annotation.crowd]
+        of_one_class = torch.ones(len(single)).long()
+        hits = (match(boxes, single.to(boxes), of_one_class, iou=SAME_OBJECT) > 0).long()
+        if len(crowds):
+            hits[(hits == 0) & (_share_inside(boxes, crowds) >= SAME_OBJECT).any(-1)] = -1
+        verdicts[numbers] = hits
+    return verdicts
+
+
+def _share_inside(boxes: Tensor, others: Tensor) -> Tensor:
+    """Compute the share of the area of each box `(N, 4)` that lies in each other box `(M, 4)`, `(N, M)`."""
+    low = torch.maximum(boxes[:, None, :2], others[:, :2])
+    high = torch.minimum(boxes[:, None, 2:], others[:, 2:])
+    area = (boxes[:, 2:] - boxes[:, :2]).prod(-1, keepdim=True).clamp(min=1e-6)
+    return (high - low).clamp(min=0).prod(-1) / area

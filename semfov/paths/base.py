@@ -57,7 +57,7 @@ class Record(Conversion):
             of the fit whose target was there (`probability_at` gives others). None where it is not known, and for a
             head, whose number is that of its most probable cell.
         targets: class indices 1..K of a search for several classes; otherwise empty.
-        least: score from which on objects count, in windows their probability (`words.threshold`).
+        score_threshold: score from which on objects count, in windows their probability (`words.threshold`).
         unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
             no probabilities.
         photograph: `(3, h, w)`, bytes, the reduced picture; None if it was not kept.

@@ -87,12 +87,12 @@ class Conversion(Outcome, OtherWords):
     def rows(self) -> list[Values]:
         """Make a table of the looks, of plain values, whose first columns all kinds of records have.
 
-        `look` is the number of the look, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the part of
-        the picture that it shows, in picture pixels. `detections` counts those from score 0.1 on, `seen` is the class
-        of the most confident one, and `score` its confidence. `seconds` is the time at the end of the look, on the
-        clock of the episode. `value` is that for which the look was chosen. `closer` is the probability that the target
-        is there, by a closer look that this is, or that follows it. `brought` is the number of objects that it shows
-        most sharply. The columns that the kind adds come last.
+        `look` is the number of the look, from 1, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the
+        part of the picture that it shows, in picture pixels. `detections` counts those from score 0.1 on, `seen` is the
+        class of the most confident one, and `score` its confidence. `seconds` is the time at the end of the look, on
+        the clock of the episode. `value` is that for which the look was chosen. `closer` is the probability that the
+        target is there, by a closer look that this is, or that follows it. `brought` is the number of objects that it
+        shows most sharply. The columns that the kind adds come last.
 
         Returns:
             One dictionary for each look.
@@ -112,8 +112,8 @@ class Conversion(Outcome, OtherWords):
                 "score": digits(float(detections.confidence[0, 0])) if count else None,
                 "seconds": None if look.seconds is None else round(look.seconds, 3),
                 "value": digits(look.value),
-                "closer": digits(closer.get(look.number)),
-                "brought": brought[look.number],
+                "closer": digits(closer.get(look.index)),
+                "brought": brought[look.index],
             }
             for name, value in look.more.items():
                 row[name] = digits(value) if isinstance(value, float) else value
@@ -134,7 +134,7 @@ class Conversion(Outcome, OtherWords):
             "target": self.target_name,
             "targets": [self.classes[label] for label in self.sought],
             **self._decision_values(),
-            "least": self.least,
+            "score_threshold": self.score_threshold,
             "expected": _without_nan(self.expected),
             "expected_error": _without_nan(self.expected_error),
             "passes": self.passes,
@@ -163,7 +163,7 @@ class Conversion(Outcome, OtherWords):
         """Make a table of the objects, of plain values, most confident first.
 
         `x1`, `y1`, `x2` and `y2` are the box of the object and `x` and `y` the middle of the box, in picture pixels.
-        `look` is the number of the look that shows it most sharply.
+        `look` is the number, from 1, of the look that shows it most sharply.
 
         Returns:
             One dictionary for each object.
@@ -171,7 +171,7 @@ class Conversion(Outcome, OtherWords):
         objects = self.objects
         columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
         rows: list[Values] = []
-        for label, score, confirmed, look, box in zip(*(column.tolist() for column in columns), strict=True):
+        for label, score, confirmed, index, box in zip(*(column.tolist() for column in columns), strict=True):
             x1, y1, x2, y2 = box
             rows.append(
                 {
@@ -180,7 +180,7 @@ class Conversion(Outcome, OtherWords):
                     "score": digits(score),
                     "confirmed": confirmed,
                     **_rounded_place((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2),
-                    "look": look,
+                    "look": index + 1,
                 }
             )
         return rows
@@ -264,7 +264,7 @@ class Conversion(Outcome, OtherWords):
             picture = supervision.LabelAnnotator().annotate(picture, found)
         """
         objects = self.objects
-        data = {"look": objects.passes.numpy(), "confirmed": self.confirmed.numpy()}
+        data = {"look": objects.passes.numpy() + 1, "confirmed": self.confirmed.numpy()}
         columns = (objects.boxes, objects.labels, objects.scores)
         return named_detections(*columns, self.classes[1:], data, objects.track_ids)
 

@@ -16,9 +16,10 @@ from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Sc
 from semfov.io.storage import read, write_file
 from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
+from semfov.words import FORMER
 
 Ending = Literal[
-    "box", "decision", "detection", "worth", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"
+    "box", "decision", "detection", "min_gain", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"
 ]
 """Reason for the end of a search or an exploration: the gaze was on a given box, the search decided, a detection
 showed the target at the gaze in a search whose belief has no thresholds, no look was worth it, all gaze shifts were
@@ -61,7 +62,7 @@ _SHARED = {
     "found": Flag(),
     "prior": Maybe(_SHARE),
     "assumed": Maybe(_SHARE),
-    "least": CHANCE,
+    "score_threshold": CHANCE,
     "source": Maybe(Text()),
     "shown": Maybe(Object({"white": Json(), "bands": Json()})),
     "detector": Maybe(Text()),
@@ -69,7 +70,7 @@ _SHARED = {
     "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
-_PLAIN = ("target", "found", "prior", "assumed", "least", "source", "shown", "detector", "ending")
+_PLAIN = ("target", "found", "prior", "assumed", "score_threshold", "source", "shown", "detector", "ending")
 """Attributes that are JSON values."""
 
 
@@ -169,6 +170,7 @@ class Format:
         """
         tensors, record = read(path, self.kind)
         record.pop("kind")
+        _rename_former(record)
         unknown = record.keys() - self.schema.record.keys()
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
         self.schema.check(tensors, record)
@@ -206,6 +208,15 @@ def _separated(tensors: Mapping[str, Tensor], lengths: list[int]) -> tuple[Detec
     names = [name for name in (*_DETECTIONS, "confidence") if name in tensors]
     looks = zip(*(tensors[name].split(lengths) for name in names), strict=True)
     return tuple(Detections(*(part[None] for part in look)) for look in looks)
+
+
+def _rename_former(record: dict[str, Any]) -> None:
+    """Give the values of a file of an earlier version their present names, and the ending its own."""
+    for former in FORMER.keys() & record.keys():
+        record[FORMER[former]] = record.pop(former)
+    ending = record.get("ending")
+    if isinstance(ending, str):
+        record["ending"] = FORMER.get(ending, ending)
 
 
 def _check_shared(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:

@@ -105,7 +105,7 @@ class FoveaLooks:
     ) -> FoveaLook:
         self._clock += sum(stages.values())
         look = FoveaLook(
-            number=len(self.looks),
+            index=len(self.looks),
             fixation=point,
             region=region,
             detections=detections,
@@ -136,7 +136,7 @@ def moment_look(
     x, y = grid.centres[cell].tolist()
     width, height = (int(side) for side in grid.extent)
     return FoveaLook(
-        number=0,
+        index=0,
         fixation=(x, y),
         region=(0.0, 0.0, float(width), float(height)),
         detections=detections,

@@ -138,7 +138,7 @@ def head_look(
     boxes = world.boxes(in_view.boxes[0], pose)[None].to(in_view.boxes)
     cells = cell_columns(world.scene, int(views.gaze_cell[action]), map_after)
     return HeadLook(
-        number=number,
+        index=number,
         fixation=(x, y),
         region=(x1, y1, x2, y2),
         detections=replace(in_view, boxes=boxes),
@@ -233,7 +233,7 @@ class HeadPath(Record):
         width, height = self.views.world.size
         for look in self.looks:
             boxes = look.in_view.boxes[0]
-            field = float(self.pose(look.number)[2])
+            field = float(self.pose(look.index)[2])
             point = self.views.view_grid.centres[look.action % self.views.cells]
             distances.append(distances_to(boxes, point) * field / width)
             border = boxes.new_tensor([2.0, 2.0, width - 2.0, height - 2.0])  # a box this near to it counts as cut
@@ -315,7 +315,7 @@ class HeadPath(Record):
         """Border of the view of a look, `(P, 2)`; it goes on beyond the picture where it crosses its seam."""
         world = self.views.world
         view = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
-        places: Any = world.places(view, self.pose(look.number))
+        places: Any = world.places(view, self.pose(look.index))
         if not hasattr(places, "outlines"):
             x1, y1, x2, y2 = places.boxes[0].tolist()
             return torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
@@ -338,7 +338,7 @@ class HeadPath(Record):
         across, down = image.shape[-1] / width, image.shape[-2] / height
         for look in self.looks:
             if scene is not None:
-                pixels = scene.view(self.pose(look.number))[0]
+                pixels = scene.view(self.pose(look.index))[0]
             else:
                 x1, y1, x2, y2 = (side * by for side, by in zip(look.region, (across, down) * 2, strict=True))
                 left, top, right, bottom = whole_pixels((x1, y1, x2, y2), (image.shape[-1], image.shape[-2]))

@@ -20,7 +20,7 @@ class RecordedLook:
     """One look of a record, in pixels of the picture.
 
     Attributes:
-        number: number of the look, from 0.
+        index: place of the look in its record, `record[index]`, from 0.
         fixation: `(x, y)`, the fixated point.
         region: `(x1, y1, x2, y2)`, the part of the picture that the look shows.
         detections: its detections, a batch of one.
@@ -34,13 +34,18 @@ class RecordedLook:
             print(look.number, look.fixation, look.seconds)
     """
 
-    number: int
+    index: int
     fixation: tuple[float, float]
     region: Box
     detections: Detections
     seconds: float | None = None
     value: float | None = None
     more: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def number(self) -> int:
+        """Number of the look as pages, figures, tables and files have it: the first look has the number 1."""
+        return self.index + 1
 
     def __repr__(self) -> str:
         """Tell number, point, region and number of detections from score 0.1 on in one line."""

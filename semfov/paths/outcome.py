@@ -16,7 +16,7 @@ from semfov.belief.prior import Prior, check_prior
 from semfov.data.classes import class_index
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
-from semfov.detection.objects import LEAST, NO_TRACK, Objects
+from semfov.detection.objects import NO_TRACK, SCORE_THRESHOLD, Objects
 from semfov.errors import check
 from semfov.kinds import LookKind
 from semfov.observation.matching import box_iou
@@ -59,7 +59,7 @@ class Outcome(ABC):
     prior: float | None = None
     assumed: float | None = None
     targets: tuple[int, ...] = ()
-    least: float = LEAST
+    score_threshold: float = SCORE_THRESHOLD
     unseen: tuple[float, float] | None = None
     photograph: Tensor | None = None
     source: str | None = None
@@ -102,11 +102,11 @@ class Outcome(ABC):
         """Return the number of looks, the first included."""
         return len(self.looks)
 
-    def __getitem__(self, number: int) -> RecordedLook:
-        """Return the look of a number, as iteration gives it; -1 is the last one."""
-        remedy = f"; its objects of a class are record.objects.of({number!r})"
-        check(not isinstance(number, str), "record", "the number of a look", f"{number!r}{remedy}")
-        return self.looks[number]
+    def __getitem__(self, index: int) -> RecordedLook:
+        """Return a look by its place, from 0; -1 is the last one."""
+        remedy = f"; its objects of a class are record.objects.of({index!r})"
+        check(not isinstance(index, str), "record", "the place of a look, from 0", f"{index!r}{remedy}")
+        return self.looks[index]
 
     @property
     def passes(self) -> int:
@@ -186,11 +186,11 @@ class Outcome(ABC):
         looks = [look.detections for look in self.fixated]
         points = [torch.tensor(look.fixation, dtype=torch.float64) for look in self.fixated]
         distances = [distances_to(look.boxes[0], point) for look, point in zip(looks, points, strict=True)]
-        return merge_fixations(looks, distances, self.closer, numbers=[look.number for look in self.fixated])
+        return merge_fixations(looks, distances, self.closer, numbers=[look.index for look in self.fixated])
 
     @property
     def objects(self) -> Objects:
-        """The candidates of the targets that have at least the score `least`, or that were confirmed.
+        """The candidates of the targets that have at least the score `score_threshold`, or that were confirmed.
 
         One that was confirmed has the box that confirmed it, and that box's probability where it is higher.
         """
@@ -275,13 +275,13 @@ class Outcome(ABC):
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed."""
-        listing = _Listing(self.candidates.of(self.sought), self.least)
+        listing = _Listing(self.candidates.of(self.sought), self.score_threshold)
         for place in self._confirmed_places:
             listing.confirm(place)
         objects, confirmed = listing.result()
         if self.decision is not None and self.decision.outcome != "found":
             # No closer look was as sure as the search asks for, so what it shows counts by its probability alone.
-            objects = objects[~confirmed | (objects.scores >= self.least)]
+            objects = objects[~confirmed | (objects.scores >= self.score_threshold)]
             confirmed = torch.zeros(len(objects), dtype=torch.bool)
         return replace(objects, classes=self.classes), confirmed
 
@@ -294,16 +294,16 @@ class _Listing:
 
     Args:
         candidates: the candidates of the classes that were searched for.
-        least: score from which on a candidate counts.
+        score_threshold: score from which on a candidate counts.
     """
 
-    def __init__(self, candidates: Objects, least: float) -> None:
+    def __init__(self, candidates: Objects, score_threshold: float) -> None:
         self.boxes = candidates.boxes
         self.scores = candidates.scores
         self.labels = candidates.labels
         self.looks = candidates.passes
         self.track_ids = candidates.track_ids
-        self.counts = candidates.scores >= least
+        self.counts = candidates.scores >= score_threshold
         self.confirmed = torch.zeros(len(candidates), dtype=torch.bool)
 
     def confirm(self, place: _ConfirmedPlace) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from semfov.belief import Belief, Grid
 from semfov.belief.observers.base import Observer
 from semfov.detection.detections import Detections
-from semfov.detection.objects import LEAST
+from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode import Step
 from semfov.paths.fovea import FoveaLook, FoveaLooks
 from semfov.paths.scanpath import Scanpath
@@ -34,17 +34,22 @@ class Trace:
         classes: names of the classes, background first.
         target: class 1..K that is searched for; None for an exploration.
         beside: observer of the map of all classes beside the belief of a search; None if the belief is that map.
-        least: score from which on objects count.
+        score_threshold: score from which on objects count.
     """
 
     def __init__(
-        self, grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None, least: float = LEAST
+        self,
+        grid: Grid,
+        classes: tuple[str, ...],
+        target: int | None,
+        beside: Observer | None,
+        score_threshold: float = SCORE_THRESHOLD,
     ) -> None:
         self.grid = grid
         self.classes = classes
         self.target = target
         self.beside = beside
-        self.least = least
+        self.score_threshold = score_threshold
         self._made = FoveaLooks(grid)
         self._fixated: list[_Fixated] = []
         self._posterior: list[Tensor] = []  # of the target in each cell, after each fixation
@@ -109,7 +114,7 @@ class Trace:
             "grid": self.grid,
             "classes": self.classes,
             "target": self.target,
-            "least": self.least,
+            "score_threshold": self.score_threshold,
             "looks": self.looks,
             "probabilities": partial(self._probabilities, count),
             "values": torch.stack([kept.values[0] for kept in self._fixated]) if count else like,

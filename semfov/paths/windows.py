@@ -72,7 +72,7 @@ class WindowWords(Words):
     record: "ZoomPath"
 
     _sentences: ClassVar[Mapping[str, str]] = {
-        "worth": "No remaining look is expected to show enough new objects.",
+        "min_gain": "No remaining look is expected to show enough new objects.",
         "seconds": "The time was over.",
         "stopped": "It was stopped.",
         "windows": "No window is left that can show more.",
@@ -218,7 +218,7 @@ def look_at_window(
     """
     window = shown.window
     return LookAtWindow(
-        number=number,
+        index=number,
         fixation=window.centre(lattice),
         region=window.region(lattice),
         detections=shown.detections,

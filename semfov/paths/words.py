@@ -29,7 +29,7 @@ class Words(ABC):
     _sentences: ClassVar[Mapping[str, str]] = {
         "box": "The gaze is on a box of the target.",
         "detection": "A detection shows the target at the gaze.",
-        "worth": "No look is expected to classify enough more cells correctly.",
+        "min_gain": "No look is expected to classify enough more cells correctly.",
         "cells": "Every cell was fixated.",
         "duration": "The next look would end after the time limit of the scene.",
         "seconds": "The time was over.",
@@ -74,7 +74,7 @@ class Words(ABC):
     @property
     def threshold(self) -> str:
         """From what on objects count, such as `probability 0.5`."""
-        return f"{self.measure} {self.record.least:g}"
+        return f"{self.measure} {self.record.score_threshold:g}"
 
     @property
     def decided_by(self) -> str:
@@ -209,11 +209,18 @@ class Words(ABC):
         given = f" ({option})" if record.prior is None else ""
         return f"This assumes that {share}; if half of them did, it would be {at_half:.2f}{given}."
 
-    def summary(self) -> str:
-        """Describe the outcome, explain why it ended, name the best place of doubt, and say what is assumed."""
+    def summary(self, option: str = "prior=0.5") -> str:
+        """Describe the outcome, explain why it ended, name the best place of doubt, and say what is assumed.
+
+        Args:
+            option: how another share of pictures is asked for (`assumption`).
+
+        Returns:
+            The sentences.
+        """
         text = self.describe() + self._ending
         place = self.best_place.capitalize()
-        sentences = [text, f"{place}." if place else "", self.assumption()]
+        sentences = [text, f"{place}." if place else "", self.assumption(option)]
         return " ".join(sentence for sentence in sentences if sentence)
 
     @property

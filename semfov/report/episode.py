@@ -158,7 +158,7 @@ def object_data(record: Record) -> Data:
         box = [row[edge] for edge in ("x1", "y1", "x2", "y2")]
         more: Data = {name: row[name] for name in ("look", "confirmed", "pan", "tilt") if name in row}
         if isinstance(record, Scanpath):  # whose page steps through its fixations
-            more["look"] = record.fixation_after(row["look"])
+            more["look"] = record.fixation_after(row["look"] - 1) + 1
         objects.append({"box": box, "label": row["class"], "score": score, **more})
     return {
         "pixels": f"{width} × {height} px",

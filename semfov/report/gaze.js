@@ -2,7 +2,7 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const SVG = "http://www.w3.org/2000/svg";
 let picture = data.pictures[0];
 let who = 0; // the number of a viewer; 0 for all
-const steps = stepper({ last, show, word: () => "fixation", pause: 900 });
+const steps = stepper({ last, show, word: () => "fixation", pause: 900, first: 0 });
 
 function last() {
   const most = picture.maps.length - 1;

@@ -27,7 +27,7 @@ def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str],
     """
     name = escape(data["name"])
     noscript = f'<noscript><dl class="facts">{facts_html(facts)}</dl></noscript>' if facts else ""
-    looks = "".join(_look(data, number, f"{place}-look-{number}") for number in range(len(data["looks"])))
+    looks = "".join(_look(data, index, f"{place}-look-{index + 1}") for index in range(len(data["looks"])))
     view = _view_word(data)
     names_shown = " checked" if data["count"] <= _NAMED else ""
     switches = (
@@ -75,7 +75,7 @@ def _overview(data: Data, place: str) -> str:
     """Draw the picture with named objects and numbered windows."""
     width, height = data["size"]
     unit = max(width, height) / 640  # the drawing is about 640 pixels of the screen wide
-    windows = [(number, look["box"]) for number, look in enumerate(data["looks"]) if not look["whole"]]
+    windows = [(number, look["box"]) for number, look in enumerate(data["looks"], 1) if not look["whole"]]
     sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
     tags = place_labels([_corners(box) for _, box in windows], sizes, (width, height))
     shapes = [rect(box, "truth") for box in data["truth"]]
@@ -86,7 +86,7 @@ def _overview(data: Data, place: str) -> str:
         x = (tag[0] + tag[2]) / 2
         y = (tag[1] + tag[3]) / 2
         text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
-        shapes.append(f'<g class="window" data-look="{number}">{framed(box)}{rect(tag, "tag")}{text}</g>')
+        shapes.append(f'<g class="window" data-look="{number - 1}">{framed(box)}{rect(tag, "tag")}{text}</g>')
     objects = f"{data['count']} object{'s' if data['count'] != 1 else ''}"
     label = f"The picture with {len(windows)} numbered {_view_word(data)}s and {objects}"
     return (
@@ -126,7 +126,7 @@ def _object_shapes(data: Data, unit: float, obstacles: Sequence[LabelBox]) -> li
         confirmed = ", confirmed" if found["confirmed"] else ""
         title = f"<title>{escape(name)}{confirmed}, look {found['look']}</title>"
         inside = f"{title}{framed(found['box'])}{text}"
-        shapes.append(f'<g class="{kind}" data-look="{found["look"]}" data-object="{order}">{inside}</g>')
+        shapes.append(f'<g class="{kind}" data-look="{found["look"] - 1}" data-object="{order}">{inside}</g>')
     return shapes
 
 
@@ -139,15 +139,16 @@ def _corner_places(box: Sequence[float], size: tuple[float, float]) -> list[tupl
     return [(x - width / 2, y - height / 2) for x in columns for y in rows]
 
 
-def _look(data: Data, number: int, place: str) -> str:
+def _look(data: Data, index: int, place: str) -> str:
     """Make the section of a look: its pixels with its detections, facts, and a table of the detections."""
-    look = data["looks"][number]
+    look = data["looks"][index]
+    number = index + 1
     width, height = look["size"]
     count = look["count"]
     label = f"The window of look {number} with {count} detection{'s' if count != 1 else ''}"
     title = f"Look {number}{': the whole picture' if look['whole'] else ''}"
     return (
-        f'<section class="look" data-look="{number}" id="{place}" aria-labelledby="{place}-title">'
+        f'<section class="look" data-look="{index}" id="{place}" aria-labelledby="{place}-title">'
         f'<h4 id="{place}-title">{title}</h4>'
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{label}">'
         f"{picture(look['view'], (width, height), f'{place}-view')}{_detection_shapes(look, data['target'])}</svg>"
@@ -185,7 +186,7 @@ def _look_facts(look: Data, number: int) -> dict[str, str]:
         facts["Head"] = look["turned"]
     if look["value"] is not None:
         facts["Value when it was chosen"] = f"{look['value']:.2g}"
-    elif number == 0:
+    elif number == 1:
         facts["Value when it was chosen"] = "none: the first look"
     if look["brought"]:
         facts["Best seen in this look"] = look["brought"]
@@ -193,7 +194,7 @@ def _look_facts(look: Data, number: int) -> dict[str, str]:
         warm_up = ", with the warm-up of the detector" if look["warm"] else ""
         facts["End"] = f"after {look['seconds']:.2f} s{warm_up}"
     if look["closer"] is not None:
-        facts["Closer look" if number else "Close enough to tell"] = look["closer"]
+        facts["Closer look" if number > 1 else "Close enough to tell"] = look["closer"]
     return facts
 
 

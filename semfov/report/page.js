@@ -89,7 +89,7 @@
     points.forEach(([x, y], number) => {
       const end = episode.found && number === episode.fixations.length - 1;
       target.append(svg("circle", { cx: x, cy: y, r: 14 * unit(), fill: when(number), stroke: end ? FOUND : "white", "stroke-width": (number === fixation ? 4 : 1.5) * unit() }));
-      target.append(svg("text", { x, y, fill: number / last > 0.6 ? "black" : "white", "font-size": 18 * unit(), "font-weight": "bold", "text-anchor": "middle", "dominant-baseline": "central" }, String(number)));
+      target.append(svg("text", { x, y, fill: number / last > 0.6 ? "black" : "white", "font-size": 18 * unit(), "font-weight": "bold", "text-anchor": "middle", "dominant-baseline": "central" }, String(number + 1)));
     });
   }
 

@@ -128,7 +128,7 @@ class Part(ABC):
         cells.append(box_text(found["box"]))
         numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
         return (
-            f'<tr data-object="{order}" data-look="{found["look"]}"><th scope="row">'
+            f'<tr data-object="{order}" data-look="{found["look"] - 1}"><th scope="row">'
             f'<button type="button" class="pick">{order}</button></th><td>{self._crop(found)}</td>{numbers}</tr>'
         )
 
@@ -213,6 +213,6 @@ class LooksPart(Part):
         """Find the picture of the look that shows an object most sharply."""
         if self.data["turns"]:  # views of a head are no parts of the picture
             return f"{self.place}-picture", 0, 0
-        number = found["look"]
-        left, top = self.data["looks"][number]["box"][:2]
-        return f"{self.place}-look-{number}-view", left, top
+        index = found["look"] - 1
+        left, top = self.data["looks"][index]["box"][:2]
+        return f"{self.place}-look-{index + 1}-view", left, top

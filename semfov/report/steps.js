@@ -1,10 +1,11 @@
 "use strict";
-// The controls of a page of steps: a slider, buttons, keys, and playing. `last` gives the number of the last step,
-// `show` draws the step that `steps.at` tells, and `word` names one.
+// The controls of a page of steps: a slider, buttons, keys, and playing. `last` gives the place of the last step, from
+// 0, `show` draws the step that `steps.at` tells, `word` names one, and `first` is the number that a reader sees of the
+// first one.
 const find = (id) => document.getElementById(id);
 document.documentElement.classList.add("scripted");
 
-function stepper({ last, show, word, pause }) {
+function stepper({ last, show, word, pause, first = 1 }) {
   const steps = { at: 0, stepped: false, draw, go, start, stop };
   let playing = null;
   function draw() {
@@ -12,8 +13,9 @@ function stepper({ last, show, word, pause }) {
     document.querySelector(".controls").hidden = last() === 0;
     find("fixation").max = last();
     find("fixation").value = steps.at;
-    find("fixation").setAttribute("aria-valuetext", `${word()} ${steps.at} of ${last()}`);
-    find("number").textContent = `${steps.at} of ${last()}`;
+    const number = `${steps.at + first} of ${last() + first}`;
+    find("fixation").setAttribute("aria-valuetext", `${word()} ${number}`);
+    find("number").textContent = number;
     find("back").disabled = steps.at === 0;
     find("forward").disabled = steps.at === last();
     show();

@@ -102,7 +102,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
         "size": list(view.size),
         "whole": path.is_whole(look.region),
         "turned": turned,
-        "warm": look.number == 0 and _warmed_up(path),
+        "warm": look.index == 0 and _warmed_up(path),
         "magnification": magnification,
         "value": look.value,
         "seconds": look.seconds,
@@ -123,23 +123,23 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
 
 def _closer_look(path: Record, look: RecordedLook) -> CloseUp | None:
     """Find the closer look that a look is, of several the surest; None for others."""
-    closer = [close_up for close_up in path.closer if close_up.number == look.number]
+    closer = [close_up for close_up in path.closer if close_up.number == look.index]
     return max(closer, key=lambda close_up: close_up.place, default=None)
 
 
 def _number_in_words(path: Record, look: RecordedLook) -> str:
-    return f"Look {look.number} of {len(path) - 1}" if len(path) > 1 else "The only look"
+    return f"Look {look.number} of {len(path)}" if len(path) > 1 else "The only look"
 
 
 def _closer_in_words(look: RecordedLook, closer: CloseUp) -> str:
     """Tell what a closer look brought; a first look that is close enough is one, too."""
-    kind = "It is a closer look" if look.number else "It is close enough to tell"
+    kind = "It is a closer look" if look.index else "It is close enough to tell"
     return f"{kind}: the target is there with a probability of {closer.place:.2f}."
 
 
 def _brought_in_words(path: Record, look: RecordedLook) -> str:
     """Count the objects by class that no look shows more sharply; empty for none."""
-    labels = path.objects.labels[path.objects.passes == look.number].tolist()
+    labels = path.objects.labels[path.objects.passes == look.index].tolist()
     counts = Counter(path.classes[label] for label in labels)
     return ", ".join(counted(count, name) for name, count in counts.most_common())
 

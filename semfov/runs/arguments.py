@@ -26,7 +26,7 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
     Args:
         arguments: the words of the command line.
         config: dataclass of the settings.
-        options: the options of the parser, with underscores, such as `--give_up`.
+        options: the options of the parser, with underscores, such as `--stop_below`.
 
     Returns:
         The words for the parser. Those that it does not know stay as they are.

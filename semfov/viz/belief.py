@@ -111,7 +111,7 @@ def plot_belief(
     for panel, number in zip(used, fixations, strict=True):
         drawn = draw_belief(panel, scanpath, number, target, photograph)
         if fixation is None:
-            panel.set_title(f"fixation {number}: {panel.get_title()}", parse_math=False)
+            panel.set_title(f"fixation {number + 1}: {panel.get_title()}", parse_math=False)
     _, name = class_posterior(scanpath, target)
     draw_scale(used, drawn, f"probability of {name}")
     for panel in panels[len(fixations) :]:
@@ -152,7 +152,7 @@ def plot_belief_bars(
     for panel, fixation in zip(panels, fixations, strict=True):
         bars = chances[fixation].numpy()
         _draw_bars(panel, scanpath.grid, bars, highest)
-        panel.set_title(f"fixation {fixation}: p({name}) up to {float(bars.max()):.2f}", parse_math=False)
+        panel.set_title(f"fixation {fixation + 1}: p({name}) up to {float(bars.max()):.2f}", parse_math=False)
     return root(panels[0])
 
 

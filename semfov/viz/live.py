@@ -88,7 +88,7 @@ class _MomentDrawing:
         """Draw the probability in each cell, where there is a map."""
         from PIL import Image
 
-        believed = self.moment.belief_map(self.moment.looks[-1].number)
+        believed = self.moment.belief_map(self.moment.looks[-1].index)
         if believed is None:
             return
         grid, chances = believed

@@ -114,7 +114,7 @@ def views_of(record: Record, image: Tensor, views: Sequence[Tensor] | None) -> l
     count = len(record.fixated)
     check(len(views) == count, "views", f"{count} views, one for each fixation", len(views))
     for look, view in zip(record.fixated, views, strict=True):
-        shown[look.number] = LookView(view, record.size, look.detections.boxes[0], look.fixation)
+        shown[look.index] = LookView(view, record.size, look.detections.boxes[0], look.fixation)
     return shown
 
 
@@ -155,7 +155,7 @@ class LookFigure:
         path_axes, view_axes = self.axes[:2]
         draw_place(path_axes, record, image, boxes)
         draw_legend(path_axes, annotation_entries(record, boxes))
-        path_axes.set_title("look 0")
+        path_axes.set_title("look 1")
         self.view = view_axes.imshow(picture_array(view.pixels), interpolation="bilinear")
         view_axes.set(xticks=[], yticks=[], title="what the eye sees")
         # An exploration with a fovea has a map of all classes, in which regions are named.
@@ -202,7 +202,7 @@ class LookFigure:
         axes = self.axes[0]
         self.path.show(number)
         seconds = self.record.looks[number].seconds
-        axes.set_title(f"look {number}" if seconds is None else f"look {number}, {seconds:.2f} s")
+        axes.set_title(f"look {number + 1}" if seconds is None else f"look {number + 1}, {seconds:.2f} s")
         return draw_marks(axes, object_marks(self.record, number))
 
     def _show_view(self, number: int, view: LookView) -> list[Artist]:
@@ -221,7 +221,7 @@ class LookFigure:
         drawn = draw_cross(axes, self.record.looks[number].fixation)
         title = f"p({self.record.target_name or 'any object'}) up to {float(chances.max()):.2f}"
         if self._names_regions:
-            title = f"semantic map after fixation {number}"
+            title = f"semantic map after fixation {number + 1}"
             drawn += write_names(axes, grid, self.record.regions(number))
         axes.set_title(title, parse_math=False)
         return drawn

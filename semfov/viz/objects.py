@@ -119,14 +119,14 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
 
     Args:
         record: the record.
-        last: number of the last look that counts; None for all.
+        last: place of the last look that counts, from 0; None for all.
 
     Returns:
         The boxes, with labels for objects and for the best place.
     """
     last = len(record) if last is None else last
     marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.of_look <= last]
-    rows = [row for row in record.object_rows() if row["look"] <= last]
+    rows = [row for row in record.object_rows() if row["look"] - 1 <= last]
     many = len(rows) > _NAMED
     # Names would only repeat the class that was searched for, and take room that many labels do not have.
     one_class = many and record.target is not None

@@ -49,7 +49,7 @@ class LookPath:
             # The picture of a panorama repeats, so that an outline over its seam is drawn at both ends.
             for shift in (0.0,) if width is None else (-width, 0.0, width):
                 (line,) = axes.plot(x + shift, y, color=GAZE, linewidth=0.8, scalex=False, scaley=False)
-                self._outlines.append((look.number, line))
+                self._outlines.append((look.index, line))
         if self.gaze is None:
             self._write_numbers(axes, record)
 
@@ -71,7 +71,7 @@ class LookPath:
                 bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8},
             )
             middles.append(middle)
-            self._numbers.append((look.number, text))
+            self._numbers.append((look.index, text))
         self.number_boxes += [(x - room / 2, y - room / 2, x + room / 2, y + room / 2) for x, y in middles]
 
     def show(self, last: int) -> None:
@@ -155,25 +155,25 @@ class GazePath:
         # The width of a digit is about 0.64 of the font size, and the frame adds 4 points.
         sizes = [
             ((0.64 * len(str(number)) * _POINTS + 4.5) * scale, (_POINTS + 4) * scale)
-            for number in range(len(self.path))
+            for number in range(1, len(self.path) + 1)
         ]
         points = [(float(x), float(y)) for x, y in self.path]
         places = place_numbers(points, sizes, self.frame, 60 * scale)
         self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
         return [
-            None if place is None else self._number(axes, number, place, scale) for number, place in enumerate(places)
+            None if place is None else self._number(axes, index, place, scale) for index, place in enumerate(places)
         ]
 
-    def _number(self, axes: Axes, number: int, place: LabelBox, scale: float) -> Annotation:
+    def _number(self, axes: Axes, index: int, place: LabelBox, scale: float) -> Annotation:
         """Write the number of a fixation into a rectangle; a line joins it to its dot if it is not written on it."""
-        x, y = self.path[number].tolist()
+        x, y = self.path[index].tolist()
         left, top, right, bottom = place
         middle = ((left + right) / 2, (top + bottom) / 2)
         is_beside = max(abs(x - middle[0]), abs(y - middle[1])) > scale
-        colour = self.colours[number]
+        colour = self.colours[index]
         line = {"arrowstyle": "-", "color": "white", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0}
         return axes.annotate(
-            str(number),
+            str(index + 1),
             xy=(x, y),
             xytext=middle,
             color="white" if lightness(colour) < 0.55 else "black",

@@ -155,7 +155,7 @@ def plot_foveated_strip(
     figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", axes=axes)
     for panel, fixation in zip(panels, fixations, strict=False):
         draw_image(panel, views[fixation], scanpath.grid)
-        panel.set_title(f"fixation {fixation}")
+        panel.set_title(f"fixation {fixation + 1}")
     for panel in panels[len(fixations) :]:
         panel.remove()
     _label_views(panels, scanpath, fixations, views)
@@ -211,7 +211,7 @@ def plot_episode(
     panels = look_side.subplots(2, len(fixations), squeeze=False)
     for (above, below), fixation in zip(panels.T, fixations, strict=True):
         draw_image(above, views[fixation], scanpath.grid)
-        above.set_title(f"fixation {fixation}")
+        above.set_title(f"fixation {fixation + 1}")
         if scanpath.target is None:
             drawn = draw_semantic_map(below, scanpath, fixation, image)
         else:

@@ -96,7 +96,7 @@ def _draw_entropy(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor |
     style: dict[str, Any] = {"cmap": UNCERTAINTY, "vmin": float(values.min()), "vmax": float(values.max())}
     drawn = draw_cells(axes, scanpath.grid, values[fixation], alpha=alpha, **style)
     draw_cross(axes, scanpath.fixations[fixation])
-    axes.set_title(f"uncertainty after fixation {fixation}")
+    axes.set_title(f"uncertainty after fixation {fixation + 1}")
     return drawn
 
 
@@ -107,7 +107,7 @@ def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tens
     drawn = draw_cells(axes, scanpath.grid, scanpath.probabilities[fixation, :, 1:].amax(-1))
     draw_grid(axes, scanpath.grid)
     draw_cross(axes, scanpath.fixations[fixation])
-    axes.set_title(f"semantic map after fixation {fixation}")
+    axes.set_title(f"semantic map after fixation {fixation + 1}")
     return drawn
 
 

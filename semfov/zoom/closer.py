@@ -221,7 +221,7 @@ class PhotographPlaces(CandidateBoxes):
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Take the most evident place, if the chance of a hit there is worth a pass."""
         place = self._most_evident()
-        return None if place is None or self._hit_chance_at(place) < thresholds.give_up else place
+        return None if place is None or self._hit_chance_at(place) < thresholds.stop_below else place
 
     def is_shown(self, candidate: CandidatePlace) -> bool:
         """Whether the window that shows a place was looked at."""

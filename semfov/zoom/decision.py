@@ -232,7 +232,7 @@ class DecisionsByPresence(WindowDecisions):
         """Whether the search goes on, whatever the presence is: nothing was found, and a look is worth a pass."""
         if not self._is_large or self._facts.detected or self.looks:
             return False
-        return self._hit_chance() >= self.thresholds.give_up
+        return self._hit_chance() >= self.thresholds.stop_below
 
     def _judge(self, step: WindowStep[Any], number: int, *, last: bool) -> None:
         """Decide after a step."""
@@ -341,7 +341,7 @@ def decisions_of(
         most = MOST_IN_PHOTOGRAPH
     if settings.closer is not None:
         most = settings.closer
-    thresholds = (fitted or _DEFAULTS).changed(give_up=settings.give_up)
+    thresholds = (fitted or _DEFAULTS).changed(stop_below=settings.stop_below)
     if not most or verification is None or verification.thresholds is None:
         return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior)
     places: CandidateBoxes
@@ -349,7 +349,7 @@ def decisions_of(
         places = CandidateBoxes(belief.target, thresholds.confirm, forgetting, prior)
     else:
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
-    thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.give_up)
+    thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.stop_below)
     verifier = Verifier(verification, places, close_up, thresholds_of_places, most)
     return DecisionsByCloserLooks(belief, thresholds, prior, verifier)
 

@@ -283,7 +283,7 @@ def find_everything(
     target: int | None = None,
     *,
     batch: int = 1,
-    worth: float = 0.0,
+    min_gain: float = 0.0,
     forgetting: Forgetting | None = None,
     known: Callable[[int], Cells] | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
@@ -295,7 +295,7 @@ def find_everything(
 
     def best(looks: Sequence[WindowLook], done: set[Window]) -> Sequence[WindowChoice]:
         chosen = jointly(lambda visited: best_find(belief, visited, belief.foresight, known=known), belief, done, batch)
-        return [choice for choice in chosen if choice[1] > worth]
+        return [choice for choice in chosen if choice[1] > min_gain]
 
     return look_by_look(
         source,

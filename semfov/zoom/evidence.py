@@ -11,7 +11,6 @@ where cells are explored, odds where coarser looks come in, and only what has ch
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -20,7 +19,7 @@ from torch import Tensor, nn
 
 from semfov.belief.evidence import network
 from semfov.belief.prior import SHARES
-from semfov.belief.target_evidence import THRESHOLDS, Thresholds
+from semfov.belief.target_evidence import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import Settings, check_same_detector
@@ -127,8 +126,8 @@ class GlimpseEvidence(Pretrained):
     It answers two questions about a part w of the window and a class t, and one about the whole picture. Small
     networks answer them. They are fitted on mosaics of photographs with annotated boxes.
 
-    - Does a closer look at w show t with a score of 0.3 or more (`detector.least`)? The log odds depend on the
-      strongest hint of t in w, and on that of every other class, because some classes occur together:
+    - Does a closer look at w show t with a score of 0.3 or more (`detector.score_threshold`)? The log odds depend on
+      the strongest hint of t in w, and on that of every other class, because some classes occur together:
 
       .. math:: \operatorname{logit} P(t \in w) = a_t \phi_t(w) + b_t + f_t(\phi(w)) + g(\phi_t(w), \ldots), \qquad
                 \phi_k(w) = \ln(\max_{x \in w} s_k(x) + \epsilon)
@@ -394,7 +393,7 @@ class GlimpseEvidence(Pretrained):
             "width": self.width,
             "patience": self.patience,
             "foresight": self.foresight,
-            "thresholds": _thresholds_record(self.thresholds),
+            "thresholds": thresholds_record(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
             "verification": _verification_record(self.verification),
             "certainty": _certainty_record(self.certainty),
@@ -411,9 +410,11 @@ class GlimpseEvidence(Pretrained):
             patience=record["patience"],
             foresight=record["foresight"],
             metadata=record["metadata"],
-            thresholds=_restored_thresholds(record),
+            thresholds=thresholds_of(record["thresholds"]),
             certainty=_restored_certainty(record),
-            verification=None if verification is None else Verification(thresholds=_restored_thresholds(verification)),
+            verification=None
+            if verification is None
+            else Verification(thresholds=thresholds_of(verification["thresholds"])),
             photograph=None if photograph is None else _restored_photograph(photograph, record["classes"], tensors),
         )
         model.survey.foresight = record["survey"]["foresight"]
@@ -424,12 +425,8 @@ class GlimpseEvidence(Pretrained):
 # The parts of a model as values of its record, and back.
 
 
-def _thresholds_record(thresholds: Thresholds | None) -> dict[str, float] | None:
-    return None if thresholds is None else asdict(thresholds)
-
-
 def _verification_record(verification: Verification | None) -> dict[str, object] | None:
-    return None if verification is None else {"thresholds": _thresholds_record(verification.thresholds)}
+    return None if verification is None else {"thresholds": thresholds_record(verification.thresholds)}
 
 
 def _certainty_record(certainty: Certainty | None) -> list[float] | None:
@@ -440,15 +437,10 @@ def _photograph_record(photograph: PhotographEvidence | None) -> dict[str, objec
     if photograph is None:
         return None
     return {
-        "thresholds": _thresholds_record(photograph.verification.thresholds),
+        "thresholds": thresholds_record(photograph.verification.thresholds),
         "certainty": _certainty_record(photograph.certainty),
         "window": list(photograph.window),
     }
-
-
-def _restored_thresholds(record: Mapping[str, Any]) -> Thresholds | None:
-    thresholds = record["thresholds"]
-    return None if thresholds is None else Thresholds(**thresholds)
 
 
 def _restored_certainty(record: Mapping[str, Any]) -> Certainty | None:
@@ -460,7 +452,7 @@ def _restored_photograph(record: Mapping[str, Any], classes: int, tensors: Mappi
     least, context = record.get("window", USUAL_WINDOW)
     return PhotographEvidence(
         classes,
-        thresholds=_restored_thresholds(record),
+        thresholds=thresholds_of(record["thresholds"]),
         certainty=_restored_certainty(record),
         window=(least, context),
         shares=tensors.get("photograph.shares"),

@@ -548,7 +548,20 @@ def test_outcomes_of_another_model_are_not_continued(folder, tmp_path, capsys, m
         return code, len(calls)
 
     look = ActivePerception.find_all
-    find = "--agent", "raw", "--detector", network, "--how", "fovea", "--shifts", 2, "--least", 0.001, "--out", out
+    find = (
+        "--agent",
+        "raw",
+        "--detector",
+        network,
+        "--how",
+        "fovea",
+        "--shifts",
+        2,
+        "--score-threshold",
+        0.001,
+        "--out",
+        out,
+    )
     write_network(network)
     stopped = False
     assert pictures("find_all", *find) == (0, 3)
@@ -565,7 +578,7 @@ def test_outcomes_of_another_model_are_not_continued(folder, tmp_path, capsys, m
 
     look, vectors = ActivePerception.search, tmp_path / "vectors.txt"
     described = (
-        *(word for word in find if word not in ("--least", 0.001)),
+        *(word for word in find if word not in ("--score-threshold", 0.001)),
         "--target",
         "crimson",
         "--embeddings",
@@ -604,7 +617,9 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     assert len(episode["looks"]) == int(episode["passes"])
     _, printed = run(*search, "--closer", 0)
     assert "closer look" not in printed.out
-    _, printed = run("search", large, "--target", "red", "--confirm", 1, "--give-up", 0, "--passes", 3, "--closer", 0)
+    _, printed = run(
+        "search", large, "--target", "red", "--confirm", 1, "--stop-below", 0, "--passes", 3, "--closer", 0
+    )
     # The red square is at 1000, 700 to 1040, 740.
     place = re.search(r"red undecided, .*; best place: box (\d+),(\d+)–(\d+),(\d+), score 0\.\d\d$", printed.out, re.M)
     assert place

@@ -17,7 +17,7 @@ COMMANDS = {
     ],
     "search_in_windows": [
         ["search", "LARGE", "--target", "red", "--passes", "5", "--looks"],
-        ["search", "LARGE", "--target", "red", "--confirm", "1", "--give-up", "0", "--passes", "3", "--closer", "0"],
+        ["search", "LARGE", "--target", "red", "--confirm", "1", "--stop-below", "0", "--passes", "3", "--closer", "0"],
     ],
     "find": [
         ["find", "PHOTO", "--target", "Red, wine glass"],
@@ -27,7 +27,7 @@ COMMANDS = {
     ],
     "explore": [
         ["explore", "PHOTO", "--how", "fovea", "--start", "7,5", "--shifts", "2", "--looks"],
-        ["explore", "LARGE", "--worth", "1000"],
+        ["explore", "LARGE", "--min-gain", "1000"],
     ],
 }
 

@@ -51,7 +51,7 @@ REFUSED = {
     "search --target cup --shifts -1": "shifts: expected a whole number from 0 to 10,000, got -1",
     "search --target cup --seconds -1": "seconds: expected a number from 0, got -1",
     "search --target cup --confirm 50": "confirm: expected a probability from 0 to 1, got 50",
-    "search --target cup --give-up -1": "give_up: expected a probability from 0 to 1, got -1",
+    "search --target cup --stop-below -1": "stop_below: expected a probability from 0 to 1, got -1",
     "search --target cup --seed -1": "seed: expected a whole number from 0",
     "search --target cup --out a.xls": "a file that ends in .png, .pdf, .svg, .coco.json, .json, .jsonl, .csv",
     "search --target cup --report a.pdf": "report: expected a file that ends in .html or .htm, got a.pdf",
@@ -81,7 +81,7 @@ WRONG_USE = {
     "find --closer 3": "unknown option --closer; it is one of `semfov search` and `semfov live`",
     "explore a.jpg --target cup": "unknown option --target; it is one of `semfov search` and `semfov find` and",
     "explore --frames=3": "unknown option --frames; it is one of `semfov live`",
-    "find . --conf 0.5": "unknown option --conf; did you mean --least?",
+    "find . --conf 0.5": "unknown option --conf; did you mean --score-threshold?",
     "search --target cup --conf 0.5": "unknown option --conf; did you mean --confirm?",
     "gaze a.jpg --target cup": "unknown option --target; it is one of `semfov search` and `semfov find`",
     "search --xyz": "unknown option --xyz; --help-all lists all options",
@@ -155,13 +155,32 @@ def test_help_is_one_screen_with_options_that_exist(name, capsys):
 
 
 def test_options_may_have_dashes_or_underscores(tmp_path, capsys):
-    for words in (["--give-up", "0.2"], ["--give_up=0.2"], ["--give-up=0.2"]):
+    for words in (["--stop-below", "0.2"], ["--stop_below=0.2"], ["--stop-below=0.2"]):
         with pytest.raises(SystemExit) as stopped:
             main(["search", *words, "--print-config"])
         assert stopped.value.code == 0
-        assert "give_up: 0.2" in capsys.readouterr().out
+        assert "stop_below: 0.2" in capsys.readouterr().out
     parser = make_parser(_options_of("search"), "", ("pictures", "pictures"))
     assert parser.parse_args(["a.jpg", "b.jpg"]).pictures == ["a.jpg", "b.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("command", "former", "present"),
+    [
+        ("search", "--give-up", "--stop-below"),
+        ("find", "--least", "--score-threshold"),
+        ("explore", "--worth", "--min-gain"),
+        ("live", "--give_up", "--stop-below"),
+    ],
+)
+def test_earlier_names_of_options_are_taken_with_a_note(command, former, present, capsys):
+    for words in ([former, "0.25"], [f"{former}=0.25"]):
+        with pytest.raises(SystemExit) as stopped:
+            main([command, *words, "--print-config"])
+        assert stopped.value.code == 0
+        printed = capsys.readouterr()
+        assert f"{present[2:].replace('-', '_')}: 0.25" in printed.out
+        assert printed.err == f"note: {former} is called {present} now; the earlier name will go\n"
 
 
 def test_detectors_are_listed_with_licence_and_models(capsys):
@@ -213,8 +232,8 @@ def test_texts_of_options_are_read(tmp_path):
 
 def test_messages_name_options_as_the_command_does():
     for message, names, told in (
-        ("use how='windows' or give_up=0.1, or find_all", ["how", "give_up"],
-         "use --how windows or --give-up 0.1, or `semfov find`"),
+        ("use how='windows' or stop_below=0.1, or find_all", ["how", "stop_below"],
+         "use --how windows or --stop-below 0.1, or `semfov find`"),
         ("give its path as weights=", ["weights"], "give its path as --weights"),
         ("recursive=True, or classes=cat,dog", ["recursive", "detector.classes"],
          "--recursive, or --detector.classes cat,dog"),
@@ -226,18 +245,18 @@ def test_messages_name_options_as_the_command_does():
 
 
 def test_options_are_written_as_in_other_commands():
-    given = ["--give-up", "0.2", "--looks", "--draw", "path,views", "--config", "a.yaml", "--config", "b.yaml"]
-    usual = ["--give_up", "0.2", "--looks=true", "--draw=[path,views]", "--config", "a.yaml", "--config", "b.yaml"]
-    known = ["--give_up", "--looks", "--draw", "--config"]
+    given = ["--stop-below", "0.2", "--looks", "--draw", "path,views", "--config", "a.yaml", "--config", "b.yaml"]
+    usual = ["--stop_below", "0.2", "--looks=true", "--draw=[path,views]", "--config", "a.yaml", "--config", "b.yaml"]
+    known = ["--stop_below", "--looks", "--draw", "--config"]
     assert usual_form(given, options.SearchOptions, known) == usual
     assert usual_form(["--looks", "--looks"], options.SearchOptions, known) == ["--looks=true", "--looks=true"]
 
 
 def test_a_shell_completes_commands_and_options():
-    lines = _completion("fish", {"find": ["give_up"]}).splitlines()
+    lines = _completion("fish", {"find": ["stop_below"]}).splitlines()
     assert lines == [
         'complete -c semfov -n __fish_use_subcommand -a "find"',
-        'complete -c semfov -n "__fish_seen_subcommand_from find" -l give-up',
+        'complete -c semfov -n "__fish_seen_subcommand_from find" -l stop-below',
     ]
 
 

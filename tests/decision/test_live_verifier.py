@@ -300,8 +300,8 @@ def test_thresholds_are_those_of_the_verification_unless_given():
         return agent(Counted(3)).live("red", **options)._episodes["fovea"].plan.thresholds
 
     assert thresholds(rate=0) == AT
-    assert thresholds() == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)
-    assert thresholds(confirm=0.99, give_up=0.5) == Thresholds(0.99, 0.5, AT.place)
+    assert thresholds() == Thresholds(AT.confirm, Counted.thresholds.stop_below, AT.place)
+    assert thresholds(confirm=0.99, stop_below=0.5) == Thresholds(0.99, 0.5, AT.place)
     assert thresholds(closer=0) == Counted.thresholds
 
 

@@ -86,7 +86,7 @@ def batches(draw):
 @given(batches())
 def test_decisions_of_a_batch_equal_a_loop(batch):
     cells, visited, presence, thresholds = batch
-    confirm, give_up, place = thresholds.confirm, thresholds.give_up, thresholds.place
+    confirm, stop_below, place = thresholds.confirm, thresholds.stop_below, thresholds.place
     stated = SimpleNamespace(
         belief=Known(torch.tensor(cells).double(), torch.tensor(presence).double(), torch.zeros(())),
         visited=torch.tensor(visited),
@@ -99,7 +99,7 @@ def test_decisions_of_a_batch_equal_a_loop(batch):
         anywhere = float(torch.tensor(presence[row]).double())
         if anywhere >= confirm and looked >= place and looked >= 0.9 * max(exact):
             assert outcome == 1
-        elif max([0.0, *left]) < give_up:
+        elif max([0.0, *left]) < stop_below:
             assert outcome == (2 if anywhere < 0.5 else 3)
         else:
             assert outcome == 0
@@ -268,10 +268,10 @@ def test_search_takes_thresholds_as_arguments(image):
     searcher = agent(Scripted(*script))
     assert searcher.search(image, "red", start=0, confirm=0.6 - 1e-6).decision.outcome == "found"
     assert searcher.search(image, "red", start=0, confirm=0.61, shifts=3).decision.outcome == "undecided"
-    ended = searcher.search(image, "red", start=0, give_up=0.41)
+    ended = searcher.search(image, "red", start=0, stop_below=0.41)
     assert (ended.decision.outcome, ended.shifts) == ("absent", 0)
     # Giving one threshold does not change the other.
-    assert searcher.search(image, "red", start=0, give_up=0.3, shifts=1).decision.outcome == "undecided"
+    assert searcher.search(image, "red", start=0, stop_below=0.3, shifts=1).decision.outcome == "undecided"
     assert searcher.search(image, "red", start=0, confirm=0.5, shifts=1).decision.outcome == "found"
 
 
@@ -308,7 +308,7 @@ def test_without_thresholds_a_detection_confirms_the_target(image):
     assert scanpath.decision.probability == pytest.approx(float(scanpath.posterior[-1].max()))
     assert torch.equal(scanpath.decision.box, scanpath.detections[-1].boxes[0, 0])
     # Such a search never gives up, and finds nothing if no detection reaches the score.
-    for options in ({"confirm": 0.95}, {"confirm": 0.95, "give_up": 1.0}):
+    for options in ({"confirm": 0.95}, {"confirm": 0.95, "stop_below": 1.0}):
         never = searcher.search(image, "red", start=0, shifts=40, **options)
         assert len(never) == 12
         assert (never.found, never.decision.outcome) == (False, "undecided")

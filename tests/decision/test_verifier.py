@@ -18,7 +18,7 @@ from tests.refusals import refused
 from tests.small import iou
 
 GRID = Grid(4, 3, (160, 120))
-AT = Thresholds(confirm=0.7, give_up=0.1, place=0.3)
+AT = Thresholds(confirm=0.7, stop_below=0.1, place=0.3)
 
 
 def box_of(cell):
@@ -335,7 +335,7 @@ class Both(Observer):
 
 def test_a_search_for_several_classes_names_the_class_that_was_looked_at_closely(image):
     """At the end green is more probable than red, but the closer look was at red."""
-    looking = agent(Both((0.6, 0.1), (0.6, 0.9)), Fine(), Thresholds(confirm=0.8, give_up=0.1, place=0.3))
+    looking = agent(Both((0.6, 0.1), (0.6, 0.9)), Fine(), Thresholds(confirm=0.8, stop_below=0.1, place=0.3))
     scanpath = looking.search(image, {"red": 1.0, "green": 0.9}, start=11, shifts=1)
     assert scanpath.found
     assert [scanpath.classes[look.target] for look in scanpath.closer] == ["red"]

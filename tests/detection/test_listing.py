@@ -230,7 +230,7 @@ def test_every_detector_is_listed_with_its_own_scores(random):
     """Against torchvision's suppression of what the head proposes."""
     agent = ZoomAgent(WindowEye(random))
     image = photographs(1, *random.input_size[::-1])[0]
-    record = agent.find_all(image, settings=FindSettings(passes=1, least=0.3))
+    record = agent.find_all(image, settings=FindSettings(passes=1, score_threshold=0.3))
     view = agent.eye.open(image)
     canvas, _ = agent.eye.glimpse(view, torch.tensor([Window.overview(view.lattice).fixation]))
     proposed = random.propose(canvas)

@@ -112,7 +112,7 @@ def test_a_seed_repeats_an_episode_and_other_seeds_give_others(sceneries, task):
 def test_a_search_ends_only_in_cells_that_a_box_of_the_target_overlaps(sceneries):
     """By a loop over the boxes of the scene, for every cell."""
     scenery = sceneries["search"]
-    env, scenes = GazeSearch(scenery, price=0.25, find=3.0), EmbeddedScenes(scenery.classes[1:], count=2)
+    env, scenes = GazeSearch(scenery, look_cost=0.25, find=3.0), EmbeddedScenes(scenery.classes[1:], count=2)
     hits = 0
     for scene in scenery.scenes:
         episode = scenery.episodes(scene)[0]
@@ -150,7 +150,7 @@ def test_random_gaze_finds_targets_as_often_as_in_closed_form(world):
 
 
 def test_rewards_of_an_exploration_add_up_to_its_success(sceneries):
-    env, random = GazeExplore(sceneries["exploration"], price=0.02, find=2.0), MaskedRandom(3)
+    env, random = GazeExplore(sceneries["exploration"], look_cost=0.02, find=2.0), MaskedRandom(3)
     _, info = env.reset(seed=1)
     before, total, steps = info["result"], 0.0, 0
     truncated = False
@@ -244,7 +244,9 @@ def test_invalid_calls_are_refused(sceneries):
     refused("scenery: expected no options of `open_scenery` beside it, got count", GazeSearch, scenery, count=3)
     refused(r"shift: expected an option of `open_scenery`.* did you mean shifts=", GazeSearch, shift=3)
     refused("render_mode: expected 'rgb_array' or None", GazeSearch, scenery, render_mode="human")
-    refused("price", GazeSearch, scenery, price=-1.0)
+    refused("look_cost", GazeSearch, scenery, look_cost=-1.0)
+    with pytest.warns(FutureWarning, match="price is called look_cost now"):
+        refused("look_cost", GazeSearch, scenery, price=-1.0)
     envs = GazeVectorEnv("search", 2, scenery)
     refused("step: expected episodes in progress, got none; call reset", envs.step, np.array([0, 1]))
     envs.reset()

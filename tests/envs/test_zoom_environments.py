@@ -111,8 +111,8 @@ def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
 
 @pytest.mark.slow
 def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scenery):
-    refused("unknown task 'explore'", ZoomEnv, "explore", zoom_scenery, price=0.5)
-    env = ZoomEnv("exploration", zoom_scenery, price=0.5, find=10.0)
+    refused("unknown task 'explore'", ZoomEnv, "explore", zoom_scenery, look_cost=0.5)
+    env = ZoomEnv("exploration", zoom_scenery, look_cost=0.5, find=10.0)
     agent = WindowAgent(env)
     _, info = env.reset(seed=0)
     before, total, truncated = info["result"], 0.0, False

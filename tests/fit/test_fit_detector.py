@@ -97,11 +97,11 @@ def test_the_folder_describes_its_models(home):
     assert 0.49 < thresholds.confirm <= 0.9  # few searches to choose it from
     text = (home / "models/report.md").read_text()
     assert f"counts as found from a probability of {thresholds.confirm:.2f} on" in text
-    assert f"gives up when no cell has a probability of {thresholds.give_up:.2f} or more" in text
+    assert f"gives up when no cell has a probability of {thresholds.stop_below:.2f} or more" in text
     assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
     verification = Verification.from_pretrained(home / "models/verification.safetensors")
     assert 0.5 <= verification.thresholds.confirm <= 0.9
-    assert verification.thresholds.give_up <= thresholds.give_up
+    assert verification.thresholds.stop_below <= thresholds.stop_below
     assert verification.metadata["detector"] == ModelFolder(home / "models").eye().settings()["detector"]
     section = text.split("## Verification (closer looks)")[1].split("## ")[0]
     assert f"| {verification.thresholds.confirm:.2f} (chosen) " in section

@@ -213,12 +213,12 @@ def test_gradients_of_certain_beliefs_are_finite():
 def best_thresholds_by_loop(config, anywhere, place, left, there):
     """The best thresholds among all combinations, applied look by look."""
 
-    def found(search, confirm, least, give_up):
+    def found(search, confirm, least, stop_below):
         for look in range(len(anywhere)):
             known = float(place[look, search])
             if float(anywhere[look, search]) >= confirm and known > 0 and known >= least:
                 return True
-            if float(left[look, search]) < give_up:
+            if float(left[look, search]) < stop_below:
                 return False
         return False
 
@@ -240,9 +240,9 @@ def best_thresholds_by_loop(config, anywhere, place, left, there):
             least = candidate
     confirm, hits = confirm_and_hits(least)
     kept = [
-        give_up
-        for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001)
-        if hits - sum(found(search, confirm, least, give_up) for search in holding) <= config.lost * len(holding)
+        stop_below
+        for stop_below in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001)
+        if hits - sum(found(search, confirm, least, stop_below) for search in holding) <= config.lost * len(holding)
     ]
     return Thresholds(confirm, max(kept, default=0.0), least)
 
@@ -275,7 +275,7 @@ def test_thresholds_of_uninformative_and_perfect_searches():
     assert blind.confirm == 1
     sharp = choose_thresholds(config, torch.tensor([[1.0, 0.0]]), place, left, there)
     assert sharp.confirm == pytest.approx(0.5, abs=0.001)
-    assert sharp.give_up == 0.3
+    assert sharp.stop_below == 0.3
     assert sharp.place == pytest.approx(0.7, abs=0.001)
 
 
@@ -306,7 +306,7 @@ def test_more_training_lowers_the_evaluated_loss(examples):
         judged, thresholds = judge_evidence(config, model, examples, GRID)
         assert [row["looks"] for row in judged] == list(_JUDGED)
         assert 0.49 < thresholds.confirm <= 1
-        assert 0 <= thresholds.give_up <= 0.3
+        assert 0 <= thresholds.stop_below <= 0.3
         for row in judged:
             assert all(math.isfinite(value) for value in row.values())
         nll.append(judged[-1]["cells_nll"])

@@ -116,7 +116,7 @@ def examined_in(seen, evidence, config):
 
 def verified_in(seen, models, evidence, config):
     """The searches of photographs with all their closer looks."""
-    limits = Thresholds(1.0, config.give_up, config.place)
+    limits = Thresholds(1.0, config.stop_below, config.place)
     return verify(photograph_searches(seen, evidence, config.looks, "verifying"), models, limits, evidence.thresholds)
 
 
@@ -217,8 +217,8 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
     found, evidence = seen
     evidence.thresholds = Thresholds(0.55, 0.3, 0.3)
     model = shipped_mean()
-    config = VerificationConfig(columns=4, rows=3, looks=6, folds=2, give_up=0.1, place=0.1)
-    model.thresholds = Thresholds(confirm, config.give_up, config.place)
+    config = VerificationConfig(columns=4, rows=3, looks=6, folds=2, stop_below=0.1, place=0.1)
+    model.thresholds = Thresholds(confirm, config.stop_below, config.place)
     searching, exploring = (Target(evidence), Policy("non-predictive")), (Semantic(4), Policy("random"))
     agent = ActivePerception(found[0].eye, searching, exploring, verification=model, grid=(4, 3)).eval()
     searches = iter(verified_in(found, [model, model], evidence, config))

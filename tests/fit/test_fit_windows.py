@@ -22,7 +22,7 @@ from semfov.fit.looking import Looking
 from semfov.fit.photographs import _explored, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification import verify
-from semfov.fit.window_looking import found_in, right_boxes
+from semfov.fit.window_looking import found_in
 from semfov.fit.windows_decisions import _mosaic_searches, fit_closer_looks
 from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
@@ -31,7 +31,7 @@ from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, right_boxes
 from semfov.runs.config import DataConfig
 from semfov.runs.progress import WholeBar
 from semfov.settings import DecisionSettings, FindSettings
@@ -207,11 +207,11 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     kinds = "searched", "judged"
     text = fit_closer_looks(model, {kind: [(scenes, opened)] for kind in kinds}, config)
     fitted = model.verification.thresholds
-    assert (fitted.place, fitted.give_up) == (0.1, 0.01)
+    assert (fitted.place, fitted.stop_below) == (0.1, 0.01)
     assert f"| {fitted.confirm:.2f} (chosen)" in text
     # The searches from which the threshold was chosen end as those of the agent.
     ends = []
-    limits = Thresholds(1.0, model.thresholds.give_up, config.place)
+    limits = Thresholds(1.0, model.thresholds.stop_below, config.place)
     again = verify(searches, [model.verification], limits, model.thresholds)
     for sought, each in zip(searches, again, strict=True):
         task = WindowTask(Goal.of(names, sought.target), model, DecisionSettings(closer=MOST_CLOSER))
@@ -411,7 +411,10 @@ def fitted():
     model = GlimpseEvidence(3, 8).requires_grad_(False)
     eye = WindowEye(Squares().eval())
     report = fit_photographs(
-        model, Photographs(), eye, SimpleNamespace(photographs=COUNT, worth=0.1, window=(0.6, 2.0), surest=0.9, seed=0)
+        model,
+        Photographs(),
+        eye,
+        SimpleNamespace(photographs=COUNT, stop_below=0.1, window=(0.6, 2.0), surest=0.9, seed=0),
     )
     return model, eye, report
 

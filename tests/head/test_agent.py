@@ -209,16 +209,16 @@ def test_every_limit_ends_an_episode_and_a_search_has_a_decision_all_the_same(ag
         explored = agent.explore(world, ExploreSettings(**limit))
         assert (explored.ending, explored.decision) == (ending, None)
     assert seen == [1, 2, 3] * 2
-    assert agent.explore(world, ExploreSettings(worth=1e6)).ending == "worth"
+    assert agent.explore(world, ExploreSettings(min_gain=1e6)).ending == "min_gain"
     whole = agent.explore(world, ExploreSettings(passes=10))
-    gains = agent.explore(world, ExploreSettings(passes=10, worth=1e-6))
+    gains = agent.explore(world, ExploreSettings(passes=10, min_gain=1e-6))
     assert gains.actions == whole.actions
 
 
 def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
     whole = agent.search(Panorama(panorama), "green", SearchSettings(confirm=1.0, passes=8), chance=0.3)
     sure = [float(chances.max()) < 0.5 for chances in whole.maps]
-    path = agent.search(Panorama(panorama), "green", SearchSettings(give_up=0.99, confirm=1.0, passes=8), chance=0.3)
+    path = agent.search(Panorama(panorama), "green", SearchSettings(stop_below=0.99, confirm=1.0, passes=8), chance=0.3)
     assert [*sure, True].index(True) == len(path) - 1 if any(sure) else len(path) == 8
     assert path.decision.outcome == ("absent" if any(sure) else "undecided")
 
@@ -482,7 +482,7 @@ def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_pat
     camera = Own(panorama)
     assert one.search(camera, "blue", color="bgr", confirm=1.0, **limits).actions[0] == head.views(camera).ahead
     assert one.find_all(camera, ["red", "blue"], color="bgr", **limits).targets == (1, 3)
-    assert [look.number for look in one.explore(camera, color="bgr", worth=0.0, **limits)] == [0, 1, 2, 3]
+    assert [look.number for look in one.explore(camera, color="bgr", min_gain=0.0, **limits)] == [1, 2, 3, 4]
     for wrong, message in (
         ({"picture": camera, "shifts": 3}, "shifts: expected none"),
         ({"picture": camera, "how": "windows"}, "how: expected 'head' or 'auto' for a scene"),

@@ -86,7 +86,7 @@ def test_quarters_cover_every_pixel_once():
 def test_a_run_compares_gaze_and_beliefs_at_the_given_thresholds(config):
     run = DecisionRun(replace(config, confirm=0.6))
     assert list(run.compared) == ["target-evidence", "random gaze", *FUSED]
-    assert run.thresholds == Thresholds(0.6, AT.give_up)
+    assert run.thresholds == Thresholds(0.6, AT.stop_below)
 
 
 def detects_at_the_gaze(step, grid, target, least=0.5):

@@ -44,12 +44,12 @@ def test_supervision_counts_classes_from_0_and_has_their_names(record):
     assert found.class_id.tolist() == [2, 0, 1]
     assert found["class_name"].tolist() == ["cup", "person", "tvmonitor"]
     np.testing.assert_allclose(found.confidence, [0.9, 0.8, 0.4])
-    assert (found["look"].tolist(), found["confirmed"].tolist()) == ([0] * 3, [False] * 3)
+    assert (found["look"].tolist(), found["confirmed"].tolist()) == ([1] * 3, [False] * 3)
     # Its annotators write the names.
     blank = np.zeros((60, 80, 3), np.uint8)
     assert supervision.LabelAnnotator().annotate(supervision.BoxAnnotator().annotate(blank.copy(), found), found).any()
     assert len(found.with_nms()) == 3
-    assert len(replace(record, least=0.95).to_supervision()) == 0
+    assert len(replace(record, score_threshold=0.95).to_supervision()) == 0
 
 
 def test_labels_of_yolo_are_shares_and_crops_the_pixels_of_the_boxes(record):

@@ -71,14 +71,14 @@ def test_what_was_not_sure_enough_for_the_decision_is_not_called_confirmed():
     unsure = replace(path, closer=(CloseUp(0, 1, 0, torch.tensor(LEFT), 0.55, 0.9),))
     assert unsure.objects.scores.tolist() == pytest.approx([0.55])
     assert unsure.confirmed.tolist() == [False]
-    assert len(replace(unsure, least=0.6).objects) == 0
+    assert len(replace(unsure, score_threshold=0.6).objects) == 0
     assert "(confirmed)" not in repr(unsure)
 
 
 def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has():
     """That of the most probable place, or without closer looks the best score; other searches name none."""
     looks = look((LEFT, 1, 0.2), (RIGHT, 2, 0.25)), look((LEFT, 1, 0.1), (RIGHT, 1, 0.12))
-    path = scanpath(*looks, target=1, decision=Decision("undecided", 0.7), least=0.5)
+    path = scanpath(*looks, target=1, decision=Decision("undecided", 0.7), score_threshold=0.5)
     assert path.words.best_place == "best place: box 10,10–30,30, score 0.20"
     places = ((LEFT, 0.1, 0.9), (RIGHT, 0.3, 0.7))
     closer = tuple(CloseUp(0, 1, 0, torch.tensor(box), place, presence) for box, place, presence in places)
@@ -137,14 +137,14 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
     assert set(path.expected) == {"cat", "cup"}
     assert all(isnan(each) for each in (*path.expected.values(), *path.expected_error.values()))
     assert path.to_dict()["expected"] == path.to_dict()["expected_error"] == {"cat": None, "cup": None}
-    assert replace(path, least=0.5).describe().endswith(": 1 object found")
+    assert replace(path, score_threshold=0.5).describe().endswith(": 1 object found")
     assert list(replace(path, target=1).expected) == ["cup"]
     assert replace(path, targets=(1, 2)).words.objects == "1 cup, 1 cat found"
     rows = path.object_rows()
     json.dumps(rows)
     assert rows[0]["class"] == "cat"
     assert [rows[0][name] for name in ("x1", "y1", "x2", "y2")] == RIGHT
-    assert (rows[0]["x"], rows[0]["y"], rows[0]["look"], rows[0]["confirmed"]) == (60.0, 47.5, 0, False)
+    assert (rows[0]["x"], rows[0]["y"], rows[0]["look"], rows[0]["confirmed"]) == (60.0, 47.5, 1, False)
     frame = path.to_frame("objects")
     assert frame.to_dict("records") == rows
 
@@ -166,7 +166,7 @@ def test_the_number_in_all_starts_with_the_objects_that_are_listed(chances, unse
     """Unless fewer are expected. Where the detector shows faint candidates alone, a large picture has no number."""
     count = len(chances)
     found = Objects(torch.rand(count, 4), torch.tensor(chances), torch.ones(count).long(), torch.zeros(count).long())
-    lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"looks": (), "least": 0.5}
+    lattice, parts = Lattice.over((2560, 1920), (416, 416)), {"looks": (), "score_threshold": 0.5}
     path = ZoomPath(lattice=lattice, classes=CLASSES, target=1, candidates=found, unseen=unseen, **parts)
     assert path.describe() == f"{words}. 0 looks"
     values = path.to_dict()
@@ -180,7 +180,7 @@ def test_a_photograph_has_a_number_where_the_detector_hardly_reacts():
     lattice, empty = Lattice.over((640, 480), (416, 416)), torch.zeros(0).long()
     assert lattice.levels == 1
     nothing = Objects(torch.zeros(0, 4), torch.zeros(0), empty, empty)
-    parts = {"looks": (), "least": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES}
+    parts = {"looks": (), "score_threshold": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES}
     path = ZoomPath(lattice=lattice, target=None, targets=(1, 2), candidates=nothing, **parts)
     assert path.expected == {"cup": 0, "cat": 0}
     assert path.expected_error == {"cup": 1, "cat": 1}
@@ -200,7 +200,7 @@ def test_a_large_picture_in_which_others_are_clear_has_a_number_too(clear, given
     cats = look(*((shifted(LEFT, 100 * number), 2, 0.75) for number in range(clear)))
     window_look = WindowLook(Window.overview(lattice), cats, torch.zeros(clear).bool(), torch.zeros(2), None)
     nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
-    parts = {"classes": CLASSES, "unseen": (0.0, 0.0), "least": 0.5, "target": 1}
+    parts = {"classes": CLASSES, "unseen": (0.0, 0.0), "score_threshold": 0.5, "target": 1}
     path = ZoomPath(lattice=lattice, looks=looks_at_windows([window_look], lattice, [0.0]), candidates=nothing, **parts)
     assert path.describe() == "No cup found. 1 look"
     number = path.expected["cup"], path.expected_error["cup"]
@@ -212,7 +212,7 @@ def test_a_number_is_claimed_class_by_class():
     chances, labels = torch.tensor([0.9, 0.8, 0.3, 0.3, 0.2]), torch.tensor([1, 1, 2, 2, 2])
     found = Objects(torch.rand(5, 4), chances, labels, torch.zeros(5).long())
     lattice = Lattice.over((2560, 1920), (416, 416))
-    parts = {"looks": (), "least": 0.5, "unseen": (0.5, 0.1), "target": None, "targets": (1, 2)}
+    parts = {"looks": (), "score_threshold": 0.5, "unseen": (0.5, 0.1), "target": None, "targets": (1, 2)}
     path = ZoomPath(lattice=lattice, classes=CLASSES, candidates=found, **parts)
     share = 1.7 / 2.5
     assert path.expected["cup"] == pytest.approx(1.7 + 0.5 * share)
@@ -223,7 +223,7 @@ def test_a_number_is_claimed_class_by_class():
     every = replace(path, targets=())
     # Of all classes only those are counted of which something is listed.
     assert every.words.classes == "2 cups (2 to 3 in all)"
-    assert replace(every, least=0.1).words.classes == "3 cats, 2 cups (2 to 3 in all)"
+    assert replace(every, score_threshold=0.1).words.classes == "3 cats, 2 cups (2 to 3 in all)"
     assert replace(every, unseen=None).words.classes == "2 cups"
     assert isnan(path.expected["cat"])
     assert isnan(path.expected_error["cat"])

@@ -327,7 +327,7 @@ def test_a_record_is_not_saved_under_the_name_of_another_file(name, call, tmp_pa
 
 
 def test_a_table_without_objects_has_its_columns():
-    table = replace(head_path(), least=1.5).to_frame("objects")
+    table = replace(head_path(), score_threshold=1.5).to_frame("objects")
     assert (len(table), table.columns.tolist()) == (0, list(head_path().object_rows()[0]))
 
 
@@ -346,7 +346,7 @@ def test_the_table_has_the_looks_and_its_first_columns_are_those_of_every_kind(m
         place = [row[name] for name in ("x", "y", "x1", "y1", "x2", "y2")]
         assert place == pytest.approx([*look.fixation, *look.region], abs=0.005)
         assert row["detections"] == int(look.detections.mask.sum())
-        assert row["brought"] == sum(each["look"] == look.number for each in found)
+        assert row["brought"] == sum(each["look"] == look.number == look.index + 1 for each in found)
         best = look.detections.scores[0, :, 1:].max() if row["detections"] else None
         assert row["score"] == (None if best is None else pytest.approx(float(best), rel=1e-3))
     times = [look.seconds for look in record if look.seconds is not None]
@@ -455,7 +455,7 @@ def with_picture(make):
 def test_every_record_draws_itself_on_its_picture(make, tmp_path):
     """What is printed, drawn, on the page and in the notebook are its objects, and no others."""
     record = with_picture(make)
-    record = replace(record, least=0.1)
+    record = replace(record, score_threshold=0.1)
     objects, sure = record.objects, record.confirmed
     assert len(objects) > 0
     (axes,) = record.plot().axes
@@ -484,13 +484,26 @@ def test_every_record_draws_itself_on_its_picture(make, tmp_path):
 
 
 @pytest.mark.parametrize("make", RECORDS)
+def test_a_file_with_earlier_names_is_read(make, tmp_path):
+    record = replace(make(), score_threshold=0.4, ending="min_gain")
+    file = tmp_path / "a.safetensors"
+    record.save(file)
+    tensors, values = read(file, record._format.kind)
+    write_file(file, tensors, {**values, "least": values.pop("score_threshold"), "ending": "worth"})
+    loaded = type(record).load(file)
+    assert (loaded.score_threshold, loaded.ending) == (0.4, "min_gain")
+    with pytest.warns(FutureWarning, match="least is called score_threshold now"):
+        assert loaded.least == 0.4
+
+
+@pytest.mark.parametrize("make", RECORDS)
 def test_a_file_keeps_the_picture(make, tmp_path):
-    record = replace(with_picture(make), targets=(1, 2), least=0.4, source="a.jpg")
+    record = replace(with_picture(make), targets=(1, 2), score_threshold=0.4, source="a.jpg")
     file = tmp_path / "a.safetensors"
     record.save(file)
     loaded = type(record).load(file)
     assert same(loaded.image, record.image)
-    assert (loaded.targets, loaded.least, loaded.source) == ((1, 2), 0.4, "a.jpg")
+    assert (loaded.targets, loaded.score_threshold, loaded.source) == ((1, 2), 0.4, "a.jpg")
     assert repr(loaded) == repr(record)
     tensors, values = read(file, record._format.kind)
     write_file(file, {**tensors, "photograph": torch.zeros(3, 2, 1281, dtype=torch.uint8)}, values)

@@ -49,9 +49,9 @@ def agent():
 
 
 def test_a_record_counts_detections_from_the_score_that_the_detector_names(agent, image):
-    agent.eye.detector.least = 0.95
+    agent.eye.detector.score_threshold = 0.95
     assert len(agent.explore(image, start=3, shifts=2).objects) == 0
-    agent.eye.detector.least = 0.2
+    agent.eye.detector.score_threshold = 0.2
     assert len(agent.explore(image, start=3, shifts=2).objects) > 0
 
 

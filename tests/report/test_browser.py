@@ -254,7 +254,7 @@ def test_keys_and_clicks_choose_a_look(chromium, zoom_page, hostile):
     with watched(chromium, zoom_page) as page:
         assert page.locator("#episode-views").is_hidden()
         shown = page.locator(".look:visible")
-        assert shown.locator("h4").all_inner_texts() == ["Look 0: the whole picture"]
+        assert shown.locator("h4").all_inner_texts() == ["Look 1: the whole picture"]
         assert page.get_by_role("button", name="Next look").count() == 1
         page.keyboard.press("ArrowRight")
         assert shown.locator("h4").all_inner_texts() == ["Look 1"]
@@ -298,7 +298,7 @@ def test_the_page_opens_with_all_objects_whose_rows_are_chosen_and_sorted(chromi
 
 def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, image, zoom_path, large_picture, tmp_path):
     large = zoom_data(zoom_path, large_picture, name="large.jpg")
-    explored = replace(scanpath, target=None, posterior=None, least=0.1)
+    explored = replace(scanpath, target=None, posterior=None, score_threshold=0.1)
     small = episode_data(explored, image, [image] * 3, name="small.jpg")
     both = write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}])
     with watched(chromium, both) as page:

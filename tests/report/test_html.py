@@ -178,7 +178,7 @@ def test_a_page_of_fixations_lists_the_objects_that_its_outcome_counts(scanpath,
     scores = torch.tensor([[[0.1, 0.1, 0.1, 0.63499], [0.1, 0.5, 0.2, 0.2]]])
     looks = (Detections(boxes, scores, torch.ones(1, 2, dtype=torch.bool)), *scanpath.detections[1:])
     explored = replace(
-        small.with_looks(scanpath, detections=looks), target=None, posterior=None, least=0.5, detector="net"
+        small.with_looks(scanpath, detections=looks), target=None, posterior=None, score_threshold=0.5, detector="net"
     )
     data = episode_data(explored, image, [image] * 3, name="kitchen")
     page = page_html("kitchen", [data])
@@ -212,7 +212,7 @@ def test_the_page_contains_the_outcome(scanpath, image):
     assert data["outcome"] == {"why": searched.why_it_ended(), "cell": 6, "box": [1.0, 2.0, 30.2, 40.0]}
     assert data["presence"] == pytest.approx([0.25, 0.5, 0.97])
     assert data["outcome"]["why"] != replace(searched, decision=Decision("absent", 0.1)).why_it_ended() != ""
-    for ending in ("box", "worth", "shifts", "cells"):
+    for ending in ("box", "min_gain", "shifts", "cells"):
         ended = replace(scanpath, ending=ending)
         data = episode_data(ended, image, [image] * 3, name="other")
         assert data["outcome"] == {"why": ended.why_it_ended(), "cell": None, "box": None}

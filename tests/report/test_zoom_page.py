@@ -105,7 +105,7 @@ def test_confirmed_objects_are_told_only_where_something_can_confirm_them(zoom_p
 def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_picture, hostile):
     looks = zoom_data(zoom_path, large_picture, name="field")["looks"]
     assert [look["brought"] for look in looks] == ["", f"1 {hostile}", f"1 {hostile}"]
-    assert looks[0]["status"] == "Look 0 of 2, at the whole picture."
+    assert looks[0]["status"] == "Look 1 of 3, at the whole picture."
     assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
 
 
@@ -183,7 +183,7 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture, monkeypatch):
         (Decision("undecided", 0.6), None, "0.60.$"),
         (Decision("found", 0.7), "detection", "“cat” found, best score: 0.70. A detection shows the target.$"),
         (None, "passes", "^No cat found. All 3 passes were used.$"),
-        (None, "worth", "^No cat found. No remaining look is expected to show enough new objects.$"),
+        (None, "min_gain", "^No cat found. No remaining look is expected to show enough new objects.$"),
         (None, None, "^No cat found.$"),
     ],
 )

@@ -273,8 +273,8 @@ def test_invalid_targets_are_refused(target, agent, zooming):
 ARGUMENTS = [
     ("shifts", -1), ("shifts", 10**9), ("shifts", 2.5), ("seed", -1), ("seed", 2**64), ("seed", 1.5),
     ("seed", None), ("start", 12), ("start", -1), ("start", True), ("start", "middle"),
-    ("confirm", 50), ("confirm", -0.1), ("confirm", "high"), ("give_up", 2),
-    ("give_up", float("nan")),
+    ("confirm", 50), ("confirm", -0.1), ("confirm", "high"), ("stop_below", 2),
+    ("stop_below", float("nan")),
 ]  # fmt: skip
 
 
@@ -292,7 +292,7 @@ def test_invalid_gazes_and_arguments_of_a_search_are_refused_by_name(agent):
     [
         ("search", "pases", "did you mean passes="),
         ("search", "conf", "did you mean confirm="),
-        ("find_all", "threshold", "did you mean least="),
+        ("find_all", "threshold", "did you mean score_threshold="),
         ("explore", "max_steps", "did you mean passes="),
         ("live", "colour", "did you mean color="),
         ("gaze", "degrees", "known: picture, model, "),
@@ -301,6 +301,27 @@ def test_invalid_gazes_and_arguments_of_a_search_are_refused_by_name(agent):
 def test_unknown_keywords_are_refused_with_the_near_ones(method, name, remedy, agent):
     with pytest.raises(SemfovError, match=f"^{name}: expected an option of {method}, got an unknown one; {remedy}"):
         getattr(agent, method)(PIXELS, "cup", **{name: 1})
+
+
+@pytest.mark.parametrize(
+    ("method", "former", "present"),
+    [
+        ("search", "give_up", "stop_below"),
+        ("find_all", "least", "score_threshold"),
+        ("find_all", "worth", "min_gain"),
+        ("live", "least", "score_threshold"),
+    ],
+)
+def test_earlier_names_of_settings_are_taken_with_a_note(method, former, present, agent):
+    """They reach the same check, under the present name."""
+    picture = () if method == "live" else (PIXELS,)
+    with (
+        pytest.warns(FutureWarning, match=f"^{former} is called {present} now"),
+        pytest.raises(SemfovError, match=f"^{present}: expected a .*, got -1"),
+    ):
+        getattr(agent, method)(*picture, "cup", **{former: -1})
+    with pytest.raises(SemfovError, match=f"^{present}: expected one value, got another as {former}"):
+        getattr(agent, method)(*picture, "cup", **{former: 0.5, present: 0.5})
 
 
 @pytest.mark.parametrize(

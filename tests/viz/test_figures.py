@@ -139,7 +139,7 @@ def test_the_legend_names_the_source_of_each_kind_of_box(scanpath, image):
 def test_the_best_place_of_an_undecided_search_is_told_apart_from_other_closer_looks(scanpath, image):
     places = ([50.0, 40, 70, 55], 0.26), ([5.0, 5, 20, 20], 0.2)
     closer = tuple(CloseUp(0, 1, 0, torch.tensor(box), place, 0.8) for box, place in places)
-    path = replace(scanpath, decision=Decision("undecided", 0.8), ending="decision", closer=closer, least=0.9)
+    path = replace(scanpath, decision=Decision("undecided", 0.8), ending="decision", closer=closer, score_threshold=0.9)
     for shown, expected in ((path, ["--", ":"]), (replace(path, closer=closer[:1]), ["--"])):
         (axes,) = draw(plot_scanpath(shown, image)).axes
         best = [box for box in axes.patches if box.get_linestyle() == "--"]
@@ -198,7 +198,7 @@ def test_bars_are_as_high_as_the_posterior(scanpath):
 def test_strip_shows_views_of_any_size_with_their_detections(scanpath, image):
     views = [image * share for share in (0.2, 0.5, 0.8)]
     figure = draw(plot_foveated_strip(scanpath, views, most=2))
-    assert [axes.get_title() for axes in figure.axes] == ["fixation 0", "fixation 2"]
+    assert [axes.get_title() for axes in figure.axes] == ["fixation 1", "fixation 3"]
     for axes, view in zip(figure.axes, (views[0], views[2]), strict=True):
         np.testing.assert_allclose(np.asarray(axes.images[0].get_array()), view.permute(1, 2, 0))
         assert {text.get_text() for text in axes.texts} == {"cat 0.80", "cup 0.60"}

@@ -57,7 +57,7 @@ def test_long_pictures_are_searched(detector, evidence, size):
     """At some levels windows are higher than the picture, and cells of coarse looks reach beyond the last cell."""
     image = torch.rand(3, size[1], size[0], generator=torch.Generator().manual_seed(0)) * 0.6
     agent = ZoomAgent(WindowEye(detector), evidence)
-    path = agent.search(image, "red", SearchSettings(passes=10, confirm=1.0, give_up=0.0))
+    path = agent.search(image, "red", SearchSettings(passes=10, confirm=1.0, stop_below=0.0))
     assert path.passes == 10
     assert path.lattice.levels > 4
 
@@ -203,6 +203,6 @@ def test_a_search_for_one_object_predicts_no_rates(detector, picture, evidence, 
 
     monkeypatch.setattr(GlimpseEvidence, "rates", rates)
     agent = ZoomAgent(WindowEye(detector), evidence)
-    assert agent.search(picture, "green", SearchSettings(passes=4, give_up=0.0)).passes == 4
+    assert agent.search(picture, "green", SearchSettings(passes=4, stop_below=0.0)).passes == 4
     with pytest.raises(AssertionError, match="rates are predicted"):
         agent.find_all(picture, "green", FindSettings(passes=4))

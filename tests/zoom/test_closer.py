@@ -24,7 +24,7 @@ from semfov.zoom.slices import ranked, raw, usual_slices
 from tests.refusals import refused, unusable
 from tests.zoom.conftest import Squares
 
-AT = Thresholds(confirm=0.6, give_up=0.01, place=0.2)
+AT = Thresholds(confirm=0.6, stop_below=0.01, place=0.2)
 LATTICE = Lattice.over((1024, 768), (128, 128))
 
 
@@ -232,7 +232,7 @@ def test_the_limits_of_a_search_hold(detector, picture):
     agent = ZoomAgent(WindowEye(detector), evidence())
     assert len(agent.search(picture, "red", SearchSettings(confirm=1.0, closer=1)).closer) == 1
     for passes in (1, 2, 3):
-        path = agent.search(picture, "red", SearchSettings(passes=passes, confirm=1.0, give_up=0.0))
+        path = agent.search(picture, "red", SearchSettings(passes=passes, confirm=1.0, stop_below=0.0))
         assert path.passes <= passes
 
 
@@ -289,10 +289,10 @@ def photograph():
     return image
 
 
-def own_evidence(give_up=0.1, confirm=0.6):
+def own_evidence(stop_below=0.1, confirm=0.6):
     torch.manual_seed(0)
     own = PhotographEvidence(3, certainty=Certainty(0.0, (1.0, *[0.0] * (len(FACTS) - 1)), 0.0, 1.0))
-    own.verification = Alike(thresholds=Thresholds(confirm, give_up, give_up))
+    own.verification = Alike(thresholds=Thresholds(confirm, stop_below, stop_below))
     with torch.no_grad():
         own.whole.weight.copy_(torch.tensor([[1.0, 0.5]]))
         own.whole.bias.fill_(0.25)
@@ -500,7 +500,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     shown = replace(nothing, looks=looks)
     assert "worth a pass" in shown.why_it_ended()
     # Without a limit of their worth all places are looked at, however sure the first one is.
-    made = [agent.search(photograph, "red", SearchSettings(confirm=least, give_up=0.0)) for least in (0.01, 0.9)]
+    made = [agent.search(photograph, "red", SearchSettings(confirm=least, stop_below=0.0)) for least in (0.01, 0.9)]
     assert len(made[0].closer) == len(made[1].closer) > max(len(path.closer), 2)
     for each in made:
         assert len({window_look.window for window_look in each.window_looks}) == each.passes < 1 + len(each.closer)
@@ -546,7 +546,7 @@ def test_a_record_says_what_its_probability_assumes_and_gives_others(detector, p
 
 
 def test_closer_looks_read_the_probabilities_of_the_fit_and_give_those_of_the_prior(detector, photograph):
-    model, share = evidence_with_shares(give_up=0.0), 0.1
+    model, share = evidence_with_shares(stop_below=0.0), 0.1
     agent = ZoomAgent(WindowEye(detector), model)
     usual, rare = agent.search(photograph, "red"), agent.search(photograph, "red", SearchSettings(prior=share))
     prior = Prior(share, float(SHARES[0]))
@@ -582,9 +582,9 @@ def test_a_prior_needs_the_shares_of_the_fit(detector, photograph):
 
 def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), own_evidence())
-    path = agent.search(photograph, "red", SearchSettings(give_up=0.0))
+    path = agent.search(photograph, "red", SearchSettings(stop_below=0.0))
     assert path.passes < 1 + len(path.closer)  # some places are in one window
-    live = agent.stream(1, (), StreamSettings(rate=0.0, give_up=0.0), follows=False)
+    live = agent.stream(1, (), StreamSettings(rate=0.0, stop_below=0.0), follows=False)
     for _ in range(path.passes):
         live.step(photograph)
     moment = live.moment()

@@ -19,11 +19,11 @@ from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES, settle
 from semfov.detection.objects import unlike
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.window_looking import right_boxes
 from semfov.fit.windows_certainty import _fit_unseen, _Numbers, explorations_of_kinds, fit_spread
 from semfov.fit.windows_decisions import WindowSearches, fit_judge, judge_searches
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import calibration_error
+from semfov.observation.matching import right_boxes
 from semfov.paths import ZoomPath
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
@@ -43,11 +43,11 @@ SHARE = st.floats(0, 1, width=32)
 
 
 @given(SHARE, st.booleans(), SHARE, SHARE, SHARE)
-def test_decisions_follow_the_rule(presence, looked, left, confirm, give_up):
-    ended = settle(*(torch.tensor([each]) for each in (presence, looked, left)), Thresholds(confirm, give_up))
+def test_decisions_follow_the_rule(presence, looked, left, confirm, stop_below):
+    ended = settle(*(torch.tensor([each]) for each in (presence, looked, left)), Thresholds(confirm, stop_below))
     if presence >= confirm and looked:
         expected = 1
-    elif left >= give_up:
+    elif left >= stop_below:
         expected = 0
     else:
         expected = 2 if presence < 0.5 else 3
@@ -116,10 +116,10 @@ def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
     path = agent.search(picture, "red")
     assert path.decision.outcome == "found"
     assert path.decision.probability >= 0.3
-    longer = agent.search(picture, "red", SearchSettings(confirm=1.0, give_up=0.0, passes=path.passes + 2))
+    longer = agent.search(picture, "red", SearchSettings(confirm=1.0, stop_below=0.0, passes=path.passes + 2))
     assert longer.passes > path.passes
     assert longer.decision.outcome == "undecided"
-    assert agent.search(picture, "green", SearchSettings(give_up=1.0)).passes == 1
+    assert agent.search(picture, "green", SearchSettings(stop_below=1.0)).passes == 1
 
 
 def synthetic(count, seed):
@@ -133,10 +133,10 @@ def synthetic(count, seed):
 
 
 @pytest.mark.parametrize("target", [1, 2, 3])
-@pytest.mark.parametrize(("confirm", "give_up"), [(0.9, 0.005), (0.3, 0.2), (1.0, 0.0), (0.0, 1.0)])
-def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm, give_up):
+@pytest.mark.parametrize(("confirm", "stop_below"), [(0.9, 0.005), (0.3, 0.2), (1.0, 0.0), (0.0, 1.0)])
+def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm, stop_below):
     """A search computes the probability only where it can matter; here it is computed after every look."""
-    most, thresholds = 6, Thresholds(confirm, give_up)
+    most, thresholds = 6, Thresholds(confirm, stop_below)
     torch.manual_seed(0)
     evidence, source = GlimpseEvidence(3, 8).eval(), LiveWindowLooks(eye, eye.open(picture))
     facts, passes, ended = None, 0, 0
@@ -150,7 +150,7 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
             if ended or passes == most:
                 break
         path = ZoomAgent(eye, evidence).search(
-            picture, target, SearchSettings(passes=most, confirm=confirm, give_up=give_up)
+            picture, target, SearchSettings(passes=most, confirm=confirm, stop_below=stop_below)
         )
     assert path.passes == passes
     assert path.decision.outcome == OUTCOMES[ended]
@@ -354,7 +354,7 @@ def test_the_spread_is_fitted_on_the_numbers_of_records():
     assert torch.equal(sought.objects[sought.looks][1], right)
     for passes in (2, 4):
         record = ZoomAgent(eye, evidence).find_all(
-            mosaics[0].image, sought.target, FindSettings(passes=passes, worth=0.0)
+            mosaics[0].image, sought.target, FindSettings(passes=passes, min_gain=0.0)
         )
         (expected,), (error,) = record.expected.values(), replace(record, spread=0.0).expected_error.values()
         assert sought.number(certainty, passes) == pytest.approx((expected, error**2), rel=1e-5)
@@ -411,7 +411,7 @@ def path(detector, picture):
 
 
 def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
-    assert path.least == 0.5
+    assert path.score_threshold == 0.5
     assert (path.objects.scores >= 0.5).all()
     assert path.unseen[0] > 0
     assert path.spread == SPREAD
@@ -424,7 +424,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     path.save(tmp_path / "a.safetensors")
     loaded = ZoomPath.load(tmp_path / "a.safetensors")
     assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
-    assert len(replace(path, least=0.0).objects) == len(path.candidates)
+    assert len(replace(path, score_threshold=0.0).objects) == len(path.candidates)
     assert all(math.isnan(each) for each in replace(path, unseen=None).expected_error.values())
 
 
@@ -439,6 +439,6 @@ def test_evidence_of_earlier_versions_has_probabilities_by_the_score_alone():
 
 def test_the_least_probability_can_be_chosen(detector, picture):
     agent = ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
-    assert agent.find_all(picture, "red", FindSettings(passes=2)).least == 0.3  # scores, without a certainty
-    assert agent.find_all(picture, "red", FindSettings(passes=2, least=0.7)).least == 0.7
-    assert agent.explore(picture, ExploreSettings(passes=2, least=0.6)).least == 0.6
+    assert agent.find_all(picture, "red", FindSettings(passes=2)).score_threshold == 0.3  # scores, without a certainty
+    assert agent.find_all(picture, "red", FindSettings(passes=2, score_threshold=0.7)).score_threshold == 0.7
+    assert agent.explore(picture, ExploreSettings(passes=2, score_threshold=0.6)).score_threshold == 0.6

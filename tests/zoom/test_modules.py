@@ -52,4 +52,4 @@ class TestZoomAgent(BaseTester):
 
     @staticmethod
     def call(module, picture):
-        return module.explore(picture, ExploreSettings(passes=3, worth=0.0)).candidates.boxes
+        return module.explore(picture, ExploreSettings(passes=3, min_gain=0.0)).candidates.boxes

@@ -62,15 +62,15 @@ def test_the_records_of_each_look_have_the_picture(agent, picture):
 
 
 def test_find_all_finds_one_class_and_explore_finds_all(agent, picture):
-    path = agent.find_all(picture, "blue", FindSettings(passes=12, worth=0.0))
+    path = agent.find_all(picture, "blue", FindSettings(passes=12, min_gain=0.0))
     assert path.target == 3
     assert (path.objects.labels == 3).all()
     assert len(path.objects.above(0.3))
-    everything = agent.find_all(picture, settings=FindSettings(passes=24, batch=3, worth=0.0))
+    everything = agent.find_all(picture, settings=FindSettings(passes=24, batch=3, min_gain=0.0))
     assert set(everything.objects.above(0.3).labels.tolist()) == {1, 3}
     assert everything.target is None
     assert everything.passes <= 24
-    assert agent.find_all(picture, "blue", FindSettings(worth=1e9)).passes == 1
+    assert agent.find_all(picture, "blue", FindSettings(min_gain=1e9)).passes == 1
 
 
 def test_a_path_tells_why_it_ended(agent, picture):
@@ -82,15 +82,15 @@ def test_a_path_tells_why_it_ended(agent, picture):
     early = agent.search(picture, "red", SearchSettings(passes=found.passes - 1))
     assert early.decision.outcome == "undecided"
     assert (early.ending, early.why_it_ended()) == ("passes", f"All {early.passes} passes were used.")
-    hopeless = agent.search(picture, "green", SearchSettings(give_up=1.0))
+    hopeless = agent.search(picture, "green", SearchSettings(stop_below=1.0))
     assert (hopeless.passes, hopeless.ending) == (1, "decision")
     # Without a limit to what is worth a look, a search looks at everything.
-    everything = agent.search(picture, "green", SearchSettings(passes=10_000, confirm=1.0, give_up=0.0))
+    everything = agent.search(picture, "green", SearchSettings(passes=10_000, confirm=1.0, stop_below=0.0))
     assert (everything.ending, everything.decision.outcome) == ("windows", "undecided")
     assert everything.why_it_ended() == "No window is left that can show more."
     assert agent.explore(picture, ExploreSettings(passes=1)).why_it_ended() == "The only pass was used."
-    assert agent.find_all(picture, "blue", FindSettings(worth=1e9)).ending == "worth"
-    assert agent.find_all(picture, "blue", FindSettings(passes=3, worth=0.0)).ending == "passes"
+    assert agent.find_all(picture, "blue", FindSettings(min_gain=1e9)).ending == "min_gain"
+    assert agent.find_all(picture, "blue", FindSettings(passes=3, min_gain=0.0)).ending == "passes"
     assert replace(found, ending=None).why_it_ended() == ""
 
 
@@ -190,7 +190,7 @@ def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, m
         assert not prepared
         paths[cores] = (
             agent.search(picture, "green", SearchSettings(passes=6)),
-            agent.explore(picture, ExploreSettings(passes=6, worth=0.0)),
+            agent.explore(picture, ExploreSettings(passes=6, min_gain=0.0)),
         )
     for alone, helped in zip(*paths.values(), strict=True):
         assert [look.window for look in alone.window_looks] == [look.window for look in helped.window_looks]
@@ -205,8 +205,8 @@ def test_a_second_thread_only_prepares_what_the_first_would_do(agent, picture, m
 @pytest.mark.parametrize(
     ("task", "settings"),
     [
-        ("search", SearchSettings(passes=16, confirm=1.0, give_up=0.0)),
-        ("find_all", FindSettings(passes=16, worth=0.0)),
+        ("search", SearchSettings(passes=16, confirm=1.0, stop_below=0.0)),
+        ("find_all", FindSettings(passes=16, min_gain=0.0)),
     ],
 )
 def test_a_second_thread_knows_the_window_after_a_look_of_the_last_level(agent, picture, monkeypatch, task, settings):
@@ -424,7 +424,7 @@ def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once(agent, pict
 def test_a_record_of_a_look_that_is_read_later_is_the_one_that_is_read_at_once(agent, picture, one_thread):
     for look, settings in (
         (partial(agent.search, picture, "red"), SearchSettings(passes=4)),
-        (partial(agent.explore, picture), ExploreSettings(passes=4, worth=0.0)),
+        (partial(agent.explore, picture), ExploreSettings(passes=4, min_gain=0.0)),
     ):
         at_once = []
         kept = []

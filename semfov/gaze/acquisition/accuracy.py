@@ -77,7 +77,7 @@ class ExpectedGain(AcquisitionFunction):
     `MapEvidence.gain` predicts the gain of each cell, and this is the sum over the cells. The prediction was learned
     from looks of explorations: a cell gains by a closer look, and gains more where the map is less certain. An
     exploration can end when no cell is expected to gain more than a look costs
-    (`semfov.ActivePerception.explore(worth=...)`).
+    (`semfov.ActivePerception.explore(min_gain=...)`).
 
     Args:
         model: the model that the map is learned with.

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Grid, MapEvidence
-from semfov.agents.fovea import _WORTH
+from semfov.agents.fovea import _MIN_GAIN
 from semfov.belief.observers import LearnedMap, Semantic
 from semfov.gaze.policies import Policy
 from tests.refusals import refused
@@ -62,16 +62,16 @@ def largest_gains(model, scanpath):
 @pytest.mark.parametrize("policy", [None, Policy("random")], ids=["closer-look", "random"])
 def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
     agent = agent_of(model, policy)
-    whole = agent.explore(image, start=0, shifts=12, worth=0, seed=1)
+    whole = agent.explore(image, start=0, shifts=12, min_gain=0, seed=1)
     assert len(whole) == 13
     assert whole.ending == "shifts"
     expected = largest_gains(model, whole)
     assert max(expected) > 4 * min(expected)
     lengths = set()
-    for price in (0.15, 0.25, 0.35, 0.55, 0.85, 5.0):
-        part = agent.explore(image, start=0, shifts=12, worth=price, seed=1)
-        last = next((number for number, value in enumerate(expected) if value < price), None)
-        assert part.ending == ("shifts" if last is None else "worth")
+    for limit in (0.15, 0.25, 0.35, 0.55, 0.85, 5.0):
+        part = agent.explore(image, start=0, shifts=12, min_gain=limit, seed=1)
+        last = next((number for number, value in enumerate(expected) if value < limit), None)
+        assert part.ending == ("shifts" if last is None else "min_gain")
         assert len(part) == (13 if last is None else last + 1)
         assert torch.equal(part.cells, whole.cells[: len(part)])
         assert torch.equal(part.probabilities, whole.probabilities[: len(part)])
@@ -87,8 +87,8 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
 def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, image):
     """After the last look every gain is below the price; after every earlier look at least one is not."""
     agent = agent_of(model, Policy("expected-gain", model))
-    scanpath = agent.explore(image, start=7, shifts=19, worth=0.25)
-    assert scanpath.ending == "worth"
+    scanpath = agent.explore(image, start=7, shifts=19, min_gain=0.25)
+    assert scanpath.ending == "min_gain"
     expected = largest_gains(model, scanpath)
     for number, values in enumerate(scanpath.values):
         left = values.clone()
@@ -99,10 +99,12 @@ def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, i
 
 def test_until_none_means_the_default_price(model, image):
     agent = agent_of(model)
-    model.worth[-1].bias.fill_(_WORTH / 3.5)
-    free, default, same = (agent.explore(image, start=0, shifts=19, worth=worth, seed=3) for worth in (0, None, _WORTH))
+    model.worth[-1].bias.fill_(_MIN_GAIN / 3.5)
+    free, default, same = (
+        agent.explore(image, start=0, shifts=19, min_gain=min_gain, seed=3) for min_gain in (0, None, _MIN_GAIN)
+    )
     assert free.ending == "cells"
-    assert default.ending == same.ending == "worth"
+    assert default.ending == same.ending == "min_gain"
     assert torch.equal(default.cells, same.cells)
     assert 1 < len(default) < len(free) == 20
 
@@ -111,15 +113,15 @@ def test_until_none_means_the_default_price(model, image):
 def test_price_zero_never_ends_an_exploration(model, image, gain):
     model.worth[-1].bias.fill_(gain)
     agent = agent_of(model)
-    assert agent.explore(image, start=0, shifts=3, worth=0).ending == "shifts"
-    assert len(agent.explore(image, start=0, shifts=30, worth=0)) == 20
-    assert len(agent.explore(image, start=0, shifts=30, worth=0.01)) == 1
+    assert agent.explore(image, start=0, shifts=3, min_gain=0).ending == "shifts"
+    assert len(agent.explore(image, start=0, shifts=30, min_gain=0)) == 20
+    assert len(agent.explore(image, start=0, shifts=30, min_gain=0.01)) == 1
     assert len(agent.explore(image, start=0, shifts=30)) == 1
 
 
 def test_exploration_without_gaze_shifts(model, image):
-    assert agent_of(model).explore(image, start=0, shifts=0, worth=0.1).ending == "shifts"
-    assert agent_of(model).explore(image, start=0, shifts=0, worth=1e3).ending == "worth"
+    assert agent_of(model).explore(image, start=0, shifts=0, min_gain=0.1).ending == "shifts"
+    assert agent_of(model).explore(image, start=0, shifts=0, min_gain=1e3).ending == "min_gain"
 
 
 def test_the_map_of_a_search_is_the_learned_map(model, image):
@@ -136,8 +138,8 @@ def test_the_map_of_a_search_is_the_learned_map(model, image):
 def test_prices_are_numbers_for_an_agent_with_a_learned_map(image, model):
     eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
     agent = ActivePerception(eye, (Semantic(3), Policy("non-predictive")), (Semantic(3), Policy("random")), grid=(5, 4))
-    refused(r"^worth: expected None for an agent without a learned map", agent.explore, image, worth=0.1)
-    assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, worth=0).ending == "shifts"
+    refused(r"^min_gain: expected None for an agent without a learned map", agent.explore, image, min_gain=0.1)
+    assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, min_gain=0).ending == "shifts"
     assert agent.explore(image, shifts=50).ending == "cells"
-    for worth in [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400]:
-        refused("worth: expected a number from 0", agent_of(model).explore, image, worth=worth)
+    for min_gain in [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400]:
+        refused("min_gain: expected a number from 0", agent_of(model).explore, image, min_gain=min_gain)
