@@ -16,6 +16,10 @@ SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
 _Odds = TypeVar("_Odds", float, Tensor)
 
 
+class UnknownShareError(InputError):
+    """A share of searches was given to models that do not know the share of their fit, with which it is compared."""
+
+
 def with_prior(logit: _Odds, prior: float, fitted: float) -> _Odds:
     r"""Change log odds from the share of searches that they were fitted with to another one.
 
@@ -70,7 +74,8 @@ class Prior:
             Both shares.
 
         Raises:
-            InputError: the share is no probability between 0 and 1, or those of the fit are not known.
+            InputError: the share is no probability between 0 and 1.
+            UnknownShareError: those of the fit are not known.
         """
         check_prior(share)
         if shares is not None:
@@ -78,7 +83,9 @@ class Prior:
             return cls(fitted if share is None else float(share), fitted)
         if share is not None:
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
-            raise InputError(f"prior: expected None for models without the shares of their fit, got {share}; {remedy}")
+            raise UnknownShareError(
+                f"prior: expected None for models without the shares of their fit, got {share}; {remedy}"
+            )
         return cls(known=False)
 
     @property

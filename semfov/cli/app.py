@@ -59,6 +59,7 @@ _NO_PICTURE = "Give it a picture, or take an example."
 _WHICH = "Choose a class: a search looks for one."
 _CLICK = "Point at the picture to see as the fovea does. Click to look: find “{}” in fewer looks than the agent."
 _WHICH_OWN = "Choose a class in the field *Class*, and look for it here."
+_SHARE = "Share of your pictures that hold the class"  # label of a field
 _STYLE = """
 footer { display: none !important; }
 .main.fillable { padding-top: 8px !important; }
@@ -256,7 +257,7 @@ def _record_page(record: Record, picture: Tensor) -> str:
     """Make the page of a record, whose title is the outcome."""
     data = record.page_data(picture if record.kind.fine else None)
     data["decision"] = None  # which says it again
-    return page_html(record.summary(), [data])
+    return page_html(record.words.summary(f"{_SHARE}: 0.5"), [data])
 
 
 def _framed(page: str) -> str:
@@ -296,11 +297,99 @@ def _errors_on_page() -> Iterator[None]:
         raise gradio.Error(str(error), print_exception=False) from None
 
 
+class _Panel(NamedTuple):
+    """What a person sets: components of Gradio."""
+
+    picture: Any
+    task: Any
+    target: Any
+    go: Any
+    end: Any
+    example: Any
+    passes: Any
+    prior: Any
+
+
+class _Views(NamedTuple):
+    """What a person sees: components of Gradio, of the tab with the agent's looks and of that with the person's own."""
+
+    words: Any
+    shown: Any
+    about: Any
+    own: Any
+    again: Any
+
+
 def _make_page(agent: ActivePerception) -> Any:
     """Make the page, a `gradio.Blocks`; pictures that it is given are removed within about an hour."""
     import gradio
 
     calls = _Calls(agent)
+    kept = (_SECONDS_SWEPT, _SECONDS_KEPT)
+    with gradio.Blocks(title="semfov", analytics_enabled=False, delete_cache=kept, fill_width=True) as page:
+        gradio.Markdown("# semfov\nSee where it looks in a picture, and what it finds there.", elem_classes="title")
+        with gradio.Row():
+            with gradio.Column(scale=1, min_width=300, elem_id="panel"):
+                panel = _lay_out_panel(calls)
+            with gradio.Column(scale=2, min_width=300), gradio.Tabs():
+                views = _lay_out_views()
+        usual = gradio.State("")
+        _connect_agent(page, calls, panel, views, usual)
+        _connect_person(calls, panel, views, usual)
+    return page
+
+
+def _lay_out_panel(calls: _Calls) -> _Panel:
+    """Lay out the picture, the task and its settings."""
+    import gradio
+
+    picture = gradio.Image(
+        label="Picture", type="filepath", format="png", sources=["upload", "clipboard"], height=220,
+        buttons=["fullscreen"], elem_id="picture",
+    )  # fmt: skip
+    # Gradio would open the file with any of Pillow's decoders, of which some start programs.
+    picture.preprocess = lambda payload: payload and payload.path
+    task = gradio.Radio(
+        list(_TASKS), value="find all", label="What to do", show_label=False, container=False, elem_id="task"
+    )
+    with gradio.Row(elem_id="press"):
+        target = gradio.Dropdown(
+            [_EVERY, *calls.classes], value=_EVERY, label="Class", show_label=False, container=False,
+            filterable=True, scale=3, min_width=120,
+        )  # fmt: skip
+        go = gradio.Button("Look", variant="primary", scale=2, min_width=70)
+        end = gradio.Button("Stop", scale=1, min_width=60)
+    with gradio.Accordion("More settings, and examples", open=False):
+        example = gradio.Button("Next example", visible=bool(calls.examples))
+        passes = gradio.Slider(1, 64, value=16, step=1, label="Looks at most")
+        prior = gradio.Textbox(
+            label=_SHARE, placeholder="as in the fit, or such as 0.2", info="For a search.", interactive=False
+        )
+    return _Panel(picture, task, target, go, end, example, passes, prior)
+
+
+def _lay_out_views() -> _Views:
+    """Lay out the tab with the agent's looks, and that in which a person looks."""
+    import gradio
+
+    with gradio.Tab("Its looks"):
+        words = gradio.Markdown(_READY)
+        shown = gradio.HTML(elem_classes="page")
+    with gradio.Tab("Look yourself"):
+        about = gradio.Markdown(_WHICH_OWN)
+        own = gradio.HTML(
+            value="", marks="", html_template=TEMPLATE, css_template=STYLE, js_on_load=SCRIPT, elem_id="own"
+        )
+        again = gradio.Button("Start again")
+    return _Views(words, shown, about, own, again)
+
+
+_PRIVATE: dict[str, Any] = {"api_visibility": "private"}  # calls of the page that are no interface for programs
+
+
+def _connect_agent(page: Any, calls: _Calls, panel: _Panel, views: _Views, usual: Any) -> None:
+    """Connect the panel with the agent's looks; `usual` keeps the class of most objects in an example."""
+    import gradio
 
     def look(path: Any, target: str, task: str, passes: float, prior: str, request: gradio.Request) -> tuple[Any, str]:
         words, page_of_record = calls.look(path, target, task, passes, prior, request.session_hash)
@@ -318,6 +407,22 @@ def _make_page(agent: ActivePerception) -> Any:
             gradio.update(interactive=used.by_prior),
         )
 
+    number = gradio.State(0)
+    example = [panel.picture, panel.target, usual, number]
+    settings = [panel.picture, panel.target, panel.task, panel.passes, panel.prior]
+    page.load(calls.take, [number, panel.task], example, queue=False, **_PRIVATE)
+    panel.example.click(calls.take, [number, panel.task], example, **_PRIVATE)
+    panel.picture.input(lambda: "", [], [usual], queue=False, **_PRIVATE)
+    fields = [panel.target, panel.passes, panel.prior]
+    panel.task.change(suit, [panel.task, panel.target, usual], fields, queue=False, **_PRIVATE)
+    panel.go.click(look, settings, [views.words, views.shown], **_PRIVATE)
+    panel.end.click(stop, [], [], queue=False, **_PRIVATE)
+
+
+def _connect_person(calls: _Calls, panel: _Panel, views: _Views, usual: Any) -> None:
+    """Connect the picture with the looks of a person, which begin anew with another picture or class."""
+    import gradio
+
     def fresh(path: Any, target: str, usual: str) -> tuple[Any, ...]:
         cells, scene, marks, about = calls.fresh(path, calls.sought(target, usual))
         return cells, gradio.update(value=scene, marks=marks), about
@@ -326,59 +431,9 @@ def _make_page(agent: ActivePerception) -> Any:
         cells, marks, about = calls.click(path, calls.sought(target, usual), cells, event.index)
         return cells, gradio.update(marks=marks), about
 
-    kept = (_SECONDS_SWEPT, _SECONDS_KEPT)
-    with gradio.Blocks(title="semfov", analytics_enabled=False, delete_cache=kept, fill_width=True) as page:
-        gradio.Markdown("# semfov\nSee where it looks in a picture, and what it finds there.", elem_classes="title")
-        usual, number, cells = gradio.State(""), gradio.State(0), gradio.State([])
-        with gradio.Row():
-            with gradio.Column(scale=1, min_width=300, elem_id="panel"):
-                picture = gradio.Image(
-                    label="Picture", type="filepath", format="png", sources=["upload", "clipboard"], height=220,
-                    buttons=["fullscreen"], elem_id="picture",
-                )  # fmt: skip
-                # Gradio would open the file with any of Pillow's decoders, of which some start programs.
-                picture.preprocess = lambda payload: payload and payload.path
-                task = gradio.Radio(
-                    list(_TASKS),
-                    value="find all",
-                    label="What to do",
-                    show_label=False,
-                    container=False,
-                    elem_id="task",
-                )
-                with gradio.Row(elem_id="press"):
-                    target = gradio.Dropdown(
-                        [_EVERY, *calls.classes], value=_EVERY, label="Class", show_label=False, container=False,
-                        filterable=True, scale=3, min_width=120,
-                    )  # fmt: skip
-                    go = gradio.Button("Look", variant="primary", scale=2, min_width=70)
-                    end = gradio.Button("Stop", scale=1, min_width=60)
-                with gradio.Accordion("More settings, and examples", open=False):
-                    example = gradio.Button("Next example", visible=bool(calls.examples))
-                    passes = gradio.Slider(1, 64, value=16, step=1, label="Looks at most")
-                    prior = gradio.Textbox(
-                        label="Share of your pictures that hold the class", placeholder="as in the fit, or such as 0.2",
-                        info="For a search.", interactive=False,
-                    )  # fmt: skip
-            with gradio.Column(scale=2, min_width=300), gradio.Tabs():
-                with gradio.Tab("Its looks"):
-                    words = gradio.Markdown(_READY)
-                    shown = gradio.HTML(elem_classes="page")
-                with gradio.Tab("Look yourself"):
-                    about = gradio.Markdown(_WHICH_OWN)
-                    own = gradio.HTML(
-                        value="", marks="", html_template=TEMPLATE, css_template=STYLE, js_on_load=SCRIPT, elem_id="own"
-                    )
-                    again = gradio.Button("Start again")
-        private: dict[str, Any] = {"api_visibility": "private"}
-        taken = [picture, target, usual, number]
-        page.load(calls.take, [number, task], taken, queue=False, **private)
-        example.click(calls.take, [number, task], taken, **private)
-        picture.input(lambda: "", [], [usual], queue=False, **private)
-        task.change(suit, [task, target, usual], [target, passes, prior], queue=False, **private)
-        go.click(look, [picture, target, task, passes, prior], [words, shown], **private)
-        end.click(stop, [], [], queue=False, **private)
-        for changed in (picture.change, again.click, target.change):
-            changed(fresh, [picture, target, usual], [cells, own, about], **private)
-        own.select(click, [picture, target, usual, cells], [cells, own, about], **private)
-    return page
+    cells = gradio.State([])
+    sought = [panel.picture, panel.target, usual]
+    shown = [cells, views.own, views.about]
+    for changed in (panel.picture.change, views.again.click, panel.target.change):
+        changed(fresh, sought, shown, **_PRIVATE)
+    views.own.select(click, [*sought, cells], shown, **_PRIVATE)

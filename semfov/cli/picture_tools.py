@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from semfov.agent import ActivePerception
+from semfov.belief.prior import UnknownShareError
 from semfov.cli.options import CheckOptions
 from semfov.data.large import open_large
 from semfov.data.sources import picture_files
 from semfov.data.windowed import resized
 from semfov.detection import Objects
-from semfov.errors import DataError, InputError, check, printable
+from semfov.errors import DataError, check, printable
 from semfov.paths import Record
 from semfov.report.episode import jpeg
 
@@ -166,10 +167,8 @@ class PictureTools:
             return _answer(self.agent.search(path, target, prior=prior, **limits))
         try:
             return _answer(self.agent.search(path, target, prior=_AS_LIKELY_AS_NOT, **limits))
-        except InputError as error:
-            if not str(error).startswith("prior:"):
-                raise
-        return _answer(self.agent.search(path, target, **limits))
+        except UnknownShareError:
+            return _answer(self.agent.search(path, target, **limits))
 
     @_one_at_a_time
     def find(self, picture: str, classes: list[str], passes: int = 24) -> Answer:

@@ -8,6 +8,7 @@ import re
 import secrets
 import stat
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
@@ -302,25 +303,39 @@ def read_text(path: str | os.PathLike[str], otherwise: str | None = None, *, mos
         return content.decode(otherwise, "replace")
 
 
-def read_json(path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None) -> Any:
+def read_json(
+    path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None, unique: bool = False
+) -> Any:
     """Read a file of JSON.
 
     Args:
         path: the file.
         most: largest number of bytes; None for any.
         name: its name in messages; None for the path.
+        unique: refuse objects in which a name stands twice, of which Python keeps the last value alone.
 
     Returns:
         The value.
 
     Raises:
-        DataError: it cannot be read, is larger, or is no JSON.
+        DataError: it cannot be read, is larger, or is no JSON, or a name stands twice where it may not.
     """
     try:
-        return json.loads(read_bytes(path, most=most, name=name))
+        return json.loads(
+            read_bytes(path, most=most, name=name), object_pairs_hook=_with_unique_names if unique else None
+        )
     except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
         reason = " ".join(str(error).split())
         raise DataError(f"{name or path}: cannot be read as JSON ({reason}); correct or replace the file") from None
+
+
+def _with_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of JSON from its names and values; raises `ValueError` for a name that stands twice."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"{twice!r} stands in it twice")
+    return values
 
 
 def _encoding(content: bytes) -> str:

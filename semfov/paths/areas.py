@@ -64,7 +64,7 @@ def boxes_of(areas: AreasLike) -> Mapping[str, Sequence[float]]:
         return _parsed(areas)
     if isinstance(areas, str | PathLike):
         path = Path(areas)
-        content = read_json(path)
+        content = read_json(path, unique=True)
         check(isinstance(content, dict), f"areas ({path})", 'boxes by name, {"logo": [10, 20, 200, 80]}', content)
         return dict(content)
     check(isinstance(areas, Mapping), "areas", "a mapping of names to boxes, a text or a file .json", areas)

@@ -53,11 +53,13 @@ class Drafts:
 
     @property
     def names(self) -> tuple[str, str]:
-        """Names of the drafts; by their paths where the files have one name."""
-        names = self.first.name, self.second.name
-        if names[0] != names[1] or self.first.source is None or self.second.source is None:
-            return names
-        return self.first.source, self.second.source
+        """Names of the drafts: of their files, by their paths if these are alike, and counted if the paths are, too."""
+        name = self.first.name
+        if name != self.second.name:
+            return name, self.second.name
+        if self.first.source is not None and self.second.source not in (None, self.first.source):
+            return self.first.source, self.second.source
+        return f"{name} (first)", f"{name} (second)"
 
     @property
     def difference(self) -> Tensor | None:

@@ -85,6 +85,9 @@ def test_other_areas_are_refused(areas, said):
 def test_files_without_areas_are_told(tmp_path):
     (tmp_path / "list.json").write_text("[1, 2]")
     refused("boxes by name", read_areas, tmp_path / "list.json", SIZE)
+    (tmp_path / "twice.json").write_text('{"logo": [1, 2, 3, 4], "logo": [5, 6, 7, 8]}')
+    with pytest.raises(DataError, match=r"twice\.json: .*'logo' stands in it twice"):
+        read_areas(str(tmp_path / "twice.json"), SIZE)
     with pytest.raises(DataError, match=r"none\.json"):
         read_areas(str(tmp_path / "none.json"), SIZE)
 

@@ -52,6 +52,8 @@ def test_shares_of_areas_are_those_of_each_draft(drafts):
 def test_drafts_of_one_name_are_told_apart_by_their_folders():
     assert Drafts(draft("a/x.png", 0.4), draft("b/x.png", 0.5)).names == ("a/x.png", "b/x.png")
     assert Drafts(draft("a/x.png", 0.4), draft("b/y.png", 0.5)).names == ("x.png", "y.png")
+    for source, name in (("a/x.png", "x.png"), (None, draft(None, 0.4).name)):
+        assert Drafts(draft(source, 0.4), draft(source, 0.5)).names == (f"{name} (first)", f"{name} (second)")
 
 
 def test_drafts_of_other_proportions_have_shares_alone(drafts):
