@@ -213,6 +213,36 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
 Videos need OpenCV: pip install opencv-python-headless. --help-all lists all options.
 """,
     ),
+    "compare": Subcommand(
+        summary="compare semfov with slicing on your own pictures, over passes and seconds",
+        positional="pictures",
+        positional_help=_PICTURES,
+        options="cli.options:CompareOptions",
+        function="cli.compare:compare",
+        help=f"""\
+semfov compare: what semfov finds over seconds, beside slices of the same pictures
+
+  semfov compare flight/ --with sahi --target person
+  semfov compare flight/ --with sahi,ranked --target person --annotations instances.json
+  semfov compare BIG.jpg --with sahi --models mymodels --passes 32 --slice 640 --out compared
+
+usage: semfov compare [PICTURE ...] [--with sahi,ranked] [options]
+
+  PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a sheet)
+  --with WAYS          sahi: the whole picture and all its slices (default); ranked: the slices with the highest scores
+                       of the whole picture first
+  --target CLASSES     a class, or several with commas (default: all classes)
+  --annotations FILE   the truth, in COCO's format; without it, what all slices list stands for it
+{_AGENT}
+  --passes N           most passes of the detector for a picture (default 24)
+  --slice N            side of a slice in pixels (default: of the detector's input); --overlap S (default 0.2)
+  --out FOLDER         compare.html, compare.csv and compare.png (default: the folder semfov-compare)
+  --quiet              no bar; --device cuda; --white auto and --bands 4,3,2 as for semfov find
+
+SAHI itself is not needed: semfov cuts the slices by its rule, looks at them, and merges what they show. Seconds are
+those of this machine. --help-all: all options.
+""",
+    ),
     "demo": Subcommand(
         summary="write a page of what semfov does, in seconds and without a picture or a network",
         positional=None,
@@ -387,6 +417,7 @@ semfov: active perception with any detector, in photographs, large pictures, sce
   semfov explore street.jpg --report street.html    what is where, as a page with every look
   semfov gaze poster.jpg --report poster.html       where people look, and in what order
   semfov live --camera 0 --target cup               one look at each frame, until Ctrl-C
+  semfov compare flight/ --with sahi                what semfov finds over seconds, beside slices
   semfov fit mine.onnx --data.root PHOTOS --data.annotations instances.json
   semfov detectors                                  detectors that can be named, and their licences
 

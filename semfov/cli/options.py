@@ -276,6 +276,43 @@ class McpOptions(AgentOptions):
     folder: Path = Path()
 
 
+Rival = Literal["sahi", "ranked"]
+
+
+@dataclass(frozen=True)
+class CompareOptions(AgentOptions):
+    """What semfov finds over seconds, beside plain ways to look at slices of the same pictures.
+
+    Args:
+        pictures: photographs, large pictures, folders of them, or patterns of names (none: one that comes with semfov).
+        recursive: also take the photographs of the folders in a folder.
+        with_: beside what: `sahi`, the whole picture and all its slices, as SAHI cuts them; `ranked`, these slices in
+            the order of the scores that the whole picture has in them.
+        target: class to find, or several with commas (none: all classes).
+        annotations: annotation file in COCO's format (none: what all slices list stands for the truth).
+        passes: most passes of the detector for a picture, for semfov and `ranked`.
+        slice: side of a slice in pixels (none: that of the detector's input).
+        overlap: share of the side of a slice that the next one repeats.
+        white: values that are black and white, as for `semfov search`.
+        bands: bands of a TIFF or a raster that are shown, as for `semfov search`.
+        out: folder for the page, the table and the figure.
+    """
+
+    unused: ClassVar[tuple[str, ...]] = ("seed", "start", "sensor")
+
+    pictures: tuple[str, ...] = ()
+    recursive: bool = False
+    with_: tuple[Rival, ...] = ("sahi",)
+    target: str | None = None
+    annotations: Path | None = None
+    passes: Annotated[int, Range(1, 1000)] = 24
+    slice: Annotated[int, Range(16, 16_384)] | None = None
+    overlap: Annotated[float, Range(0, 0.9)] = 0.2
+    white: str | None = None
+    bands: str | None = None
+    out: Path = Path("semfov-compare")
+
+
 @dataclass(frozen=True)
 class DemoOptions(Settings):
     """A page of what semfov does, on the photographs that come with it.

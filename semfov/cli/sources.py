@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 from torch import Tensor
 
 from semfov.agents.picture import PictureLike
-from semfov.cli.options import GazeOptions, PictureOptions, white_of
+from semfov.cli.options import CompareOptions, GazeOptions, PictureOptions, white_of
 from semfov.data.examples import example_scene
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large, picture_size
@@ -120,7 +120,7 @@ def example_source(name: str, classes: Sequence[str] = CLASSES, target: str | No
     return PictureSource(f"{_EXAMPLE}{name}", scene=Picture(name, scene.image, boxes), place=Path(name))
 
 
-def picture_sources(options: PictureOptions | GazeOptions) -> list[PictureSource]:
+def picture_sources(options: PictureOptions | GazeOptions | CompareOptions) -> list[PictureSource]:
     """Find the pictures that are named or match a pattern (`flight/*.jpg`); those of folders in the order of names.
 
     Args:
@@ -169,7 +169,7 @@ def _check_may_be_picture(name: str, *, has_target: bool) -> None:
     check(not is_video, "picture", "photographs; `semfov live` takes videos", name)
 
 
-def _shown_by(options: PictureOptions | GazeOptions) -> dict[str, Any]:
+def _shown_by(options: PictureOptions | GazeOptions | CompareOptions) -> dict[str, Any]:
     """Take the values and the bands that are to be shown, as arguments of `semfov.data.large.open_large`."""
     shown: dict[str, Any] = {}
     white = white_of(options.white)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from html import escape
-from typing import TYPE_CHECKING
 
 from semfov.paths.areas import AreasLike, percent
 from semfov.paths.drafts import Drafts
+from semfov.report.markup import figure_html
 from semfov.viz.drafts import plot_difference
 from semfov.viz.gaze import BORDERS, plot_gaze
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def drafts_section(drafts: Drafts, areas: AreasLike | None = None) -> str:
@@ -27,12 +22,12 @@ def drafts_section(drafts: Drafts, areas: AreasLike | None = None) -> str:
         HTML.
     """
     panels = [
-        _figure(f"{name}", plot_gaze(prediction, areas=areas, title=False))
+        figure_html(name, plot_gaze(prediction, areas=areas, title=False))
         for name, prediction in zip(drafts.names, (drafts.first, drafts.second), strict=True)
     ]
     if drafts.difference is not None:
         caption = f"More fixations in {drafts.names[1]} are orange, fewer are purple"
-        panels.append(_figure(caption, plot_difference(drafts, title=False)))
+        panels.append(figure_html(caption, plot_difference(drafts, title=False)))
     return (
         f'<section aria-labelledby="drafts-title"><h2 id="drafts-title">{escape(_headline(drafts))}</h2>'
         f'{_table(drafts, areas)}<p class="hint">In both pictures, {BORDERS}. 1 to 3 are the first fixations.</p>'
@@ -45,15 +40,6 @@ def _headline(drafts: Drafts) -> str:
     if drafts.moved is None:
         return "The two drafts"
     return f"{percent(drafts.moved)} of the fixations move between the drafts"
-
-
-def _figure(caption: str, figure: Figure) -> str:
-    """Embed a figure with its caption."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=130, bbox_inches="tight", pad_inches=0.02)
-    encoded = base64.b64encode(content.getvalue()).decode()
-    source = f"data:image/png;base64,{encoded}"
-    return f'<figure><figcaption>{escape(caption)}</figcaption><img src="{source}" alt="{escape(caption)}"></figure>'
 
 
 def _table(drafts: Drafts, areas: AreasLike | None) -> str:

@@ -1,7 +1,15 @@
 """HTML of boxes, pictures and tables, which the parts of pages share."""
 
+from __future__ import annotations
+
+import base64
+import io
 from collections.abc import Mapping, Sequence
 from html import escape
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def rect(box: Sequence[float], kind: str) -> str:
@@ -51,6 +59,15 @@ def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
         f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'
         f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
     )
+
+
+def figure_html(caption: str, figure: Figure) -> str:
+    """Embed a figure of matplotlib with its caption, plain text."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=130, bbox_inches="tight", pad_inches=0.02)
+    encoded = base64.b64encode(content.getvalue()).decode()
+    source = f"data:image/png;base64,{encoded}"
+    return f'<figure><figcaption>{escape(caption)}</figcaption><img src="{source}" alt="{escape(caption)}"></figure>'
 
 
 def _row(name: str, numbers: Sequence[str]) -> str:

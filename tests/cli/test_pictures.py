@@ -47,7 +47,7 @@ def test_a_search_says_where_and_writes_what_is_asked_for(run, photo, tmp_path):
     assert found
     assert 8 <= int(found[1]) <= 28
     assert 8 <= int(found[2]) <= 28
-    assert "  0     (150, 110)" in printed.out  # the middle of the cell in column 7 and row 5 of 8 × 6
+    assert "  1     (150, 110)" in printed.out  # the middle of the cell in column 7 and row 5 of 8 × 6
     names = {"results.json", "scanpath.png", "views.png", "belief.png", "animation.gif"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
     listed = written_files(printed)

@@ -1,0 +1,144 @@
+"""Subcommand compare: what semfov finds over seconds, beside plain ways to look at slices of the same pictures."""
+
+import sys
+from collections.abc import Sequence
+
+from tqdm import tqdm
+
+from semfov.cli.agent import detector_classes, make_agent, several_classes
+from semfov.cli.options import CompareOptions
+from semfov.cli.outcome import table_lines
+from semfov.cli.rivals import ALL_SLICES, SEMFOV, Point, Scores, Way, all_slices, best_slices, by_semfov, warm_up
+from semfov.cli.sources import PictureSource, example_source, picture_sources
+from semfov.cli.truth import Truth
+from semfov.data.large import open_large
+from semfov.errors import SemfovError, check
+from semfov.io.files import check_writable, write_text
+from semfov.io.tables import csv_text
+from semfov.report.compare import comparison_page
+from semfov.report.template import write_html
+from semfov.viz.compare import plot_comparison
+from semfov.viz.style import save_figure
+from semfov.zoom.eye import WindowEye
+
+_COLUMNS = ("way", "passes", "seconds", "ap50", "listed", "right", "reference")
+_HEADINGS = ("way", "passes", "seconds", "AP50", "listed", "right", "of")
+
+
+def compare(options: CompareOptions) -> int:
+    """Look at pictures in several ways, and print and write what each finds over passes and seconds.
+
+    Args:
+        options: the options of the command.
+
+    Returns:
+        The exit code, 1 if a picture was left out.
+    """
+    check_writable(options.out, folder=True)
+    check(bool(options.with_), "with", "sahi, ranked, or both", "none")
+    has_reference = options.annotations is not None or "sahi" in options.with_
+    check(has_reference, "with", "sahi, whose objects stand for the truth where there are no annotations", "ranked")
+    truth = None if options.annotations is None else Truth(options.annotations)
+    # What is wrong with the classes and the pictures is said before the agent is loaded.
+    several_classes(options.target, detector_classes(options))
+    sources = picture_sources(options)
+    agent = make_agent(options)
+    names = agent.classes[1:]
+    targets = several_classes(options.target, names)
+    labels = tuple(names.index(name) + 1 for name in targets or ())
+    sources = sources or [example_source("sheet", names)]
+    side = min(agent.eye.detector.input_size) if options.slice is None else options.slice
+    eye = agent.zoom.eye
+    ways: dict[str, Way] = {SEMFOV: by_semfov(agent, labels, options.passes)}
+    if "sahi" in options.with_:
+        ways[ALL_SLICES] = all_slices(eye, labels, side, options.overlap)
+    if "ranked" in options.with_:
+        ways["best slices"] = best_slices(eye, labels, side, options.overlap, options.passes)
+    scores = Scores(names, labels, truth)
+    skipped = 0
+    for source in tqdm(sources, desc="pictures", leave=False, disable=options.quiet or not sys.stderr.isatty()):
+        try:
+            _look(source, eye, ways, scores, several=len(sources) > 1)
+        except SemfovError as error:
+            if len(sources) == 1:
+                raise
+            print(f"skipped {source.name}: {error}", file=sys.stderr)
+            skipped += 1
+    points = scores.points()
+    about = f"{scores.pictures} picture{'s' if scores.pictures != 1 else ''}, {', '.join(targets or ['all classes'])}"
+    sentences = [
+        *conclusion(points, is_truth=truth is not None),
+        f"All slices are the whole picture and squares of {side} px that overlap by {options.overlap:g}, cut as SAHI "
+        "cuts them; semfov looks at them and merges what they show. Seconds are those of a picture on this machine, "
+        "without reading the file.",
+    ]
+    _write(options, points, about, sentences)
+    print("\n".join([about, *table_lines([_HEADINGS, *map(_cells, points)]), *sentences]))
+    print(f"wrote {options.out}: compare.html, compare.csv, compare.png")
+    return int(skipped > 0)
+
+
+def _look(source: PictureSource, eye: WindowEye, ways: dict[str, Way], scores: Scores, *, several: bool) -> None:
+    """Look at a picture in all ways; what fails at one picture of several is raised as an error of that picture."""
+    try:
+        picture = open_large(source.picture())
+        image = scores.image_of(source.name, picture.size)
+        warm_up(eye, picture)
+        scores.add(image, picture.size, {name: way(picture) for name, way in ways.items()})
+    except Exception as error:
+        raise source.fault(error, several=several) from error
+
+
+def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
+    """Say in a sentence or two how semfov compares with all slices.
+
+    Args:
+        points: the points of all ways.
+        is_truth: whether the reference is annotated.
+
+    Returns:
+        The sentences.
+    """
+    ours = [point for point in points if point.way == SEMFOV]
+    slices = next((point for point in points if point.way == ALL_SLICES), None)
+    last = ours[-1]
+    if slices is None:
+        return [f"After {last.passes:.3g} passes semfov has {_precision(last)} in {last.seconds:.2f} s."]
+    share = last.seconds / slices.seconds
+    if not is_truth:
+        found = f"{last.right} of the {last.reference} objects that all slices list"
+        return [
+            f"After {last.passes:.3g} passes semfov lists {found}, in {share:.2f} of their time, and "
+            f"{last.listed - last.right} others.",
+            "All slices stand for the truth here, though they miss and invent objects, too: give --annotations FILE.",
+        ]
+    sentence = (
+        f"After {last.passes:.3g} passes semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "
+        f"{_precision(slices)} in {slices.seconds:.2f} s ({slices.passes:.3g} passes)."
+    )
+    level = next((point for point in ours if (point.ap50 or 0) >= (slices.ap50 or 0) > 0), None)
+    if level is None:
+        return [sentence]
+    return [sentence, f"It is level with them from {level.passes:.3g} passes and {level.seconds:.2f} s on."]
+
+
+def _precision(point: Point) -> str:
+    return "no AP50" if point.ap50 is None else f"an AP50 of {point.ap50:.3f}"
+
+
+def _cells(point: Point) -> list[str]:
+    """Write the cells of a point in the table."""
+    ap50 = "" if point.ap50 is None else f"{point.ap50:.3f}"
+    counts = [str(count) for count in (point.listed, point.right, point.reference)]
+    return [point.way, f"{point.passes:.3g}", f"{point.seconds:.3f}", ap50, *counts]
+
+
+def _write(options: CompareOptions, points: Sequence[Point], about: str, sentences: Sequence[str]) -> None:
+    """Write the table, the figure and the page into a folder."""
+    folder = options.out
+    rows = [[point.way, point.passes, point.seconds, point.ap50, *point.counts] for point in points]
+    write_text(folder / "compare.csv", csv_text([_COLUMNS, *rows]))
+    figure = plot_comparison(points)
+    save_figure(figure, folder / "compare.png")
+    table = [_HEADINGS, *map(_cells, points)]
+    write_html(folder / "compare.html", comparison_page(about, sentences, table, figure))

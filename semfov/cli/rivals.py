@@ -1,0 +1,346 @@
+"""Ways to look at pictures beside each other: by semfov, at all slices, and at the best slices first."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple
+
+import torch
+
+from semfov.agent import ActivePerception
+from semfov.cli.truth import Truth
+from semfov.data.annotations import Annotations, Entry, Id
+from semfov.data.classes import canonical_name
+from semfov.data.scene import Annotation
+from semfov.data.windowed import LargePicture
+from semfov.detection.exchange import coco_results
+from semfov.detection.objects import SCORE_THRESHOLD, Objects
+from semfov.errors import check_data
+from semfov.metrics.average_precision import average_precision
+from semfov.observation.matching import right_boxes
+from semfov.paths import Record
+from semfov.zoom.episode import look_by_look
+from semfov.zoom.eye import WindowEye
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
+from semfov.zoom.objects import merge
+from semfov.zoom.slices import ranked, slices
+
+SEMFOV = "semfov"
+ALL_SLICES = "all slices"
+
+_AFTER = (1, 2, 4, 8, 16, 24, 32, 48, 64)  # passes after which the objects found so far are compared
+
+
+class Finding(NamedTuple):
+    """What a way of looking has found in a picture.
+
+    Attributes:
+        passes: passes of the detector so far.
+        seconds: seconds so far, with choosing and merging, without reading the file.
+        objects: all objects, from low scores on, most confident first.
+        threshold: score from which on they are listed.
+    """
+
+    passes: int
+    seconds: float
+    objects: Objects
+    threshold: float
+
+
+Way = Callable[[LargePicture], list[Finding]]
+"""Looks at a picture, and returns what it has found after some numbers of passes."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """What a way of looking finds with some passes, over all pictures.
+
+    Attributes:
+        way: name of the way.
+        passes: mean number of passes for a picture.
+        seconds: mean number of seconds for a picture.
+        ap50: average precision at an overlap of 0.5 against the reference; None where that has no objects.
+        listed: number of objects that are listed.
+        right: how many of these are in the reference.
+        reference: number of objects in the reference.
+    """
+
+    way: str
+    passes: float
+    seconds: float
+    ap50: float | None
+    listed: int
+    right: int
+    reference: int
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Numbers of objects: listed, of these right, and in the reference."""
+        return self.listed, self.right, self.reference
+
+
+def by_semfov(agent: ActivePerception, labels: Sequence[int], passes: int) -> Way:
+    """Make the way of an agent, which chooses each window and may end before its last pass.
+
+    Args:
+        agent: the agent.
+        labels: classes 1..K to find; none for all.
+        passes: most passes.
+
+    Returns:
+        The way.
+    """
+
+    def way(picture: LargePicture) -> list[Finding]:
+        wanted = _wanted(passes)
+        stops: list[tuple[float, Record]] = []
+        began = time.perf_counter()
+
+        def stop_the_clock(record: Record) -> None:
+            if record.passes in wanted:
+                stops.append((time.perf_counter() - began, record))
+
+        last = agent.find_all(picture, [*labels] or None, how="windows", passes=passes, on_look=stop_the_clock)
+        if not stops or stops[-1][1].passes < last.passes:
+            stops.append((time.perf_counter() - began, last))
+        findings = []
+        for seconds, record in stops:
+            merging = time.perf_counter()
+            objects = record.candidates.of(labels)
+            seconds += time.perf_counter() - merging
+            findings.append(Finding(record.passes, seconds, objects, record.score_threshold))
+        return findings
+
+    return way
+
+
+def all_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float) -> Way:
+    """Make the way that looks at the whole picture and at all its slices, as SAHI does (Akyon et al., 2022).
+
+    Args:
+        eye: the eye, with the detector.
+        labels: classes 1..K to find; none for all.
+        side: of a slice in pixels.
+        overlap: share of its side that the next one repeats.
+
+    Returns:
+        The way.
+    """
+
+    def way(picture: LargePicture) -> list[Finding]:
+        began = time.perf_counter()
+        source = LiveWindowLooks(eye, eye.open(picture))
+        windows = [Window.overview(source.lattice), *_slices_of(source.lattice, side, overlap)]
+        looks = [source.see([window], hints=False)[0] for window in windows]
+        objects = merge(looks, labels)
+        return [Finding(len(looks), time.perf_counter() - began, objects, SCORE_THRESHOLD)]
+
+    return way
+
+
+def best_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float, passes: int) -> Way:
+    """Make the way that looks at the slices in the order of the raw scores that the whole picture has in them.
+
+    Args:
+        eye: the eye, with the detector.
+        labels: classes 1..K to find; none for all.
+        side: of a slice in pixels.
+        overlap: share of its side that the next one repeats.
+        passes: most passes.
+
+    Returns:
+        The way.
+    """
+
+    def way(picture: LargePicture) -> list[Finding]:
+        began = time.perf_counter()
+        source = LiveWindowLooks(eye, eye.open(picture))
+        order = ranked(_slices_of(source.lattice, side, overlap), labels)
+        looks: list[WindowLook] = []
+        findings = []
+        merged = 0.0  # seconds for points before, which a run to a later one does not take
+        for step in islice(look_by_look(source, order, None), passes):
+            looks.append(step.look)
+            if len(looks) in _wanted(passes):
+                seconds = time.perf_counter() - began - merged
+                merging = time.perf_counter()
+                objects = merge(looks, labels)
+                duration = time.perf_counter() - merging
+                merged += duration
+                findings.append(Finding(len(looks), seconds + duration, objects, SCORE_THRESHOLD))
+        if len(looks) not in _wanted(passes):
+            seconds = time.perf_counter() - began - merged
+            findings.append(Finding(len(looks), seconds, merge(looks, labels), SCORE_THRESHOLD))
+        return findings
+
+    return way
+
+
+def warm_up(eye: WindowEye, picture: LargePicture) -> None:
+    """Read a picture and run the detector on it once, so that the first way that is timed does not pay for that."""
+    view = eye.open(picture)
+    eye.look(view, torch.tensor([Window.overview(view.lattice).fixation]))
+
+
+def _wanted(passes: int) -> set[int]:
+    """Choose the numbers of passes after which objects are compared."""
+    return {number for number in _AFTER if number < passes} | {passes}
+
+
+def _slices_of(lattice: Lattice, side: int, overlap: float) -> list[Window]:
+    """Cut the slices of a picture; one that is as large as the picture would only repeat the look at it."""
+    if side >= max(lattice.size):
+        return []
+    return slices(lattice, side, max(1, int(side * (1 - overlap))))
+
+
+class Scores:
+    """What ways of looking find in pictures, beside a reference: annotations, or the objects that all slices list.
+
+    Args:
+        classes: names of the detector's classes.
+        labels: classes 1..K that are sought; none for all.
+        truth: the annotations; None takes what all slices list.
+
+    Attributes:
+        pictures: number of pictures so far.
+    """
+
+    def __init__(self, classes: Sequence[str], labels: Sequence[int], truth: Truth | None) -> None:
+        self.classes = classes
+        self.truth = truth
+        sought = [*labels] or [*range(1, len(classes) + 1)]
+        categories = {canonical_name(classes[label - 1]): label for label in sought}
+        if truth is None:
+            self._ids: dict[int, Id] = {label: label for label in sought}
+        else:
+            found = truth.categories([classes[label - 1] for label in sought])
+            self._ids = {categories[name]: id_ for name, id_ in found.items()}
+        self._annotations: dict[Id, Annotation] = {}
+        self._found: dict[str, dict[Id, list[Finding]]] = defaultdict(dict)
+
+    @property
+    def pictures(self) -> int:
+        """Number of pictures so far."""
+        return len(self._annotations)
+
+    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+        """Find the id of a picture in the annotations; without these they are counted.
+
+        Args:
+            name: path of the picture.
+            size: `(width, height)` in pixels.
+
+        Returns:
+            The id.
+
+        Raises:
+            DataError: the annotations lack it, or have it twice or in another size.
+        """
+        if self.truth is None:
+            return self.pictures + 1
+        image = self.truth.image_id(name, size)
+        check_data(image not in self._annotations, name, "a picture that was not named before", "it again")
+        return image
+
+    def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
+        """Add a picture.
+
+        Args:
+            image: its id.
+            size: `(width, height)` in pixels.
+            findings: what each way has found in it.
+        """
+        if self.truth is None:
+            (slices_finding,) = findings[ALL_SLICES]
+            reference = slices_finding.objects.above(slices_finding.threshold)
+            crowd = torch.zeros(len(reference), dtype=torch.bool)
+            self._annotations[image] = Annotation(reference.boxes, reference.labels, crowd, size)
+        else:
+            self._annotations[image] = self._annotated(self.truth.annotations.objects[image], size)
+        for way, of_way in findings.items():
+            self._found[way][image] = of_way
+
+    def _annotated(self, entries: Iterable[Entry], size: tuple[int, int]) -> Annotation:
+        """Make the annotation of a picture from the entries of the file, those of the classes that are sought."""
+        labels = {id_: label for label, id_ in self._ids.items()}
+        kept = [entry for entry in entries if entry["category_id"] in labels and min(entry["bbox"][2:]) > 0]
+        corners = torch.tensor([entry["bbox"] for entry in kept], dtype=torch.float32).view(-1, 4)
+        corners[:, 2:] += corners[:, :2]
+        numbers = torch.tensor([labels[entry["category_id"]] for entry in kept], dtype=torch.long)
+        crowd = torch.tensor([bool(entry["iscrowd"]) for entry in kept], dtype=torch.bool)
+        return Annotation(corners, numbers, crowd, size)
+
+    def points(self) -> list[Point]:
+        """List what each way finds after each number of passes.
+
+        Returns:
+            The points, way by way in the order of their passes.
+        """
+        points = []
+        reference = self._reference()
+        for way, found in self._found.items():
+            numbers = sorted({finding.passes for of_picture in found.values() for finding in of_picture})
+            if way == ALL_SLICES:
+                numbers = numbers[-1:]
+            else:
+                numbers = [number for number in numbers if number in _AFTER or number == numbers[-1]]
+            # A picture in which a way ended before has the objects that it had then.
+            points += [
+                self._point(way, {image: _after(number, of_picture) for image, of_picture in found.items()}, reference)
+                for number in numbers
+            ]
+        return points
+
+    def _point(self, way: str, found: Mapping[Id, Finding], reference: Annotations) -> Point:
+        """Judge what was found in all pictures."""
+        results: list[Entry] = []
+        listed = 0
+        right = 0
+        for image, finding in found.items():
+            objects = _of_classes(finding.objects, self._ids)
+            results += [
+                dict(row) for row in coco_results(image, objects.boxes, objects.labels, objects.scores, self._ids)
+            ]
+            verdicts = right_boxes(objects.above(finding.threshold), self._annotations[image])
+            listed += int((verdicts >= 0).sum())
+            right += int((verdicts > 0).sum())
+        names = [self.classes[label - 1] for label in self._ids]
+        precision = average_precision(reference, results, images=[*found], classes=names)
+        return Point(
+            way,
+            sum(finding.passes for finding in found.values()) / len(found),
+            sum(finding.seconds for finding in found.values()) / len(found),
+            None if precision is None else precision[1],
+            listed,
+            right,
+            sum(int((~annotation.crowd).sum()) for annotation in self._annotations.values()),
+        )
+
+    def _reference(self) -> Annotations:
+        """Return the annotations, or what all slices list in their form."""
+        if self.truth is not None:
+            return self.truth.annotations
+        objects: dict[Id, list[Entry]] = {}
+        for image, annotation in self._annotations.items():
+            scores = torch.ones(len(annotation.labels))
+            rows = coco_results(image, annotation.boxes, annotation.labels, scores, self._ids)
+            objects[image] = [{**row, "iscrowd": 0} for row in rows]
+        images: dict[Id, Entry] = {image: {"file_name": str(image)} for image in self._annotations}
+        categories: dict[Id, Entry] = {id_: {"name": self.classes[label - 1]} for label, id_ in self._ids.items()}
+        return Annotations(images, categories, objects, "")
+
+
+def _after(passes: int, findings: Sequence[Finding]) -> Finding:
+    """Take the last finding with at most so many passes, or the first one."""
+    before = [finding for finding in findings if finding.passes <= passes]
+    return before[-1] if before else findings[0]
+
+
+def _of_classes(objects: Objects, labels: Iterable[int]) -> Objects:
+    """Take the objects of classes that are judged."""
+    kept = [label in labels for label in objects.labels.tolist()]
+    return objects[torch.tensor(kept, dtype=torch.bool)]

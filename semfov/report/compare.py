@@ -1,0 +1,40 @@
+"""The page of a comparison: in a sentence how ways of looking compare, their figure and their table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+from semfov.report.markup import figure_html, table_html
+from semfov.report.page import page_html
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_COLUMNS = (
+    "Passes and seconds are means of a picture. AP50 counts all boxes by their scores; listed are those from the score "
+    "on from which semfov lists objects, right are those of them that the reference has, and the last column counts "
+    "the objects of the reference."
+)
+
+
+def comparison_page(about: str, sentences: Sequence[str], table: Sequence[Sequence[str]], figure: Figure) -> str:
+    """Make the page.
+
+    Args:
+        about: the pictures and the classes, in words.
+        sentences: what follows from the comparison, the result first.
+        table: rows of cells, the first one the headings.
+        figure: the figure.
+
+    Returns:
+        The HTML of the page.
+    """
+    result, *others = sentences
+    sections = (
+        f"<p>{escape(about)}</p>{figure_html(result, figure)}"
+        f"{''.join(f'<p>{escape(sentence)}</p>' for sentence in others)}"
+        f"{table_html(table, _COLUMNS)}"
+    )
+    return page_html("semfov beside slices", [], sections=sections)
