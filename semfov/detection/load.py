@@ -220,8 +220,11 @@ def _check_has_loader(name: str) -> None:
     """Raise `InputError` for files of other programs, with the call that makes one to load."""
     weights_alone = f"weights only; give 'x.cfg' with weights='{name}'"
     check(not name.endswith(".weights"), "detector", "a cfg and its weights", weights_alone)
+    exported = Path(name).with_suffix(".onnx")
+    found = f"give {str(exported)!r}, which lies beside it, or " if exported.is_file() else ""
     pickled = (
-        f"{name}; export the model to ONNX, for Ultralytics with: yolo export model={name} format=onnx; for other "
+        f"{name}; {found}export the model to ONNX, for Ultralytics with: yolo export model={name} format=onnx (pip "
+        f"install 'semfov[ultralytics]'); for other "
         f"modules with: torch.onnx.export(model, image, '{Path(name).stem}.onnx'). A state dict of a torchvision model "
         f"is read as 'torchvision:MODEL' with weights='{name}' and classes="
     )

@@ -136,7 +136,13 @@ def test_a_detector_is_returned_as_it_is_and_names_have_any_case(small_cfg, smal
 @pytest.mark.parametrize("load", [load_detector, check_detector])
 @pytest.mark.parametrize("name", ["mine.pt", "folder/mine.pth"])
 def test_pickles_are_refused_with_the_command_that_exports_them(load, name):
-    refused(rf"yolo export model={name} format=onnx;.*weights='{name}'", load, name)
+    refused(rf"yolo export model={name} format=onnx .*;.*weights='{name}'", load, name)
+
+
+@pytest.mark.parametrize("load", [load_detector, check_detector])
+def test_the_onnx_file_beside_a_pickle_is_named(load, tmp_path):
+    (tmp_path / "mine.onnx").touch()
+    refused(rf"give '{tmp_path}/mine.onnx', which lies beside it, or export", load, str(tmp_path / "mine.pt"))
 
 
 class Cells(nn.Module):
