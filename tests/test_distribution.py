@@ -110,7 +110,7 @@ from semfov.cli.main import main
 
 assert semfov.__file__.startswith(sys.argv[1]), semfov.__file__
 for words in (["search", "--target", "boat"], ["find", "--target", "person", "--passes", "4"], ["gaze"],
-              ["search", "example:market", "--target", "truck", "--out", "seen"], ["demo"]):
+              ["search", "example:market", "--target", "truck", "--out", "seen"]):
     assert main(words) == 0, words
 sys.modules["gradio"] = ModuleType("gradio")  # the page's calls need it only for their errors
 calls = _Calls(semfov.ActivePerception.recommended())
@@ -134,7 +134,6 @@ def test_the_wheel_alone_looks_at_its_photographs_without_a_network_and_with_an_
     assert "looking at example:sheet" in printed
     assert "found truck" in printed
     assert (tmp_path / "seen").is_dir()
-    assert (tmp_path / "semfov-demo.html").is_file()
     assert not (tmp_path / "cache").exists()
 
 

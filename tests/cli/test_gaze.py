@@ -27,6 +27,7 @@ def run(monkeypatch, tmp_path, capsys):
     model.save(tmp_path / "models/colours.safetensors")
     monkeypatch.setattr("semfov.cli.gaze.check_detector", lambda name: None)
     monkeypatch.setattr("semfov.cli.gaze.load_detector", lambda name, **options: detector)
+    monkeypatch.setattr("semfov.paths.gaze._VIEWERS", 5)  # what they agree on is tested with the prediction
 
     def call(*words):
         code = main(["gaze", *map(str, words)])

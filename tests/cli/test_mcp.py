@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import shutil
 import sys
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -36,13 +37,20 @@ def agent() -> ActivePerception:
     return ActivePerception.recommended()
 
 
-@pytest.fixture
-def tools(tmp_path: Path, agent: ActivePerception) -> PictureTools:
-    """Tools over a folder with a sheet of photographs and a beach; beside it lies a picture that is not its own."""
-    folder = tmp_path / "pictures"
-    (folder / "sub").mkdir(parents=True)
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a sheet of photographs and, in a folder of it, a beach."""
+    folder = tmp_path_factory.mktemp("mcp")
+    (folder / "sub").mkdir()
     save(example("sheet"), folder / "sheet.png")
     save(example("beach"), folder / "sub" / "beach.png")
+    return folder
+
+
+@pytest.fixture
+def tools(tmp_path: Path, pictures: Path, agent: ActivePerception) -> PictureTools:
+    """Tools over a copy of the folder; beside it lies a picture that is not its own."""
+    folder = shutil.copytree(pictures, tmp_path / "pictures")
     save(torch.zeros(3, 32, 48), tmp_path / "secret.png")
     (folder / "link.png").symlink_to(tmp_path / "secret.png")
     (folder / "ring.png").symlink_to(folder / "ring.png")
