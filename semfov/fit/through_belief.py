@@ -199,7 +199,8 @@ def fit_through_belief(
     check(min(looks, steps, batch) > 0 and rate > 0, "looks, steps, batch, rate", "positive numbers", (looks, steps))
     if not searches:
         raise DataError("data: expected a photograph with a class to search for, got none; raise max_target_area")
-    trained = starting_model(model).eval()
+    # Models are usually loaded frozen, and a frozen table would keep the value that the fit starts from.
+    trained = starting_model(model).eval().requires_grad_(True)
     trained.log_alpha.requires_grad_(False)  # stays as it was fitted to single detections
     for name in _CURVED:
         parametrize.register_parametrization(trained, name, _Curve(getattr(trained, name)))

@@ -259,6 +259,20 @@ def test_the_fit_through_the_belief_changes_tables_by_parabolas():
     }
 
 
+def test_a_frozen_model_is_fitted_as_one_that_is_not():
+    generator = torch.Generator().manual_seed(5)
+    searches = [draw_search(generator) for _ in range(4)]
+    fitted = [
+        fit_through_belief(start, searches, looks=3, steps=3, batch=2).state_dict()
+        for start in (
+            FovealObservationModel.identity(CLASSES, EDGES),
+            FovealObservationModel.identity(CLASSES, EDGES).requires_grad_(False),
+        )
+    ]
+    assert all(torch.equal(table, fitted[1][name]) for name, table in fitted[0].items())
+    assert float((fitted[1]["log_exponents"] - math.log(0.75)).abs().max()) > 0.01
+
+
 def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_from():
     generator = torch.Generator().manual_seed(12)
     searches = [draw_search(generator) for _ in range(40)]
