@@ -69,7 +69,7 @@ def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, z
     assert [each["data-look"] for each in looks] == ["0", "1", "2"]
     assert not [each for each in looks if "hidden" in each]
     told = " ".join(elements.texts)
-    for number, value in enumerate(["none: the first look", "0.5", "0.25"]):
+    for number, value in enumerate(["none: the first look", "0.5", "0.25"], 1):
         assert re.search(rf"Look {number}\b.*?Value when it was chosen {re.escape(value)} ", told, re.S)
     # Boxes of the table are in picture pixels.
     assert "30,24–61,52" in elements.texts
@@ -106,7 +106,7 @@ def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_pic
     looks = zoom_data(zoom_path, large_picture, name="field")["looks"]
     assert [look["brought"] for look in looks] == ["", f"1 {hostile}", f"1 {hostile}"]
     assert looks[0]["status"] == "Look 1 of 3, at the whole picture."
-    assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
+    assert looks[1]["status"].startswith("Look 2 of 3 at (100, 100), magnification 0.5. Its value was 0.5.")
 
 
 def test_a_look_that_brought_nothing_has_no_line_of_what_it_brought(zoom_path, large_picture):
