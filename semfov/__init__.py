@@ -28,4 +28,4 @@ def __getattr__(name: str) -> object:
     try:
         return _named(name)
     except AttributeError:
-        raise missing("semfov", name, PACKAGE) from None
+        raise missing("semfov", name, PACKAGE, __all__) from None

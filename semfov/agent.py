@@ -245,7 +245,10 @@ class ActivePerception(nn.Module):
         """Find a part of the module; other libraries' words for what an agent does are refused with its own."""
         if name in AGENT:
             raise missing("an agent", name, AGENT)
-        return super().__getattr__(name)
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            raise missing("an agent", name, AGENT, dir(type(self))) from None
 
     def __call__(self, *arguments: object, **options: object) -> Any:
         if type(self).forward is nn.Module.forward:

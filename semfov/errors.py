@@ -14,7 +14,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from semfov.words import FORMER, meant_options, note_of_former, other_method
+from semfov.words import FORMER, MAKERS, meant_options, note_of_former, other_method
 
 __all__ = ["DataError", "InputError", "SemfovError"]
 
@@ -223,7 +223,7 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
     names = list(dict.fromkeys(known))
     for name in options:
         if name not in names:
-            hint = other_method(what, name) or _nearest_options(name, names)
+            hint = other_method(what, name, names) or _nearest_options(name, names)
             raise InputError(f"{name}: expected an option of {what}, got an unknown one; {hint}")
 
 
@@ -272,7 +272,8 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
         try:
             form.bind(*arguments, **options)
         except TypeError as error:
-            raise InputError(f"{name}: {error}; expected {', '.join(words)}") from None
+            maker = f"; {MAKERS[name]} makes one" if name in MAKERS else ""
+            raise InputError(f"{name}: {error}; expected {', '.join(words)}{maker}") from None
         return function(*arguments, **options)
 
     return call

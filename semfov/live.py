@@ -10,11 +10,12 @@ from semfov.errors import check
 from semfov.motion import Motion
 from semfov.paths import Moment
 from semfov.settings import How, StreamSettings
+from semfov.words import LIVE, OtherWords
 
 __all__ = ["LivePerception"]
 
 
-class LivePerception:
+class LivePerception(OtherWords):
     """Looks at the frames of a stream with one pass of the detector each, by a fovea or at windows.
 
     With `how="auto"` windows are looked at. A fovea looks at frames that are less than four times as long as the
@@ -44,6 +45,8 @@ class LivePerception:
             moment = live.step(frame)
             print(moment.describe())
     """
+
+    _other_words = LIVE
 
     def __init__(
         self,

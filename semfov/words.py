@@ -4,7 +4,8 @@ Each table has our words, and beside them those of others, separated by blanks.
 """
 
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, ClassVar
 
 
@@ -15,23 +16,27 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
 
 OPTIONS = _by_word(
     {
-        "score_threshold confirm": "conf conf_thres confidence min_score score threshold",
+        "score_threshold confirm threshold": "conf conf_thres confidence min_score score threshold",
+        "iou": "iou_thres iou_threshold nms nms_threshold",
+        "limit": "max_det max_detections topk",
+        "input_size": "image_size img_size imgsz",
         "min_gain": "expected_gain gain min_improvement tol tolerance",
         "stop_below": "stop stop_threshold stopping_threshold",
         "target": "class class_name classes cls label labels name query targets",
         "picture": "file image img path photo source",
         "grid": "cells columns rows",
-        "detector": "model yolo",
+        "detector name": "model yolo",
         "model": "models",
         "device": "gpu cuda",
         "half": "fp16 float16",
-        "out": "csv figure format json output pdf plot png project save show svg",
+        "out": "csv figure format heatmap json output pdf plot png project save show svg",
         "report": "html page",
         "crops": "crop save_crop save_crops",
         "labels": "label_dir save_txt txt yolo_labels",
-        "passes": "budget iterations looks max_passes max_steps n steps",
+        "passes": "budget iterations looks max_passes max_steps n_looks steps",
+        "people": "n n_scanpaths num_observers observers subjects viewers",
         "shifts passes": "fixations max_fixations max_shifts n_fixations saccades",
-        "seconds": "max_seconds time time_limit timeout",
+        "seconds": "duration max_seconds time time_budget time_limit timeout",
         "workers": "jobs num_workers processes threads",
         "on_look": "callback on_step",
         "looks quiet": "verbose",
@@ -53,10 +58,48 @@ def note_of_former(former: str, present: str) -> str:
     return f"{former} is called {present} now; the earlier name will go"
 
 
+COMMANDS = _by_word(
+    {
+        "find": "annotate count detect infer label predict segment",
+        "gaze": "attention eye-tracking heatmap saliency scanpath",
+        "live": "camera stream track video watch webcam",
+        "fit": "calibrate finetune learn train",
+        "compare": "bench benchmark sahi slice val validate",
+        "detectors": "list model models weights",
+        "explore": "map scan",
+        "app": "gradio gui serve ui web",
+        "demo": "example examples start try",
+        "mcp": "agent server tools",
+    }
+)
+"""Commands of ours by words of others."""
+
+_LOOKING = ("search", "find_all", "explore")
+
 _OTHER_METHODS = {
     ("explore", "target"): "find_all(picture, target) lists what is there of a class, search(picture, target) decides",
 }
 """What to call in place of a method of an agent, by its name and the option that it has not."""
+
+_OF_DETECTORS = ("iou", "limit", "input_size", "device", "weights", "per_class", "classes", "half")
+"""Options that an agent is made with, and not a look."""
+
+_OTHER_PLACES = _by_word(
+    {
+        "semfov chooses the windows, so none are cut; `semfov compare` sets all slices beside it": (
+            "auto_slice_resolution overlap overlap_height_ratio overlap_ratio overlap_width_ratio "
+            "perform_standard_pred slice slice_height slice_size slice_width slice_wh tile tile_size"
+        ),
+        "the record has what is to be written and shown: record.report(path), record.plot(), record.to_csv(path)": (
+            "csv export format html json out output plot project report save save_crop save_txt show visualize"
+        ),
+        "agent.live(target).step(frame) takes the frames of a stream": "stream video vid_stride",
+        "leave it out, as nothing is printed; on_look= is called after each look": "progress quiet verbose",
+        "a whole list is looked at by semfov.run(pictures, target, workers=)": "batch_size jobs num_workers workers",
+        "color='bgr' says that an array is BGR": "bgr channels",
+    }
+)
+"""What to do in place of an option of a look that others have."""
 
 
 def meant_options(word: str, known: Collection[str]) -> list[str]:
@@ -72,10 +115,31 @@ def meant_options(word: str, known: Collection[str]) -> list[str]:
     return [option for option in OPTIONS.get(word, "").split() if option in known]
 
 
-def other_method(method: str, option: str) -> str | None:
-    """Name the method of an agent that has an option which this one has not; None if there is none."""
-    return _OTHER_METHODS.get((method, option))
+def other_method(method: str, option: str, known: Collection[str]) -> str | None:
+    """Say what has an option which a method of an agent has not: another method, the agent, or its record.
 
+    Args:
+        method: name of the method.
+        option: the option.
+        known: names of the options of the method.
+
+    Returns:
+        The advice; None if there is none.
+    """
+    if (method, option) in _OTHER_METHODS:
+        return _OTHER_METHODS[method, option]
+    if method not in _LOOKING or meant_options(option, known):
+        return None
+    if option in _OTHER_PLACES:
+        return _OTHER_PLACES[option]
+    of_detector = next((name for name in (option, *OPTIONS.get(option, "").split()) if name in _OF_DETECTORS), None)
+    if of_detector is None:
+        return None
+    return f"an agent is made with it: semfov.ActivePerception.recommended({of_detector}=…)"
+
+
+MAKERS = {"ActivePerception": "ActivePerception.recommended()"}
+"""Calls that make what a class makes of parts, by its name."""
 
 PACKAGE = _by_word(
     {
@@ -84,14 +148,27 @@ PACKAGE = _by_word(
         ),
         "record.plot(), or semfov.viz": "plot show",
         "semfov.read_image": "imread open",
+        "semfov.load_detector(name or file), or semfov.ActivePerception.recommended(name)": (
+            "AutoDetectionModel AutoModel Detector YOLO from_pretrained get_model pipeline"
+        ),
+        "semfov.ActivePerception.recommended().find_all(picture, target), which chooses its windows": (
+            "InferenceSlicer count get_prediction get_sliced_prediction slice_image"
+        ),
+        "semfov.ActivePerception.recommended().gaze(picture)": "DeepGaze DeepGazeIIE gaze heatmap saliency_map",
+        "`semfov detectors` in a shell": "detectors list_detectors list_models models",
     }
 )
 
 AGENT = _by_word(
     {
         "search, find_all, explore, gaze and live, or semfov.run for many pictures": (
-            "detect find find_objects locate predict run track"
+            "detect find find_objects infer locate predict run track"
         ),
+        "len(agent.find_all(picture, target).objects), and record.expected with what was not seen": "count count_all",
+        "agent.gaze(picture)": "heatmap predict_gaze predict_saliency saliency saliency_map",
+        "agent.live(target), whose step takes frames": "stream update video watch webcam",
+        "agent.classes[1:]": "class_names names",
+        "agent.eye.detector": "detector model",
     }
 )
 
@@ -104,8 +181,18 @@ DECISION = _by_word(
     }
 )
 
+LIVE = _by_word(
+    {
+        "live.step(frame)": "detect forward predict process push read run track update",
+        "the moment that live.step(frame) returns": "boxes decision objects tracks",
+    }
+)
+
 OBJECTS = _by_word(
     {
+        "semfov.detection.objects, whose boxes are corners: boxes[:, 2:] - boxes[:, :2] are their sizes": "area xywh",
+        "objects.above(score), or objects.of(class)": "filter select where",
+        "leave it out: an object has one box": "nms with_nms with_nmm",
         "record.to_csv(path, 'objects')": "save to_csv write",
         "record.to_frame('objects')": "dataframe df to_dataframe to_df to_frame to_pandas",
         "record.object_rows()": "to_dict to_json tolist",
@@ -128,8 +215,23 @@ RECORD = _by_word(
         "record.to_frame()": "dataframe df to_dataframe to_df to_pandas",
         "record.plot()": "draw show visualize",
         "record.classes": "names",
-        "record.objects, or the detections of a look, record[0].detections": "detections results",
+        "record.objects, or the detections of a look, record[0].detections": (
+            "detections object_prediction_list predictions results"
+        ),
         "record.report(path)": "to_html save_html",
+        "record.decision.box": "bbox",
+        "record.found, or record.decision.outcome": "is_present present success",
+        "record.objects.labels": "class_id cls label",
+        "record.to_coco()": "to_coco_annotations to_coco_predictions",
+        "record.to_yolo(path)": "save_labels save_txt",
+        "record.plot().savefig(path)": "export_visuals save_plot savefig",
+        "record.object_rows()": "objects_table to_json_list tolist",
+        "record.save(path), record.to_csv(path), record.to_json(path) or record.report(path)": "export write",
+        "semfov.run(picture, target, crops=FOLDER)": "crop save_crop save_crops",
+        "record.rows(), which has the seconds of each look": "speed times timing",
+        "record.objects.track_ids, of a stream": "id ids track_id tracker_id",
+        "[look.fixation for look in record]": "fixations gaze path saccades scanpath",
+        "record.belief_map(number), of looks by a fovea or a head": "belief heatmap map posterior probabilities",
     }
 )
 
@@ -137,25 +239,36 @@ GAZE_PREDICTION = _by_word(
     {
         "gaze.plot()": "draw show visualize",
         "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)": "save to_png",
-        "gaze.density": "heatmap map saliency",
-        "gaze.scanpaths(people)": "fixations sample scanpath",
+        "gaze.density": "heatmap map probability saliency saliency_map",
+        "gaze.density.log()": "log_density log_probability logits",
+        "gaze.scanpaths(people)": "fixations sample sample_scanpaths scanpath",
+        "semfov.metrics.scanpath, which has nss, auc and correlation of a density": "auc cc evaluate nss score",
     }
 )
 
 
-def missing(owner: str, name: str, words: Mapping[str, str]) -> AttributeError:
+def missing(owner: str, name: str, words: Mapping[str, str], known: Iterable[str] = ()) -> AttributeError:
     """Make the error of an attribute that is not there, with ours where others have another word for it.
 
     Args:
         owner: what has no such attribute.
         name: the attribute.
         words: our words by those of others, such as `RECORD`.
+        known: the attributes that there are, of which near ones are suggested.
 
     Returns:
         The error, to raise.
     """
-    remedy = f"; use {words[name]}" if name in words else ""
+    remedy = f"; use {words[name]}" if name in words else _near(name, known)
     return AttributeError(f"{owner} has no attribute {name!r}{remedy}")
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    """Suggest the public names that are near to one; empty if there are none, or it is a private one."""
+    if name.startswith("_"):  # which programs ask for, and not people
+        return ""
+    similar = get_close_matches(name, [word for word in known if not word.startswith("_")], n=2, cutoff=0.7)
+    return f"; did you mean {' or '.join(similar)}?" if similar else ""
 
 
 class OtherWords:
@@ -172,4 +285,4 @@ class OtherWords:
             if present is not None and hasattr(self, present):
                 warnings.warn(note_of_former(name, present), FutureWarning, stacklevel=2)
                 return getattr(self, present)
-            raise missing(type(self).__name__, name, self._other_words)
+            raise missing(type(self).__name__, name, self._other_words, dir(type(self)))

@@ -16,7 +16,7 @@ from typing import Any
 
 from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
-from semfov.words import FORMER, OPTIONS, meant_options, note_of_former
+from semfov.words import COMMANDS, FORMER, OPTIONS, meant_options, note_of_former
 
 _LOOKING = tuple(name for name, command in SUBCOMMANDS.items() if command.looking)
 """Subcommands that look at pictures or frames."""
@@ -132,11 +132,11 @@ def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
 
 def _unknown(name: str) -> str:
     """Say what to type instead of a name that is no subcommand."""
-    if Path(name).exists():
+    if Path(name).exists() and name not in COMMANDS:
         return f"expected a command before {name!r}; try `semfov search {name} --target CLASS`"
     if name.startswith("-"):
         return f"expected a command before {name}: {', '.join(SUBCOMMANDS)}"
-    matches = get_close_matches(name, SUBCOMMANDS, n=1)
+    matches = [COMMANDS[name]] if name in COMMANDS else get_close_matches(name, SUBCOMMANDS, n=1)
     hint = f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(SUBCOMMANDS)}"
     return f"unknown command {name!r}; {hint}"
 
@@ -236,4 +236,5 @@ def _in_command_words(message: str, options: Iterable[str]) -> str:
         value = (match[2] or "").strip("'\"").removeprefix("True")
         return f"--{by_name[match[1]].replace('_', '-')}{' ' if value else ''}{value}"
 
-    return re.sub(rf"(?<![\w.-])({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)
+    # Settings of other programs stay as they are.
+    return re.sub(rf"(?<![\w.-])(?<!yolo export )({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)

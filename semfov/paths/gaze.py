@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations
 from semfov.detection import Detections, Detector, FeatureMaps
-from semfov.errors import InputError, check, check_number, check_whole
+from semfov.errors import InputError, check, check_number, check_whole, checked_keywords
 from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density
 from semfov.gaze.saliency.glimpses import features_so_far
@@ -259,6 +259,7 @@ class GazePrediction(OtherWords):
         """
         return {name: share_in(self.density, area) for name, area in read_areas(areas, self.size).items()}
 
+    @checked_keywords
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.
 

@@ -134,7 +134,7 @@ def mistake(message: str, config: type[CheckedSettings], options: Iterable[str],
     value = got[1].strip()
     matches = get_close_matches(value, _words_of(hint), n=1, cutoff=0.5)
     suggestion = f"; did you mean {matches[0]!r}?" if matches else ""
-    return f"{setting[1]}: expected {expected}, got {value!r}{suggestion}"
+    return f"{setting[1].rstrip('_')}: expected {expected}, got {value!r}{suggestion}"
 
 
 def _unknown_argument(text: str, options: Iterable[str], help_option: str) -> str:

@@ -156,6 +156,7 @@ def test_the_seed_repeats_scanpaths_whose_next_fixation_has_the_mean_of_the_dens
     torch.testing.assert_close(mean, each.mean(0))
     assert float(mean.sum()) == pytest.approx(1, abs=1e-5)
     torch.testing.assert_close(gaze.given(paths, 90), gaze.cells)
+    refused("n: expected an option of scanpaths, .* did you mean people=", gaze.scanpaths, n=4)
     again = gaze.scanpaths(4, seed=1), gaze.scanpaths(4, seed=1)
     assert all(np.array_equal(a.points, b.points) for a, b in zip(*again, strict=True))
     other = gaze.scanpaths(4, seed=2)

@@ -10,13 +10,27 @@ import torch
 from PIL import Image
 
 import semfov
-from semfov import ActivePerception, MapEvidence, TargetEvidence, WindowEye, ZoomAgent, as_image, foveate, read_image
+from semfov import (
+    ActivePerception,
+    MapEvidence,
+    TargetEvidence,
+    WindowEye,
+    ZoomAgent,
+    as_image,
+    foveate,
+    read_image,
+    words,
+)
 from semfov.data.classes import _SYNONYMS, class_index
 from semfov.data.large import open_large
+from semfov.decision import Decision
+from semfov.detection import Objects
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.load import check_detector
 from semfov.errors import SemfovError
 from semfov.gaze.saliency import VOCUS2, IttiKoch
+from semfov.live import LivePerception
+from semfov.paths import GazePrediction, Scanpath, WindowMoment
 from semfov.zoom import GlimpseEvidence
 from tests import small
 
@@ -296,6 +310,10 @@ def test_invalid_gazes_and_arguments_of_a_search_are_refused_by_name(agent):
         ("explore", "max_steps", "did you mean passes="),
         ("live", "colour", "did you mean color="),
         ("gaze", "degrees", "known: picture, model, "),
+        ("find_all", "slice_height", "semfov chooses the windows"),
+        ("find_all", "imgsz", r"an agent is made with it: semfov.ActivePerception.recommended\(input_size="),
+        ("search", "device", "an agent is made with it"),
+        ("explore", "save", r"the record has what is to be written and shown: record.report\(path\)"),
     ],
 )
 def test_unknown_keywords_are_refused_with_the_near_ones(method, name, remedy, agent):
@@ -336,7 +354,8 @@ def test_earlier_names_of_settings_are_taken_with_a_note(method, former, present
             "search: too many positional arguments; expected picture, target, ",
         ),
         (lambda agent: agent.search(PIXELS, "cup", target="cup"), "search: multiple values for argument 'target'"),
-        (lambda agent: type(agent)("yolox-nano"), "ActivePerception: missing a required argument: 'search'; "),
+        (lambda agent: type(agent)("yolox-nano"), "ActivePerception: missing a .*'search'; .*recommended.. makes one"),
+        (lambda agent: agent.eye.detector(PIXELS), r"images: .*got a \w+; give semfov.as_image"),
         (lambda agent: agent(PIXELS), "an agent is not called itself: it has search, find_all, explore"),
         (lambda agent: agent.track, "an agent has no attribute 'track'; use search, find_all, explore, gaze and live"),
         (
@@ -363,6 +382,10 @@ def test_earlier_names_of_settings_are_taken_with_a_note(method, former, present
         (lambda agent: agent.explore(PIXELS, shifts=1).nothing, "Scanpath has no attribute 'nothing'$"),
         (lambda agent: semfov.search, "semfov has no attribute 'search'; use agent = semfov.ActivePerception"),
         (lambda agent: semfov.nothing, "semfov has no attribute 'nothing'$"),
+        (lambda agent: semfov.foveat, r"semfov has no attribute 'foveat'; did you mean foveate\?"),
+        (lambda agent: agent.find_al, r"an agent has no attribute 'find_al'; did you mean find_all\?"),
+        (lambda agent: agent.count, "an agent has no attribute 'count'; use len"),
+        (lambda agent: agent.live("cup").update, r"LivePerception has no attribute 'update'; use live.step\(frame\)"),
         (lambda agent: agent.explore(PIXELS, shifts=1).score, "Scanpath has .*; use record.decision.probability$"),
         (lambda agent: agent.explore(PIXELS, shifts=1).outcome, "Scanpath has .*; use record.decision.outcome$"),
         (lambda agent: agent.explore(PIXELS, shifts=1).plot("x.png"), "ax: .* 'x.png'; .* semfov.viz.save_figure"),
@@ -467,3 +490,30 @@ def test_saliency_takes_pictures_of_any_type(tmp_path, model):
 def test_cells_that_an_episode_cannot_look_at_are_refused(cells, agent):
     with pytest.raises(SemfovError, match=r"^cells: expected "):
         semfov.agents.fovea_episode.GazePlan(agent.fovea, cells=cells)
+
+
+NAMED = {
+    "agent": ActivePerception,
+    "decision": Decision,
+    "gaze": GazePrediction,
+    "live": LivePerception,
+    "moment": WindowMoment,
+    "objects": Objects,
+    "record": Scanpath,
+}
+
+
+@pytest.mark.parametrize("table", ["AGENT", "DECISION", "GAZE_PREDICTION", "LIVE", "OBJECTS", "PACKAGE", "RECORD"])
+def test_what_a_hint_names_is_there(table, agent):
+    """Every attribute in the words for others' words is one of the class."""
+    text = "\n".join({*getattr(words, table).values(), *words.MAKERS.values()})
+    names = re.findall(rf"\b({'|'.join(NAMED)})\.(\w+)", text)
+    assert names
+    absent = [
+        f"{owner}.{name}"
+        for owner, name in names
+        if not hasattr(agent if owner == "agent" else NAMED[owner], name)
+        and name not in getattr(NAMED[owner], "__dataclass_fields__", ())
+    ]
+    assert absent == []
+    assert [name for name in re.findall(r"semfov\.(\w+)", text) if not hasattr(semfov, name)] == []
