@@ -237,7 +237,7 @@ def test_looks_are_given_one_by_one():
     first, second = path
     assert first.fixation == tuple(path.fixations[0].tolist())
     assert first.region == (0, 0, 80, 60)
-    assert (first.number, first.seconds, second.seconds, first.value) == (0, 1.5, 1.75, None)
+    assert (first.number, first.seconds, second.seconds, first.value) == (1, 1.5, 1.75, None)
     assert second.value == float(path.values[0, 11])
     assert torch.equal(first.detections.boxes, path.detections[0].boxes)
 

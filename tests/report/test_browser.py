@@ -87,7 +87,7 @@ def test_the_slider_is_moved_by_arrow_keys(opened):
     before, drawn = pictures(opened), drawings(opened)
     opened.locator("#fixation").focus()
     opened.keyboard.press("ArrowRight")
-    assert opened.locator("#number").inner_text() == "1 of 2"
+    assert opened.locator("#number").inner_text() == "2 of 3"
     after = pictures(opened)
     assert all(after[name] != before[name] for name in before)
     opened.keyboard.press("ArrowLeft")
@@ -98,11 +98,11 @@ def test_arrow_keys_work_without_focus_on_the_slider(opened):
     opened.keyboard.press("ArrowRight")
     opened.keyboard.press("ArrowRight")
     opened.keyboard.press("ArrowRight")
-    assert opened.locator("#number").inner_text() == "2 of 2"
+    assert opened.locator("#number").inner_text() == "3 of 3"
     assert opened.locator("#forward").is_disabled()
     assert "The end" in opened.locator("#status").inner_text()
     opened.keyboard.press("Home")
-    assert opened.locator("#number").inner_text() == "0 of 2"
+    assert opened.locator("#number").inner_text() == "1 of 3"
 
 
 def test_selecting_another_class_changes_only_the_map(opened, scanpath):
@@ -175,9 +175,9 @@ def test_the_page_in_a_frame_is_isolated_from_the_notebook(chromium, scanpath, t
     file.write_text(f"<!DOCTYPE html>{style}{scanpath._repr_html_()}", "utf-8")
     with watched(chromium, file) as page:
         inside = page.frame_locator("iframe")
-        assert inside.locator("#number").inner_text() == "0 of 2"
+        assert inside.locator("#number").inner_text() == "1 of 3"
         inside.locator("#forward").click()
-        assert inside.locator("#number").inner_text() == "1 of 2"
+        assert inside.locator("#number").inner_text() == "2 of 3"
         assert inside.locator("h1").evaluate("each => getComputedStyle(each).color") != "rgb(255, 0, 0)"
         assert (
             inside.locator("h1").evaluate("() => { try { return parent.document.title } catch { return 'refused' } }")
@@ -240,13 +240,13 @@ def test_names_that_are_not_escaped_run(chromium, hostile, tmp_path):
 def test_selecting_another_episode_starts_at_its_first_fixation(opened):
     opened.keyboard.press("End")
     opened.locator("#episode").select_option(index=1)
-    assert opened.locator("#number").inner_text() == "0 of 2"
+    assert opened.locator("#number").inner_text() == "1 of 3"
 
 
 def test_the_play_button_runs_to_the_last_fixation(opened):
     opened.locator("#play").click()
     playwright.expect(opened.locator("#play")).to_have_text("Pause")
-    playwright.expect(opened.locator("#number")).to_have_text("2 of 2")
+    playwright.expect(opened.locator("#number")).to_have_text("3 of 3")
     playwright.expect(opened.locator("#play")).to_have_text("Play")
 
 
@@ -257,19 +257,19 @@ def test_keys_and_clicks_choose_a_look(chromium, zoom_page, hostile):
         assert shown.locator("h4").all_inner_texts() == ["Look 1: the whole picture"]
         assert page.get_by_role("button", name="Next look").count() == 1
         page.keyboard.press("ArrowRight")
-        assert shown.locator("h4").all_inner_texts() == ["Look 1"]
-        assert page.locator("#number").inner_text() == "1 of 2"
-        assert page.locator("#status").inner_text().startswith("Look 1 of 2 at (100, 100)")
+        assert shown.locator("h4").all_inner_texts() == ["Look 2"]
+        assert page.locator("#number").inner_text() == "2 of 3"
+        assert page.locator("#status").inner_text().startswith("Look 2 of 3 at (100, 100)")
         chosen = page.locator(".chosen rect").first
         assert [chosen.get_attribute(name) for name in ("x", "y", "width", "height")] == ["0", "0", "200", "200"]
         assert page.locator(".window.now").get_attribute("data-look") == "1"
         assert page.locator(".window.later").get_attribute("data-look") == "2"
         page.locator(".window[data-look='2'] text").click()
-        assert shown.locator("h4").all_inner_texts() == ["Look 2"]
+        assert shown.locator("h4").all_inner_texts() == ["Look 3"]
         assert page.locator(".object.now").get_attribute("data-look") == "2"
         page.locator("#fixation").focus()
         page.keyboard.press("Home")
-        assert page.locator("#number").inner_text() == "0 of 2"
+        assert page.locator("#number").inner_text() == "1 of 3"
         assert hostile in page.locator("#about").inner_text()
 
 
@@ -281,7 +281,7 @@ def test_the_page_opens_with_all_objects_whose_rows_are_chosen_and_sorted(chromi
         assert len(set(first)) > 50  # it shows something
         rows.nth(1).click()
         assert page.locator(".object.picked").get_attribute("data-look") == "2"
-        assert page.locator("#number").inner_text() == "2 of 2"
+        assert page.locator("#number").inner_text() == "3 of 3"
         heads = page.locator(".objects th[scope=col]")
         heads.filter(has_text="score").get_by_role("button").click()
         scores = page.locator(".objects tbody tr td:nth-child(4)")
@@ -310,12 +310,12 @@ def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, ima
             assert page.locator("#about dd").nth(2).is_visible() == bool(visible)
             assert page.locator(".of-episode").is_visible() == (not visible)
             page.locator("#forward").click()
-            assert page.locator("#number").inner_text() == "1 of 2"
+            assert page.locator("#number").inner_text() == "2 of 3"
             if not visible:  # an object of fixations is shown by a part of the picture, and goes to its fixation
                 row = page.locator("tr[data-object]:visible").first
                 assert row.locator(".crop").evaluate("crop => crop.firstElementChild.getBBox().width") > 0
                 row.click()
-                assert page.locator("#number").inner_text() == f"{row.get_attribute('data-look')} of 2"
+                assert page.locator("#number").inner_text() == f"{int(row.get_attribute('data-look')) + 1} of 3"
                 assert page.locator("tr.picked:visible").count() == 1
 
 

@@ -185,7 +185,7 @@ def test_a_page_of_fixations_lists_the_objects_that_its_outcome_counts(scanpath,
     rows = re.findall(r'<tr data-object="(\d)" data-look="(\d)">(.*?)</tr>', page)
     told = [re.findall(r'<td class="number">(.*?)</td>', cells) for *_, cells in rows]
     assert len(rows) == len(explored.objects) > 1
-    assert told[0] == ["cup", "0.63", "0", "10,10–21,30"]
+    assert told[0] == ["cup", "0.63", "1", "10,10–21,30"]
     assert f"{len(rows)} objects found" in data["decision"]
     elements = Elements(page)
     assert {"80 × 60 px", "net"} <= set(elements.texts)

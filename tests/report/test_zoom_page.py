@@ -75,7 +75,7 @@ def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, z
     assert "30,24–61,52" in elements.texts
     labels = {attributes.get("aria-label") for tag, attributes in elements.found if tag == "svg"}
     assert "The picture with 2 numbered windows and 2 objects" in labels
-    assert "The window of look 1 with 1 detection" in labels
+    assert "The window of look 2 with 1 detection" in labels
 
 
 def test_numbers_are_rounded_once(zoom_path, large_picture):

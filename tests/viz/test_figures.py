@@ -69,7 +69,7 @@ def test_the_legend_names_all_of_few_curves_and_the_highest_of_many():
 def test_scanpath_shows_numbered_fixations(scanpath, image):
     figure = draw(plot_scanpath(scanpath, image, boxes=torch.tensor([[60.0, 45, 79, 59]])))
     axes = figure.axes[0]
-    assert [text.get_text() for text in axes.texts] == ["0", "1", "2", "cup 0.60"]
+    assert [text.get_text() for text in axes.texts] == ["1", "2", "3", "cup 0.60"]
     np.testing.assert_allclose([text.xy for text in axes.texts[:3]], scanpath.fixations + 0.5)
     np.testing.assert_allclose(axes.collections[-1].get_offsets(), scanpath.fixations + 0.5)
     framed = {patch.get_bbox().bounds: patch.get_linestyle() for patch in axes.patches}
@@ -210,13 +210,13 @@ def test_strip_shows_views_of_any_size_with_their_detections(scanpath, image):
 
 def test_plot_of_a_fixation_shows_scanpath_view_and_belief(scanpath, image):
     path, seen, believed, _ = draw(plot_fixation(scanpath, 1, image, image * 0.5)).axes
-    assert [text.get_text() for text in path.texts if text.get_visible()] == ["0", "1"]
+    assert [text.get_text() for text in path.texts if text.get_visible()] == ["1", "2"]
     np.testing.assert_allclose(np.asarray(seen.images[0].get_array()), (image * 0.5).permute(1, 2, 0))
     belief = scanpath.probabilities[1]
     shown = np.asarray(believed.images[-1].get_array()).ravel()
     np.testing.assert_allclose(shown, belief[:, 2], rtol=1e-6)
     explored = draw(plot_fixation(replace(scanpath, target=None), 1, image, image))
-    assert explored.axes[2].get_title() == "semantic map after fixation 1"
+    assert explored.axes[2].get_title() == "semantic map after fixation 2"
 
 
 def test_figures_do_not_depend_on_matplotlib_settings():
