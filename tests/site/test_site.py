@@ -156,6 +156,10 @@ ASKED = {
     "device": "tasks/running",
     "drone": "tasks/count",
     "visual angle": "tasks/eye-tracker",
+    "threshold": "tasks/find",
+    "jupyter": "tasks/running",
+    "docker": "install",
+    "webcam": "tasks/video",
 }
 """Words that a reader may ask for, and a page that is among the first three answers."""
 ANSWERS = """() => {
