@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from onnx import ModelProto, NodeProto, TensorProto
 
 _MOST_METADATA = 2**20  # largest number of characters of a model's metadata
-_MOST_NODES = 2**16  # after functions of the model are put where they are called
+_MOST_NODES = 2**14  # after functions of the model are put where they are called
 _MOST_REASON = 400  # largest number of characters of a reason that a message has
 _HOLDERS = {f"{kind}Proto" for kind in ("Graph", "Function", "Node", "Attribute", "SparseTensor", "Tensor")}
 """Messages of protobuf that hold tensors, perhaps at some depth."""
@@ -35,7 +35,7 @@ def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
         canvas: `(width, height)` of the image that a pass is tried out for, if the model takes any.
 
     Returns:
-        Whether its sizes or its work remain open, as they depend on values.
+        Whether a pass is open-ended: nothing in the file says that it ends soon.
 
     Raises:
         DataError: the file cannot be read, or a pass takes more than a model of its size may.
@@ -54,13 +54,29 @@ def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
         length = sum(len(entry.key) + len(entry.value) for entry in model.metadata_props)
         check_data(length <= _MOST_METADATA, name, f"at most {_MOST_METADATA:,} characters of metadata", f"{length:,}")
         budget = Budget.of(_without_functions(model, name), canvas, name)
-        budget.check(sum(map(getsize, files)))
-        return budget.is_open()
+        on_disk = sum(map(getsize, files))
+        budget.check(on_disk)
+        return budget.is_open(on_disk)
     except DataError:
         raise
     except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
         reason = " ".join(str(error).split())[-_MOST_REASON:]
         raise DataError(f"cannot load the {name}: {reason}") from None
+
+
+def stored_bytes(path: Path) -> int:
+    """Sum the bytes of a model's files.
+
+    Args:
+        path: the ONNX file, which was checked.
+
+    Returns:
+        The bytes, with those of files of weights beside it.
+    """
+    import onnx
+
+    stored = _tensors(onnx.load(path, load_external_data=False))
+    return sum(map(getsize, {path, *_files_of_weights(path.parent, stored)}))
 
 
 def _tensors(message: Message) -> Iterator[TensorProto]:

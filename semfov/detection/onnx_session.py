@@ -1,34 +1,31 @@
 """An ONNX model, checked before memory is allocated, in onnxruntime, called with torch tensors.
 
 Models whose sizes or work depend on values are *open-ended*: no check of the file bounds what a pass takes. They run
-with an allocator of limited memory, image by image, and in a thread that is given up after some time.
+image by image in a process of their own, with limited memory, which ends when a pass takes too long.
 """
 
 from __future__ import annotations
 
-import atexit
 import re
-import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
-from functools import cache, partial
+from functools import partial
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.detection.feature_maps import NetworkStep, stride_of
+from semfov.detection.onnx_apart import ModelApart
 from semfov.detection.onnx_budget import check_elements, dims, without_weights
 from semfov.detection.onnx_cells import Canvas
-from semfov.detection.onnx_check import check_file
+from semfov.detection.onnx_check import check_file, stored_bytes
+from semfov.detection.onnx_program import Opening, Port, describe, open_session, runtime
 from semfov.errors import DataError, check
 
 if TYPE_CHECKING:
-    from onnxruntime import InferenceSession, SessionOptions
+    from onnxruntime import InferenceSession
 
 _INTEGERS = "tensor(int64)", "tensor(int32)"  # of outputs that number classes and boxes
 _FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
@@ -41,8 +38,9 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 _MOST_MEMORY = 2**29  # bytes for the tensors of models whose sizes depend on values, all together
+_MOST_BESIDE = 2**28  # bytes that their process may need for onnxruntime itself, and a few copies of what is stored
+_COPIES = 4
 _MOST_SECONDS = 10.0  # longest pass of such a model for one image, and longest time until it is loaded
-_LAST_SECONDS = 5.0  # for which the end of the process waits for an operation that was given up
 _MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 _MOST_BATCH = 1024  # largest fixed batch size of a model
 
@@ -51,9 +49,6 @@ Provider = str | tuple[str, Mapping[str, object]]
 
 _Sizes = tuple[int | None, ...]
 """A shape, with None for sizes that are open."""
-
-_Result = TypeVar("_Result")
-_Arrays = dict[str, NDArray[np.generic]]
 
 
 class _Inputs(NamedTuple):
@@ -80,7 +75,7 @@ class OnnxSession:
         shape: shape of the input for images, `(B, 3, H, W)`.
 
     Private attributes: `_again` makes a session of the same model with the same settings, in another process, or with
-    further outputs; `_further` names those of this session. `_session` is onnxruntime's, `_inputs` what it takes.
+    further outputs; `_further` names those of this session. `_session` runs the model, `_inputs` is what it takes.
     """
 
     def __init__(
@@ -94,9 +89,6 @@ class OnnxSession:
         open_ended: bool | None = None,
         further: Sequence[str] = (),
     ) -> None:
-        import onnxruntime as ort
-
-        ort.disable_telemetry_events()
         self.path = Path(path)
         self.threads = torch.get_num_threads() if threads is None else threads
         check(self.threads > 0, "threads", "at least one", self.threads)
@@ -112,48 +104,47 @@ class OnnxSession:
             open_ended=self.open_ended,
         )
         self._further = tuple(further)
-        chosen = _chosen_providers(torch.device(device), self.providers)
-        options = self._options(spinning)
+        opening: Opening = {
+            "path": None if self._further else fspath(self.path),
+            "folder": fspath(self.path.parent),
+            "threads": self.threads,
+            "providers": _chosen_providers(torch.device(device), self.providers),
+            "spinning": spinning,
+            "tensors": _MOST_MEMORY if self.open_ended else None,
+            "process": None,
+        }
+        self._session: InferenceSession | ModelApart
         try:
-            self._session = self._opened(options, chosen)
-        except Exception as error:  # onnxruntime's own exceptions share no base class
-            raise DataError(f"cannot load the ONNX model {str(path)!r}: {_reason(error)}") from error
-        try:
-            self._read_model()
+            model = self._model_with_further_outputs() if self._further else None
+            if self.open_ended:
+                self._session = self._opened_apart(opening, model)
+                description = self._session.description
+            else:
+                self._session = open_session(opening, model)
+                description = describe(self._session)
         except UnicodeDecodeError as error:
             raise DataError(f"cannot load the ONNX model {str(path)!r}: its names are not text ({error})") from None
+        except Exception as error:  # onnxruntime's own exceptions share no base class
+            raise DataError(f"cannot load the ONNX model {str(path)!r}: {_reason(error)}") from error
+        self.metadata = description["metadata"]
+        self.producer = description["producer"]
+        for output in description["outputs"]:
+            name = f"{self.path.name}: output {output['name']!r}"
+            check(output["type"] in (*_FLOATS, *_INTEGERS), name, "numbers", output["type"])
+        self.outputs: tuple[tuple[str, _Sizes], ...] = tuple(
+            (output["name"], _sizes(output["shape"])) for output in description["outputs"]
+        )
+        self._inputs = self._read_inputs(description["inputs"])
+        self.image = self._inputs.image
+        self.shape = self._inputs.shape
         batch = self.shape[0]
         check(batch is None or batch <= _MOST_BATCH, "batch", f"at most {_MOST_BATCH} images at once", batch)
 
-    def _options(self, spinning: bool) -> SessionOptions:
-        """Make onnxruntime's options."""
-        import onnxruntime as ort
-
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = self.threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # exceptions say all, and some exporters leave a warning for every initialiser
-        options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
-        if self.open_ended:
-            _limit_memory()
-            options.add_session_config_entry("session.use_env_allocators", "1")
-        if self._further:
-            # Such a model is loaded from memory, while its weights may stay in other files.
-            folder = "session.model_external_initializers_file_folder_path"
-            options.add_session_config_entry(folder, fspath(self.path.parent))
-        return options
-
-    def _opened(self, options: SessionOptions, providers: Sequence[Provider]) -> InferenceSession:
-        """Open the model in onnxruntime, in limited time where it is open-ended."""
-        import onnxruntime as ort
-
-        model = self._model_with_further_outputs() if self._further else fspath(self.path)
-        # onnxruntime's fallback would print messages and try the same again.
-        load = partial(ort.InferenceSession, model, options, providers=providers, disable_fallback=1)
-        if not self.open_ended:
-            return load()
-        # What it computes of stored values alone, when a model is loaded, is stopped by nothing.
-        return _in_time(partial(load, disabled_optimizers=["ConstantFolding"]))
+    def _opened_apart(self, opening: Opening, model: bytes | None) -> ModelApart:
+        """Open the model in a process of its own, whose memory is limited where it uses no other device."""
+        if [*opening["providers"]] == ["CPUExecutionProvider"]:  # drivers of GPUs map more than they use
+            opening["process"] = _MOST_MEMORY + _MOST_BESIDE + _COPIES * stored_bytes(self.path)
+        return ModelApart(opening, model, _MOST_SECONDS)
 
     def _model_with_further_outputs(self) -> bytes:
         """Make the model that also returns the tensors inside it that are asked for."""
@@ -164,32 +155,17 @@ class OnnxSession:
         model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in self._further if name not in names)
         return model.SerializeToString()
 
-    def _read_model(self) -> None:
-        """Read metadata, outputs and inputs; raises `InputError` for others than detectors have."""
-        model = self._session.get_modelmeta()
-        self.metadata: dict[str, str] = dict(model.custom_metadata_map)
-        self.producer: str = model.producer_name
-        outputs = self._session.get_outputs()
-        for output in outputs:
-            name = f"{self.path.name}: output {output.name!r}"
-            check(output.type in (*_FLOATS, *_INTEGERS), name, "numbers", output.type)
-        self.outputs: tuple[tuple[str, _Sizes], ...] = tuple((o.name, _sizes(o.shape)) for o in outputs)
-        self._inputs = self._read_inputs()
-        self.image = self._inputs.image
-        self.shape = self._inputs.shape
-
-    def _read_inputs(self) -> _Inputs:
-        """Find the input for images, and the others."""
-        inputs = self._session.get_inputs()
-        images = [node for node in inputs if len(node.shape) == 4 and node.type in _FLOATS]
-        description = ", ".join(f"{node.name} {node.shape} {node.type}" for node in inputs)
-        takes_rgb = len(images) == 1 and _sizes(images[0].shape)[1] in (3, None)
+    def _read_inputs(self, inputs: Sequence[Port]) -> _Inputs:
+        """Find the input for images, and the others; raises `InputError` for others than detectors have."""
+        images = [port for port in inputs if len(port["shape"]) == 4 and port["type"] in _FLOATS]
+        description = ", ".join(f"{port['name']} {port['shape']} {port['type']}" for port in inputs)
+        takes_rgb = len(images) == 1 and _sizes(images[0]["shape"])[1] in (3, None)
         check(takes_rgb, self.path.name, "one floating-point input (B, 3, H, W)", description)
         image = images[0]
-        others = tuple(node.name for node in inputs if node is not image)
+        others = tuple(port["name"] for port in inputs if port is not image)
         expected = f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}"
         check(set(others) <= set(_EXTRA_INPUTS), self.path.name, expected, description)
-        return _Inputs(image.name, _sizes(image.shape), _FLOATS[image.type], others)
+        return _Inputs(image["name"], _sizes(image["shape"]), _FLOATS[image["type"]], others)
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model on images, without gradients, in parts where its batch size is fixed.
@@ -232,7 +208,7 @@ class OnnxSession:
         for name in self._inputs.extra:
             feed[name] = _EXTRA_INPUTS[name](image).numpy()
         try:
-            arrays = self._run_in_time(names, feed) if self.open_ended else self._session.run(names, feed)
+            arrays = self._session.run(names, feed)
         except Exception as error:  # onnxruntime's own exceptions share no base class
             reason = _reason(error)
             if "Available memory" in reason:
@@ -244,17 +220,6 @@ class OnnxSession:
             check(array.shape[:1] == (len(image),), f"{self.path.name}: output {name!r}", rows, f"shape {array.shape}")
             outputs[name] = torch.from_numpy(array)
         return outputs
-
-    def _run_in_time(self, names: list[str], feed: _Arrays) -> list[NDArray[np.generic]]:
-        """Run the model, and stop it after some time."""
-        import onnxruntime as ort
-
-        options = ort.RunOptions()
-        options.log_severity_level = 4
-        try:
-            return _in_time(partial(self._session.run, names, feed, options), len(feed[self.image]))
-        finally:
-            options.terminate = True  # read between two operations; the last one goes on
 
     def __reduce__(self) -> tuple[Callable[[], OnnxSession], tuple[()]]:
         return partial(self._again, further=self._further), ()
@@ -323,37 +288,6 @@ class OnnxSession:
         return steps
 
 
-def _in_time(call: Callable[[], _Result], passes: int = 1) -> _Result:
-    """Return what a call returns, unless it takes longer than a number of passes may."""
-    # No operation can be stopped from outside: one that does not end goes on in its thread, for which none waits.
-    future: Future[_Result] = Future()
-
-    def work() -> None:
-        try:
-            future.set_result(call())
-        except BaseException as error:  # raised again where the result is asked for
-            future.set_exception(error)
-
-    seconds = _MOST_SECONDS * passes
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        return future.result(seconds)
-    except TimeoutError:
-        atexit.register(thread.join, _LAST_SECONDS)  # one that returns while Python ends would abort the process
-        raise DataError(f"not done after {seconds:.0f} s, as with a loop that does not end") from None
-
-
-@cache
-def _limit_memory() -> None:
-    """Register a limited allocator, which sessions use that ask for it."""
-    import onnxruntime as ort
-
-    memory = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
-    limits = ort.OrtArenaCfg({"max_mem": _MOST_MEMORY, "arena_extend_strategy": 1})
-    ort.create_and_register_allocator(memory, limits)
-
-
 def _reason(error: Exception) -> str:
     """Shorten onnxruntime's own words to their end, which says most."""
     text = " ".join(str(error).split()).rpartition("Status Message: ")[2]
@@ -363,9 +297,7 @@ def _reason(error: Exception) -> str:
 
 def _chosen_providers(device: torch.device, providers: Sequence[Provider] | None) -> list[Provider]:
     """Choose the providers asked for; else those for a device, and the CPU's for what it does not support."""
-    import onnxruntime as ort
-
-    available = ort.get_available_providers()
+    available = runtime().get_available_providers()
     if providers is not None:
         _check_providers(providers, available)
         return list(providers)

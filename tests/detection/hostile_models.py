@@ -167,6 +167,29 @@ def suppressed() -> tuple[list[Any], dict[str, Any]]:
     return [*nodes, *ending("large")], stored
 
 
+def chained(kind: str, side: int, count: int, **attributes: Any) -> tuple[list[Any], dict[str, Any]]:
+    """Operations that take long for each number, one after the other; their bytes at any one time are few."""
+    nodes = [node("Pad", "images pads", "c0"), node("Identity", "length", "k")]
+    outputs = "c{0} i{0}" if kind == "TopK" else "c{0}"
+    inputs = "c{0} k" if kind == "TopK" else "c{0}"
+    nodes += [node(kind, inputs.format(i), outputs.format(i + 1), **attributes) for i in range(count)]
+    return [*nodes, *ending(f"c{count}")], {"pads": [0, 0, side, side, 0, 0, 0, 0], "length": [side]}
+
+
+def as_text() -> tuple[list[Any], dict[str, Any]]:
+    """Numbers as texts, which no limit of tensors counts."""
+    nodes = [node("Pad", "images pads", "room"), node("Cast", "room", "text", to=TensorProto.STRING)]
+    nodes += [node("Concat", " ".join(["text"] * 20), "texts", axis=0), node("Cast", "texts", "large", to=FLOAT)]
+    return [*nodes, *ending("large")], {"pads": [0, 0, 800, 800, 0, 0, 0, 0]}
+
+
+def cubic() -> tuple[list[Any], dict[str, Any]]:
+    nodes = [node("Resize", "images empty scales", "c0", mode="cubic")]
+    nodes += [node("Resize", f"c{i} empty same", f"c{i + 1}", mode="cubic") for i in range(200)]
+    numbers = {"scales": np.array([1, 1, 14, 14], np.float32), "same": np.array([1, 1, 1.001, 1], np.float32)}
+    return [*nodes, *ending("c200")], {**numbers, "empty": np.zeros(0, np.float32)}
+
+
 def functions(count: int) -> tuple[list[Any], dict[str, Any]]:
     """Each function calls the one before it twice: as many nodes as 2 to the power of their count."""
     return [node(f"F{count - 1}", "images", "large", domain="own"), *ending("large")], {}
@@ -204,6 +227,12 @@ HOSTILE = {
     "sequences": sequences,
     "suppressed": suppressed,
     "stated": stated,
+    "powers": lambda: chained("Tan", 900, 1000),
+    "sorted": lambda: chained("TopK", 900, 500, axis=2),
+    "sums of exponentials": lambda: chained("Softmax", 900, 700, axis=1),
+    "many nodes": lambda: chained("Relu", 1, 16_000),
+    "texts": as_text,
+    "cubic": cubic,
     "functions": lambda: functions(40),
     "functions that end": lambda: functions(3),
     "sparse": lambda: (ending("large"), {}),
