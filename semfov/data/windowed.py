@@ -109,6 +109,13 @@ BY_WINDOWS = (".tif", ".tiff", *RASTERS)
 _LARGE = 1 << 24  # pictures with more pixels have copies
 
 
+def _strips(box: Box, reduction: int) -> list[Box]:
+    """Cut a window of a reduced picture into strips whose pixels in the picture fit into memory at once."""
+    x1, y1, x2, y2 = box
+    rows = max(1, _STRIP // ((x2 - x1) * reduction) // reduction)
+    return [(x1, top, x2, min(top + rows, y2)) for top in range(y1, y2, rows)]
+
+
 class LargePicture(ABC):
     """Base of 8-bit pictures that are read window by window.
 
@@ -245,23 +252,34 @@ class LargePicture(ABC):
             Bytes, channels last in memory.
         """
         x1, y1, x2, y2 = box
-        # Rows whose pixels in the picture fit into memory at once.
-        rows = max(1, _STRIP // ((x2 - x1) * reduction) // reduction)
         window = torch.empty(y2 - y1, x2 - x1, 3, dtype=torch.uint8)
-        for top in range(y1, y2, rows):
-            bottom = min(top + rows, y2)
-            for left, right, stored in self._runs((x1, top, x2, bottom), reduction):
-                # One pixel is the colour of all that is not stored.
-                part = (left, top, right, bottom) if stored else (left, top, left + 1, top + 1)
-                window[top - y1 : bottom - y1, left - x1 : right - x1] = self._part(part, reduction)
+        for block, stored in self._blocks(box, reduction):
+            left, top, right, bottom = block
+            # One pixel is the colour of all that is not stored.
+            shown = block if stored else (left, top, left + 1, top + 1)
+            window[top - y1 : bottom - y1, left - x1 : right - x1] = self._part(shown, reduction)
         return window.permute(2, 0, 1)
+
+    def _blocks(self, box: Box, reduction: int) -> Iterator[tuple[Box, bool]]:
+        """Divide a window of the reduced picture into blocks that fit into memory, and tell which of them are stored.
+
+        Strips of which the same columns are stored are taken together: where these are few, more rows fit.
+        """
+        for runs, strips in groupby(_strips(box, reduction), lambda strip: self._runs(strip, reduction)):
+            alike = [*strips]
+            top = alike[0][1]
+            bottom = alike[-1][3]
+            for left, right, stored in runs:
+                block = left, top, right, bottom
+                for part in _strips(block, reduction) if stored else [block]:
+                    yield part, stored
 
     def _size_reduced(self, reduction: int) -> tuple[int, int]:
         """`(width, height)` of the picture when it is reduced, without the rest of sides that are no multiples."""
         width, height = self.size
         return max(1, width // reduction), max(1, height // reduction)
 
-    def _runs(self, box: Box, reduction: int) -> Iterator[tuple[int, int, bool]]:
+    def _runs(self, box: Box, reduction: int) -> list[tuple[int, int, bool]]:
         """Find runs of columns of a strip of the reduced picture, `(left, right, stored)`, by whether they are."""
         x1, top, x2, bottom = box
         step = max(1, _PIECE // reduction)
@@ -270,9 +288,11 @@ class LargePicture(ABC):
             right = min(left + step, x2)
             stored = self.holds(self._around((left, top, right, bottom), reduction))
             pieces.append((left, right, stored))
+        runs = []
         for stored, run in groupby(pieces, itemgetter(2)):
             columns = list(run)
-            yield columns[0][0], columns[-1][1], stored
+            runs.append((columns[0][0], columns[-1][1], stored))
+        return runs
 
     def _with_border(self, box: Box, reduction: int) -> Box:
         """Widen a part of the reduced picture by what the filter reaches, less than one pixel at each side."""

@@ -7,6 +7,7 @@ import pytest
 import tifffile
 
 from semfov import read_image
+from semfov.data import windowed
 from semfov.data.large import open_large
 from tests.data.test_large import pixels
 from tests.refusals import unusable
@@ -169,6 +170,31 @@ def test_what_a_tiff_does_not_store_is_without_data(tmp_path, nodata):
     assert picture.pixels((0, 0, 32, 32))[..., 0].flatten().tolist().count(nodata or 0) == 3 * 256
     assert picture.holds((0, 0, 16, 32))
     assert not picture.holds((16, 0, 32, 32))
+
+
+@pytest.mark.parametrize("kept", ["both ends", "a few", "all", "one"])
+def test_a_reduced_copy_of_what_is_stored_is_that_of_the_whole_picture(tmp_path, kept, monkeypatch):
+    """However the picture is cut into blocks: its twin stores all tiles."""
+    monkeypatch.setattr(windowed, "_LARGE", 0)
+    monkeypatch.setattr(windowed, "_STRIP", 1 << 13)
+    monkeypatch.setattr(windowed, "_PIECE", 16)
+    side, grid = 256, np.indices((16, 16))
+    stored = {
+        "both ends": (grid[1] == 0) | (grid[1] == 15),
+        "a few": np.random.default_rng(0).random((16, 16)) < 0.1,
+        "all": np.ones((16, 16), np.bool_),
+        "one": np.zeros((16, 16), np.bool_),
+    }[kept]
+    stored[0, 0] = True  # tifffile learns from the first tile what the others are
+    values = pixels(side, side)[..., 0] * np.kron(stored, np.ones((16, 16), np.uint8))
+    cut = values.reshape(16, 16, 16, 16).swapaxes(1, 2).reshape(-1, 16, 16)
+    tiles = (tile if is_stored else None for tile, is_stored in zip(cut, stored.flat, strict=True))
+    options = {"tile": (16, 16), "photometric": "minisblack", "shape": (side, side), "dtype": np.uint8}
+    tifffile.imwrite(tmp_path / "sparse.tif", tiles, **options)
+    tifffile.imwrite(tmp_path / "whole.tif", iter(cut), **options)
+    sparse, whole = (open_large(tmp_path / f"{name}.tif").read((0, 0, side, side), 4) for name in ("sparse", "whole"))
+    assert sparse.shape == (3, 64, 64)
+    assert np.array_equal(sparse, whole)
 
 
 @pytest.mark.parametrize("kind", ["webp", "lerc", "12 bits", "zstd"])
