@@ -4,6 +4,7 @@ A target draws an input (`hypothesis`) for one function of semfov, and says what
 outcomes are allowed: the documented result, checked against something independent of the code (*right*), or one of
 semfov's own errors in one line that names the argument or file (*refused by name*). A stored file that can be computed
 again may also count as missing, which is right, too. Anything else is a finding.
+The target `resources` also watches what a picture makes the process do: memory, time, files, sockets and processes.
 """
 
 from benchmarks.fuzz.agents import agent_arguments, detectors, settings_values
@@ -13,6 +14,7 @@ from benchmarks.fuzz.images import image_files
 from benchmarks.fuzz.models import darknet_files, model_fields, model_files
 from benchmarks.fuzz.onnx_models import onnx_files
 from benchmarks.fuzz.onnx_outputs import onnx_outputs
+from benchmarks.fuzz.resources import resources
 from benchmarks.fuzz.stores import look_files, part_files
 from benchmarks.fuzz.tensors import boxes_on_grids, fixations, fusion_rules, observations, saliency_maps
 
@@ -41,5 +43,6 @@ TARGETS = {
         labels,
         tables,
         frames,
+        resources,
     )
 }

@@ -1,0 +1,42 @@
+"""What the fuzzer watches is seen, and pictures of a few kinds do none of it."""
+
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.fuzz.resources import resources
+from benchmarks.fuzz.runner import run
+from benchmarks.fuzz.watch import listener, opened_files, watched
+from semfov.errors import DataError
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs inotify and /proc")
+MOST = 64 << 20
+
+
+def test_what_a_call_does_is_seen(tmp_path):
+    def refuse():
+        raise DataError("no picture")
+
+    assert watched(refuse, MOST).refused == "no picture"
+    assert watched(lambda: 1 / 0, MOST).fault.startswith("ZeroDivisionError")
+    assert watched(lambda: b"x" * (48 << 20), MOST).bytes >= 48 << 20
+    assert watched(lambda: b"x" * (1 << 30), MOST).fault == "MemoryError: "
+    assert watched(lambda: subprocess.run(["true"], check=False), MOST).forbidden
+    with listener() as (address, requests):
+        port = int(address.rpartition(":")[2])
+        outcome = watched(lambda: socket.create_connection(("127.0.0.1", port)).sendall(b"GET /"), MOST)
+        assert any("socket.connect" in event for event in outcome.forbidden)
+        assert watched(lambda: None, MOST)._replace(bytes=0, seconds=0) == (None, None, 0, 0, [])
+        assert len(requests) <= 1
+    (tmp_path / "secret").write_text("201")
+    with opened_files(tmp_path) as names:
+        assert watched((tmp_path / "secret").read_text, MOST).fault is None
+    assert names == {"secret"}
+
+
+@pytest.mark.slow
+def test_pictures_stay_within_their_means():
+    outcomes = run(resources, 12, 7)
+    assert sum(outcomes.values()) >= 6
