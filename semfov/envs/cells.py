@@ -19,7 +19,7 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.observers import Look, Observer, Semantic
 from semfov.detection.detections import Detections
-from semfov.envs.gazes import Gazes, GazeSettings, scene_number
+from semfov.envs.gazes import Gazes, GazeSettings, SavedGazes, scene_number
 from semfov.envs.scenery import CellEpisode, Scenery
 from semfov.episode import EpisodeLook, Looks, StoredLooks
 from semfov.episode.loop import attend
@@ -282,6 +282,10 @@ class CellGazes(Gazes[CellEpisode]):
             self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])
         self.looks.enter(rows, scenes, targets)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
+
+    def check_saved(self, saved: SavedGazes) -> None:
+        if self.pictures and saved.looks.trace is None:
+            raise InputError("state: expected one of an environment with `render_mode=`, got one without")
 
     @torch.inference_mode()
     def _saved_looks(self) -> _SavedLooks:

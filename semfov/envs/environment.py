@@ -22,6 +22,9 @@ from semfov.gaze.acquisition.base import Task
 _ROW = torch.tensor([0])  # the only row of a batch of one episode
 
 
+_KIND = "single environment"
+
+
 class EpisodeEnv(gymnasium.Env[Arrays, object], EzPickle):
     """One episode at a time; base of `GazeEnv` and `ZoomEnv`, which differ in their actions.
 
@@ -121,7 +124,7 @@ class EpisodeEnv(gymnasium.Env[Arrays, object], EzPickle):
                 _, reward, *_ = env.step(action)
         """
         randoms = (copy.deepcopy(self.np_random),)
-        return EnvState(self.scenery, self.gazes.task, self.gazes.save(), randoms, (self._over,))
+        return EnvState(_KIND, self.scenery, self.gazes.task, self.gazes.save(), randoms, (self._over,))
 
     def restore(self, state: EnvState) -> None:
         """Go back to a saved state; all that follows is the same, bit by bit.
@@ -132,7 +135,8 @@ class EpisodeEnv(gymnasium.Env[Arrays, object], EzPickle):
         Raises:
             InputError: it is the state of another environment.
         """
-        check_state(state, self.scenery, self.gazes.task, 1)
+        check_state(state, _KIND, self.scenery, self.gazes.task, 1)
+        self.gazes.check_saved(state.gazes)
         self.gazes.restore(state.gazes)
         self.np_random = copy.deepcopy(state.randoms[0])
         self._over = state.over[0]

@@ -213,6 +213,9 @@ class Gazes(ABC, Generic[_Episode]):
             raise InputError("save_state: expected an episode, got none; call reset first")
         return SavedGazes(tuple(self.episodes), self.shift.clone(), self.result.clone(), self._saved_looks())
 
+    def check_saved(self, saved: SavedGazes) -> None:
+        """Raise `InputError` where a saved state lacks something that these episodes need."""
+
     def restore(self, saved: SavedGazes) -> None:
         """Go back to a state that `save` gave.
 

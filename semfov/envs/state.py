@@ -16,6 +16,7 @@ class EnvState:
     """A state of an environment, from `save_state`, for `restore`.
 
     Attributes:
+        kind: the kind of environment: a single one, or several side by side.
         scenery: the scenes, which are not copied.
         task: `search` or `exploration`.
         gazes: the episodes.
@@ -29,6 +30,7 @@ class EnvState:
         env.restore(state)
     """
 
+    kind: str
     scenery: Scenery | ZoomScenery
     task: Task
     gazes: SavedGazes
@@ -36,11 +38,13 @@ class EnvState:
     over: tuple[Any, ...]
 
 
-def check_state(state: object, scenery: Scenery | ZoomScenery, task: Task, count: int) -> None:
-    """Raise `InputError` unless a state is one of an environment with these scenes, this task and `count` episodes."""
+def check_state(state: object, kind: str, scenery: Scenery | ZoomScenery, task: Task, count: int) -> None:
+    """Raise `InputError` unless a state is one of a kind of environment with these scenes, this task and episodes."""
     expected = "what `save_state` of this environment gave"
     if not isinstance(state, EnvState):
         raise InputError(f"state: expected {expected}, got a {type(state).__name__}")
+    if state.kind != kind:
+        raise InputError(f"state: expected {expected}, a {kind}, got one of a {state.kind}")
     if state.scenery is not scenery:
         raise InputError(f"state: expected {expected}, got one of other scenes; share them by scenery=")
     got = (state.task, len(state.randoms))

@@ -19,6 +19,8 @@ from semfov.envs.state import EnvState, check_state
 from semfov.errors import InputError, check, check_whole, former_keywords, lookup
 from semfov.gaze.acquisition.base import Task
 
+_KIND = "GazeVectorEnv"
+
 
 class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], EzPickle):
     """Many episodes side by side, each in a scene of its own; a step of all is one step of the batched loop.
@@ -220,7 +222,8 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
             InputError: no episode was started.
         """
         over = (self._terminated.clone(), self._truncated.clone())
-        return EnvState(self.scenery, self.task, self.gazes.save(), tuple(copy.deepcopy(self._randoms)), over)
+        randoms = tuple(copy.deepcopy(self._randoms))
+        return EnvState(_KIND, self.scenery, self.task, self.gazes.save(), randoms, over)
 
     def restore(self, state: EnvState) -> None:
         """Go back to a saved state; all that follows is the same, bit by bit.
@@ -231,7 +234,8 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         Raises:
             InputError: it is the state of another environment.
         """
-        check_state(state, self.scenery, self.task, self.num_envs)
+        check_state(state, _KIND, self.scenery, self.task, self.num_envs)
+        self.gazes.check_saved(state.gazes)
         self.gazes.restore(state.gazes)
         self._randoms = copy.deepcopy(list(state.randoms))
         terminated, truncated = state.over

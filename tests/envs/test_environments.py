@@ -26,6 +26,8 @@ def equal(one, other):
     """Whether observations or infos are the same bit for bit."""
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(equal(one[name], other[name]) for name in one)
+    if isinstance(one, np.ndarray) and one.dtype == object:  # of the observations at the ends of episodes, or None
+        return len(one) == len(other) and all(map(equal, one, other))
     return np.array_equal(one, other)
 
 
@@ -320,8 +322,11 @@ def same(one, other):
     return equal(one, other)
 
 
-def test_restored_environments_side_by_side_go_on_as_they_did(sceneries):
-    envs = GazeVectorEnv("search", 3, sceneries["search"], belief=True)
+@pytest.mark.parametrize(
+    ("task", "mode"), [("search", "NextStep"), ("search", "SameStep"), ("exploration", "SameStep")]
+)
+def test_restored_environments_side_by_side_go_on_as_they_did(sceneries, task, mode):
+    envs = GazeVectorEnv(task, 3, sceneries[task], belief=True, autoreset_mode=mode)
     envs.reset(seed=2)
     random = np.random.default_rng(1)
     for _ in range(3):
@@ -340,9 +345,35 @@ def test_states_of_other_environments_are_refused(sceneries, world):
     env.reset(seed=0)
     refused("state: expected what .* gave, got a dict", env.restore, {})
     two = GazeVectorEnv("search", 2, sceneries["search"])
-    refused(r"state: .*\(search, episodes: 2\), got search, episodes: 1", two.restore, env.save_state())
+    refused("state: .* a GazeVectorEnv, got one of a single environment", two.restore, env.save_state())
+    three = GazeVectorEnv("search", 3, sceneries["search"])
+    two.reset(seed=0)
+    refused(r"state: .*\(search, episodes: 3\), got search, episodes: 2", three.restore, two.save_state())
     another = GazeSearch(open_scenery("search", **world))
     refused("state: .* got one of other scenes", another.restore, env.save_state())
+
+
+def test_a_state_that_is_refused_changes_nothing(sceneries):
+    """One of several environments, though it is of one episode; and one without pictures where they are drawn."""
+    scenery = sceneries["search"]
+    plain = GazeSearch(scenery)
+    drawing = GazeSearch(scenery, render_mode="rgb_array")
+    single = GazeVectorEnv("search", 1, scenery)
+    for each in (plain, drawing, single):
+        each.reset(seed=4)
+    pairs = [
+        (plain, single, "a single environment, got one of a GazeVectorEnv"),
+        (single, plain, "a GazeVectorEnv, got one of a single environment"),
+        (drawing, plain, "with `render_mode=`, got one without"),
+    ]
+    for env, other, message in pairs:
+        other.step(np.array([5]) if other is single else 5)
+        before = env.save_state()
+        refused(f"state: .*{message}", env.restore, other.save_state())
+        after = env.save_state()
+        assert torch.equal(before.gazes.shift, after.gazes.shift)
+        assert torch.equal(before.gazes.looks.cell, after.gazes.looks.cell)
+    assert drawing.render() is not None
 
 
 def test_ended_environments_stay_idle_until_they_are_reset(sceneries):
