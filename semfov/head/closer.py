@@ -42,7 +42,8 @@ class CloserLooks:
         self.target = target
         self._places: dict[int, _Place] = {}  # by their cell of the scene
         self._shown: dict[int, float] = {}  # by the cell, the narrowest field of view of a look at its place
-        self._cells: dict[int, int] = {}  # by the action that was offered, the cell of its place
+        self._cells: dict[int, int] = {}  # by the action that was offered after the last look, the cell of its place
+        self._taken: set[int] = set()  # numbers of the poses of all looks
 
     def see(self, action: int, detections: Detections) -> None:
         """Keep the places of boxes in a look.
@@ -54,6 +55,7 @@ class CloserLooks:
         views = self.views
         pose = views.poses[action // views.cells]
         field = views.field_of(pose)
+        self._taken.add(action // views.cells)
         if action in self._cells:
             self._shown[self._cells[action]] = field
         scores = detections.scores[0, :, 1:].amax(-1) if self.target is None else detections.scores[0, :, self.target]
@@ -82,8 +84,10 @@ class CloserLooks:
         """
         views = self.views
         cells = self._best(belief)
-        offered = [views.aim(self._places[cell].point, self._places[cell].field) for cell in cells]
-        self._cells.update(zip(offered, cells, strict=True))
+        # Poses that were offered, and are not looked from, serve the next ones.
+        free = sorted({action // views.cells for action in self._cells} - self._taken, reverse=True)
+        offered = [views.aim(self._places[cell].point, self._places[cell].field, free) for cell in cells]
+        self._cells = dict(zip(offered, cells, strict=True))
         values = torch.full((len(views.grid),), OUT)
         if not offered:
             return values

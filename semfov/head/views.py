@@ -24,7 +24,7 @@ class Views:
                  ├────────┤
 
     The poses of the widest field of view are a lattice, which covers the scene. Those of narrower fields are closer
-    looks at places, and are added one by one (`aim`).
+    looks at places (`aim`). Those that were offered and not taken give their numbers to others.
 
     Attributes:
         world: the scene.
@@ -80,19 +80,26 @@ class Views:
         width, height = self.world.size
         return Grid(_POINTS, _POINTS * len(self.poses), (width, height * len(self.poses)))
 
-    def aim(self, point: Tensor, field: float) -> int:
-        """Aim a narrower field of view at a point of the scene; a pose that is new is added.
+    def aim(self, point: Tensor, field: float, free: list[int] | None = None) -> int:
+        """Aim a narrower field of view at a point of the scene; a pose that is new is added, or takes a free number.
 
         Args:
             point: `(D,)`.
             field: one of `fields`, narrower than the widest.
+            free: numbers of poses that are not needed any more; the one that is taken is removed from the list.
 
         Returns:
             The action that fixates the point, as nearly as the limits of the head allow.
         """
+        free = [] if free is None else free
         pose = self.world.aim(point, field)
         known = (self.poses == pose).all(-1).nonzero()
-        number = int(known[0, 0]) if len(known) else self.add(pose)
+        if len(known):
+            number = int(known[0, 0])
+            if number in free:
+                free.remove(number)
+        else:
+            number = self.add(pose) if not free else self.replace(free.pop(), pose)
         pixel, _ = self.world.to_view(point[None], pose)
         return number * self.cells + int(self.view_grid.cell_of(pixel))
 
@@ -105,23 +112,48 @@ class Views:
         Returns:
             Its number.
         """
-        world = self.world
         number = len(self.poses)
+        actions = self.cells
         self.poses = torch.cat([self.poses, pose[None]])
-        self._field_numbers.append(self.fields.index(self.field_of(pose)))
+        self.gaze = torch.cat([self.gaze, self.gaze[:actions]])
+        self.gaze_cell = torch.cat([self.gaze_cell, self.gaze_cell[:actions]])
+        self._field_numbers.append(0)
+        self.visible.append(self.visible[0])
+        self.points.append(self.points[0])
+        self.distances.append(self.distances[0])
         self.grid = self._strip()
+        return self.replace(number, pose)
+
+    def replace(self, number: int, pose: Tensor) -> int:
+        """Give the number of a pose that was never looked from to another one.
+
+        Args:
+            number: of the pose that is replaced.
+            pose: `(3,)`.
+
+        Returns:
+            The number.
+        """
+        world = self.world
+        actions = slice(number * self.cells, (number + 1) * self.cells)
         gaze = world.to_scene(self.view_grid.centres, pose)
-        self.gaze = torch.cat([self.gaze, gaze])
-        self.gaze_cell = torch.cat([self.gaze_cell, world.scene.cell_of(world.pixels_of(gaze))])
+        # Others may hold the tensors as they were.
+        self.poses = self.poses.clone()
+        self.gaze = self.gaze.clone()
+        self.gaze_cell = self.gaze_cell.clone()
+        self.poses[number] = pose
+        self.gaze[actions] = gaze
+        self.gaze_cell[actions] = world.scene.cell_of(world.pixels_of(gaze))
+        self._field_numbers[number] = self.fields.index(self.field_of(pose))
         points, inside = world.to_view(world.centres, pose)
         # A narrow view may lie between the centres of cells. It shows the cell in its middle all the same.
         middle = int(self.gaze_cell[number * self.cells + self.cells // 2 + _POINTS // 2])
         if not bool(inside[middle]):
             inside[middle] = True
             points[middle] = self.view_grid.extent / 2 - 0.5
-        self.visible.append(inside.nonzero()[:, 0])
-        self.points.append(points[inside])
-        self.distances.append(self._distances(pose, points[inside]))
+        self.visible[number] = inside.nonzero()[:, 0]
+        self.points[number] = points[inside]
+        self.distances[number] = self._distances(pose, points[inside])
         return number
 
     def field_of(self, pose: Tensor) -> float:

@@ -133,6 +133,47 @@ def test_no_more_than_a_handful_is_offered_and_no_place_twice(speck, models):
     assert 0 < int((again > OUT).sum()) <= 2
 
 
+def test_offers_that_are_not_taken_leave_no_poses_behind(speck, models):
+    """At each look there are other places; one offer in three is taken."""
+    views = Views(Panorama(speck, fields=FIELDS))
+    gain = SearchGain(views)
+    observer = SceneObserver(Target(models[0]), views, prior=0.1)
+    closer = CloserLooks(gain, Speeds(), 1)
+    nothing = Detections.empty(1, 4)
+    point = views.grid.centres[views.ahead][None]
+    belief = observer(observer.start(1, views.grid, views.poses), boxes_in_view(6.0), point, views.grid, target=1)
+    taken = {}
+    for number in range(9):
+        action = (number % views.lattice) * 100 + 55
+        closer.see(action, boxes_in_view(*[6.0 + number] * 6))
+        offers = (closer.values(belief, action) > OUT).nonzero()[:, 0].tolist()
+        if offers and number % 3 == 0:
+            closer.see(offers[0], nothing)
+            taken[offers[0]] = views.poses[offers[0] // 100].clone()
+        assert len(views) <= views.lattice + len(taken) + 4
+        assert len(views.gaze) == len(views.grid) == len(views.gaze_cell) == 100 * len(views)
+    assert len(taken) > 1
+    for action, pose in taken.items():
+        assert torch.equal(views.poses[action // 100], pose)  # a pose that was looked from keeps its number
+
+
+def test_a_pose_that_takes_a_free_number_is_as_one_that_is_added(speck):
+    one, other = (Views(Panorama(speck, fields=FIELDS)) for _ in range(2))
+    points = panorama_directions(torch.tensor([[300.0, 300.0], [900.0, 380.0]]), (1440, 720))
+    number = one.aim(points[0], 20.0) // 100
+    free = [number]
+    action = one.aim(points[1], 4.0, free)
+    expected = other.aim(points[1], 4.0)
+    assert free == []
+    assert action == expected
+    assert len(one) == len(other)
+    for name in ("poses", "gaze", "gaze_cell"):
+        assert torch.equal(getattr(one, name), getattr(other, name))
+    for name in ("visible", "points", "distances"):
+        assert torch.equal(getattr(one, name)[number], getattr(other, name)[number])
+    assert torch.equal(one.durations(0, Speeds()), other.durations(0, Speeds()))
+
+
 @pytest.fixture
 def closely(monkeypatch):
     """After the first look, only closer ones have a value."""
