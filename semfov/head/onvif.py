@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from http.client import HTTPException
 from typing import Any, NamedTuple
 from urllib.error import HTTPError, URLError
@@ -30,6 +30,9 @@ _MEDIA = "http://www.onvif.org/ver10/media/wsdl"
 _PTZ = "http://www.onvif.org/ver20/ptz/wsdl"
 _TYPES = "http://www.onvif.org/ver10/schema"
 _SOAP = "http://www.w3.org/2003/05/soap-envelope"
+_SPACES = "http://www.onvif.org/ver10/tptz"
+_FARTHEST = 1.0  # largest translation of one relative move, in the units of ONVIF
+_BEYOND = 1.001  # largest position in the units of ONVIF, with its rounding
 
 
 class Position(NamedTuple):
@@ -83,6 +86,7 @@ class OnvifClient:
         self.user = user
         self.password = password
         self.timeout = timeout
+        self._ahead: timedelta | None = None  # of the camera's clock; None before it was asked for
 
     def services(self) -> dict[str, str]:
         """Ask for the addresses of the services `PTZ` and `Media`.
@@ -117,21 +121,48 @@ class OnvifClient:
         Raises:
             DataError: the camera does not answer, refuses the command, or answers what is no message.
         """
+        if self.user is not None and self._ahead is None:
+            self._ahead = self._clock_difference()
         head = "" if self.user is None else self._credentials(self.user)
+        return self._send(address, head, body)
+
+    def _send(self, address: str, head: str, body: str) -> XML.Element:
+        """Send a message with a header, and read the answer."""
         text = f'<s:Envelope xmlns:s="{_SOAP}"><s:Header>{head}</s:Header><s:Body>{body}</s:Body></s:Envelope>'
         request = Request(address, text.encode(), {"Content-Type": "application/soap+xml; charset=utf-8"})
         try:
             with _OPENER.open(request, timeout=self.timeout) as answer:
-                return _parsed(answer.read(_MOST_BYTES + 1))
+                message = _parsed(answer.read(_MOST_BYTES + 1))
         except HTTPError as error:
-            raise DataError(f"camera: it refuses a command: {_reason(error)}") from None
+            raise DataError(f"camera: it refuses a command: {_reason_of(error)}") from None
         except (URLError, HTTPException, OSError, ValueError) as error:
             raise DataError(f"camera: no answer from {address} ({error}); check the address") from None
+        if message.find(f"{{{_SOAP}}}Body/{{{_SOAP}}}Fault") is not None:
+            raise DataError(f"camera: it refuses a command: {_reason(message) or 'it does not say why'}")
+        return message
+
+    def _clock_difference(self) -> timedelta:
+        """Ask how far the camera's clock is ahead of ours: it refuses a digest that is minutes old, or of the future.
+
+        Every camera tells its time without a user (ONVIF Core, `GetSystemDateAndTime`); one that does not is taken to
+        have ours.
+        """
+        try:
+            answer = self._send(self.address, "", f'<GetSystemDateAndTime xmlns="{_DEVICE}"/>')
+            moment = answer.find(f".//{{{_TYPES}}}UTCDateTime")
+            if moment is None:
+                return timedelta()
+            names = ("Date/Year", "Date/Month", "Date/Day", "Time/Hour", "Time/Minute", "Time/Second")
+            paths = ["/".join(f"{{{_TYPES}}}{part}" for part in name.split("/")) for name in names]
+            year, month, day, hour, minute, second = (int(moment.findtext(path, "")) for path in paths)
+            return datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC) - datetime.now(UTC)
+        except (DataError, ValueError, OverflowError):
+            return timedelta()
 
     def _credentials(self, user: str) -> str:
         """Make the header that names a user, with a digest of the password for this message alone."""
         nonce = os.urandom(16)
-        created = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        created = (datetime.now(UTC) + (self._ahead or timedelta())).strftime("%Y-%m-%dT%H:%M:%SZ")
         digest = base64.b64encode(hashlib.sha1(nonce + created.encode() + self.password.encode()).digest()).decode()
         secext, utility = f"{_SECURITY}wssecurity-secext-1.0.xsd", f"{_SECURITY}wssecurity-utility-1.0.xsd"
         kind = f"{_SECURITY}username-token-profile-1.0#PasswordDigest"
@@ -153,13 +184,18 @@ def _parsed(data: bytes) -> XML.Element:
         raise DataError(f"camera: expected an XML message, got none that can be read ({error})") from None
 
 
-def _reason(error: HTTPError) -> str:
-    """Take the reason from the answer to a refused command."""
+def _reason(message: XML.Element) -> str:
+    """Take the reason from a fault; empty for none."""
+    return message.findtext(f".//{{{_SOAP}}}Reason/{{{_SOAP}}}Text", "").strip()
+
+
+def _reason_of(error: HTTPError) -> str:
+    """Take the reason from the answer to a refused command, or else that of HTTP."""
     try:
-        reason = _parsed(error.read(_MOST_BYTES + 1)).find(f".//{{{_SOAP}}}Reason/{{{_SOAP}}}Text")
+        reason = _reason(_parsed(error.read(_MOST_BYTES + 1)))
     except (DataError, HTTPException, OSError):
-        reason = None
-    return f"{error.code} {error.reason}" if reason is None or not reason.text else reason.text.strip()
+        reason = ""
+    return reason or f"{error.code} {error.reason}"
 
 
 class OnvifCamera(PanTiltCamera):
@@ -221,6 +257,7 @@ class OnvifCamera(PanTiltCamera):
         self.pan, self.tilt = pan, tilt
         self.fields = check_fields(fields)
         self._zooms = len(self.fields) > 1
+        self._is_round = pan[1] - pan[0] == 360  # left and right end are one direction
         self.speeds = Speeds(eye_start=0.0, eye=0.0, settle=0.3) if speeds is None else speeds
         self.rate = rate
         self.relative = relative
@@ -244,12 +281,10 @@ class OnvifCamera(PanTiltCamera):
         """
         goal = self.position_of(direction, field)
         if self.relative:
-            here = self.where()
-            way = Position(goal.pan - here.pan, goal.tilt - here.tilt, goal.zoom - here.zoom)
-            self._move("RelativeMove", "Translation", way)
+            self._approach(goal)
         else:
             self._move("AbsoluteMove", "Position", goal)
-        self._wait(goal)
+            self._wait(goal)
         time.sleep(self.speeds.settle)
         position = self.where()
         frame = self.frame()
@@ -307,18 +342,42 @@ class OnvifCamera(PanTiltCamera):
         zoomed = answer.find(f".//{{{_TYPES}}}Zoom[@x]")
         if turned is None:
             raise DataError("camera: expected its position, got a status without pan and tilt")
+        pan = _number(turned, "x")
+        tilt = _number(turned, "y")
+        units = turned.get("space", "")
+        if max(abs(pan), abs(tilt)) > _BEYOND or (units and not units.endswith("/PositionGenericSpace")):
+            expected = "its position from -1 to 1 (the generic space of ONVIF)"
+            raise DataError(f"camera: expected {expected}, got {pan:g}, {tilt:g} in {units or 'no named space'}")
         zoom = 0.0 if zoomed is None else _number(zoomed, "x")
         states = [element.text for element in answer.findall(f".//{{{_TYPES}}}MoveStatus/*")]
         known = [state for state in states if state in ("IDLE", "MOVING")]
         moves = "MOVING" in known if known else None
-        return Position(_number(turned, "x"), _number(turned, "y"), zoom), moves
+        return Position(pan, tilt, zoom), moves
+
+    def _approach(self, goal: Position) -> None:
+        """Turn by relative moves, the short way round; one is at most as long as ONVIF allows, so there may be two."""
+        here = self.where()
+        while True:
+            way = Position(self._turn(here.pan, goal.pan), goal.tilt - here.tilt, goal.zoom - here.zoom)
+            part = Position(*(max(-_FARTHEST, min(_FARTHEST, length)) for length in way))
+            stop = Position(*(start + length for start, length in zip(here, part, strict=True)))
+            self._move("RelativeMove", "Translation", part)
+            self._wait(stop)
+            if part == way:
+                return
+            here = stop
+
+    def _turn(self, start: float, end: float) -> float:
+        """Compute the turn between two pans in the units of ONVIF; of a camera without borders the shorter one."""
+        turn = end - start
+        return (turn + 1) % 2 - 1 if self._is_round else turn
 
     def _wait(self, goal: Position) -> None:
         """Wait until the camera stands still at a position."""
         until = time.monotonic() + self.patience
         while True:
             position, moves = self._status()
-            off = max(abs(position.pan - goal.pan), abs(position.tilt - goal.tilt))
+            off = max(abs(self._turn(position.pan, goal.pan)), abs(position.tilt - goal.tilt))
             if self._zooms:
                 off = max(off, abs(position.zoom - goal.zoom))
             # A camera that was just told to move may not have begun.
@@ -330,8 +389,11 @@ class OnvifCamera(PanTiltCamera):
 
     def _move(self, command: str, name: str, to: Position) -> None:
         """Send a movement."""
-        zoom = f'<t:Zoom x="{to.zoom:.6f}"/>' if self._zooms else ""
-        turn = f'<t:PanTilt x="{to.pan:.6f}" y="{to.tilt:.6f}"/>'
+        # The units of a camera are its own where none are named.
+        zoom_space = f'space="{_SPACES}/ZoomSpaces/{name}GenericSpace"'
+        turn_space = f'space="{_SPACES}/PanTiltSpaces/{name}GenericSpace"'
+        zoom = f'<t:Zoom x="{to.zoom:.6f}" {zoom_space}/>' if self._zooms else ""
+        turn = f'<t:PanTilt x="{to.pan:.6f}" y="{to.tilt:.6f}" {turn_space}/>'
         self._command(command, f'<{name} xmlns:t="{_TYPES}">{turn}{zoom}</{name}>')
 
     def _command(self, command: str, content: str = "") -> XML.Element:

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import threading
+from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from xml.etree import ElementTree
 
@@ -17,11 +18,13 @@ class OnvifServer:
     """Listens at `address` until it is closed.
 
     `position` is pan, tilt and zoom as ONVIF has them, `moves` what was asked for. A movement takes `slow` questions
-    for the status. `answers` replaces the answer to a command by its name.
+    for the status. `answers` replaces the answer to a command by its name. Its clock is `ahead` of ours. A
+    camera that is `round` has no borders of pan, and tells 1 as -1.
     """
 
     def __init__(self, slow=2):
         self.position, self.goal, self.left, self.slow = [0.5, -0.5, 0.0], [0.5, -0.5, 0.0], 0, slow
+        self.ahead, self.round = timedelta(), False
         self.moves, self.answers, self.says_whether_it_moves = [], {}, True
         server = self
 
@@ -51,6 +54,9 @@ class OnvifServer:
         name = command.tag.partition("}")[2]
         if name in self.answers:
             return self.answers[name]
+        if name == "GetSystemDateAndTime":
+            assert root.find(f"{{{SOAP}}}Header")[:] == []  # nobody needs a user to ask for the time
+            return 200, envelope(self.GetSystemDateAndTime(command))
         if not self.knows_user(root):
             return 400, envelope(
                 f'<s:Fault xmlns:s="{SOAP}"><s:Reason><s:Text>Sender not Authorized</s:Text></s:Reason></s:Fault>'
@@ -62,8 +68,17 @@ class OnvifServer:
         parts = {element.tag.rpartition("}")[2]: element.text for element in root.iter()}
         if parts.get("Username") != USER:
             return False
+        created = datetime.fromisoformat(parts["Created"])
+        if abs(created - datetime.now(UTC) - self.ahead) > timedelta(seconds=30):
+            return False
         text = base64.b64decode(parts["Nonce"]) + parts["Created"].encode() + PASSWORD.encode()
         return base64.b64encode(hashlib.sha1(text).digest()).decode() == parts["Password"]
+
+    def GetSystemDateAndTime(self, command):
+        now = datetime.now(UTC) + self.ahead
+        date = f"<t:Date><t:Year>{now.year}</t:Year><t:Month>{now.month}</t:Month><t:Day>{now.day}</t:Day></t:Date>"
+        time = f"<t:Hour>{now.hour}</t:Hour><t:Minute>{now.minute}</t:Minute><t:Second>{now.second}</t:Second>"
+        return f'<r xmlns:t="{TYPES}"><t:UTCDateTime><t:Time>{time}</t:Time>{date}</t:UTCDateTime></r>'
 
     def GetCapabilities(self, command):
         """Its own address is one that is not reached from outside."""
@@ -102,7 +117,14 @@ class OnvifServer:
         if zoom is None:
             asked[2] -= origin[2]
         self.moves.append((command.tag.partition("}")[2], *asked))
+        assert all(abs(part) <= 1.0001 for part in asked)
         self.goal = [a + b for a, b in zip(asked, origin, strict=True)]
+        for element, kind in ((turn, "PanTilt"), (zoom, "Zoom")):
+            form = "Position" if "Absolute" in command.tag else "Translation"
+            space = f"http://www.onvif.org/ver10/tptz/{kind}Spaces/{form}GenericSpace"
+            assert element is None or element.get("space") == space
+        if self.round:
+            self.goal[0] = (self.goal[0] + 1) % 2 - 1
         assert all(abs(part) <= 1.0001 for part in self.goal)
         self.left = self.slow
 

@@ -1,6 +1,7 @@
 """A camera that speaks ONVIF, against a small server of SOAP messages."""
 
 import math
+from datetime import timedelta
 
 import pytest
 
@@ -8,7 +9,7 @@ from semfov import HeadAgent, Panorama
 from semfov.head import Speeds, open_scene
 from semfov.head.onvif import OnvifCamera, OnvifClient, Position
 from semfov.settings import SearchSettings
-from tests.head.onvif_server import PASSWORD, USER, OnvifServer, envelope
+from tests.head.onvif_server import PASSWORD, SOAP, TYPES, USER, OnvifServer, envelope
 from tests.refusals import refused, unusable
 
 PAN, TILT = (-170.0, 170.0), (-30.0, 90.0)
@@ -51,6 +52,55 @@ def test_it_turns_where_it_is_sent_and_tells_where_it_is(server, make, panorama,
         assert frame.field == pytest.approx(60.0)
     assert {move[0] for move in server.moves} == {"RelativeMove" if relative else "AbsoluteMove"}
     assert server.position[2] == 0  # a camera of one field is not told to zoom
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_a_camera_without_borders_turns_across_where_its_ends_meet(server, panorama, relative):
+    """180 degrees to the left and to the right are one direction, which it tells as the left one."""
+    server.round = True
+    client = OnvifClient(server.address, USER, PASSWORD)
+    camera = OnvifCamera(client, lambda: panorama, (104, 78), tilt=TILT, speeds=FAST, relative=relative)
+    for pan, told in ((170.0, 170.0), (180.0, -180.0), (-180.0, -180.0), (-170.0, -170.0), (10.0, 10.0)):
+        frame = camera.look_at((pan, 0.0), 60.0)
+        assert frame.direction[0] == pytest.approx(told, abs=1e-3)
+    if relative:
+        assert max(abs(move[1]) for move in server.moves[1:4]) < 0.1  # the short way
+
+
+def test_a_turn_that_is_longer_than_one_relative_move_takes_two(server, make):
+    camera = make(relative=True)
+    camera.look_at((-170.0, 0.0), 60.0)
+    server.moves.clear()
+    assert camera.look_at((160.0, 0.0), 60.0).direction[0] == pytest.approx(160.0, abs=1e-3)
+    assert [move[1] for move in server.moves] == pytest.approx([1.0, 330 / 170 - 1], abs=1e-5)
+
+
+def test_a_digest_has_the_time_of_the_camera(server, make):
+    """Its clock is years behind; without an answer to the time it is taken to have ours."""
+    server.ahead = timedelta(days=-2000)
+    assert make().where() == Position(0.5, -0.5, 0)
+    server.answers["GetSystemDateAndTime"] = (400, "not here")
+    unusable("Sender not Authorized", make)
+    server.ahead = timedelta()
+    assert make().where() == Position(0.5, -0.5, 0)
+
+
+def test_a_fault_is_one_also_where_http_says_that_all_is_well(server, make):
+    fault = f'<s:Fault xmlns:s="{SOAP}"><s:Reason><s:Text xml:lang="en">No space left</s:Text></s:Reason></s:Fault>'
+    camera = make()
+    server.answers["GetStatus"] = (200, envelope(fault))
+    unusable("refuses a command: No space left", camera.where)
+    server.answers["GetStatus"] = (200, envelope(f'<s:Fault xmlns:s="{SOAP}"/>'))
+    unusable("it does not say why", camera.where)
+
+
+def test_positions_in_degrees_are_not_taken_for_those_of_onvif(server, make):
+    camera = make()
+    degrees = "http://www.onvif.org/ver10/tptz/PanTiltSpaces/SphericalPositionSpaceDegrees"
+    for attributes in ('x="85" y="30"', f'x="0.5" y="0" space="{degrees}"'):
+        place = f'<r xmlns:t="{TYPES}"><t:Position><t:PanTilt {attributes}/></t:Position></r>'
+        server.answers["GetStatus"] = (200, envelope(place))
+        unusable("expected its position from -1 to 1", camera.where)
 
 
 def test_the_agent_searches_with_it(server, make, eye, models, panorama):
