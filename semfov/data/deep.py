@@ -1,6 +1,8 @@
 """Colours of 16 bits a channel in PNG and PPM files, of which Pillow gives the upper eight bits alone."""
 
 from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, cast
 
 import numpy as np
@@ -15,6 +17,13 @@ _LOWER_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L"}
 
 _GREY_AND_ALPHA = "LA;16B"  # four bytes a pixel, which Pillow also unpacks as the channels of RGBA
 _CHANNELS = {"L": 1, "RGB": 3}  # of a PPM
+
+
+_SIZES = b"\xff\x4f\xff\x51"
+"""Markers of JPEG 2000 by which a code stream (SOC) and its sizes (SIZ) begin."""
+
+_PRECISION = 42  # bytes from there to that of the bits of the first channel
+_JPEG2000_HEAD = 2**16  # bytes of a file that are looked through
 
 
 def is_deep(image: "ImageFile") -> bool:
@@ -54,6 +63,17 @@ def deep_values(
     upper = np.asarray(load(image))
     lower = np.asarray(load(again))
     return upper * np.uint16(256) + lower, 65535
+
+
+def jpeg2000_bits(path: str | PathLike[str]) -> int:
+    """Tell the bits of the first channel of a JPEG 2000 file (ISO/IEC 15444-1, A.5.1); 8 where its head lacks them."""
+    with Path(path).open("rb") as file:
+        head = file.read(_JPEG2000_HEAD)
+    start = head.find(_SIZES)
+    place = start + _PRECISION
+    if start < 0 or place >= len(head):
+        return 8
+    return (head[place] & 0x7F) + 1  # the first bit tells a sign
 
 
 def _ppm_values(image: "ImageFile") -> tuple[NDArray[np.uint16], int]:

@@ -38,7 +38,8 @@ class Description:
         alpha: number of the band that is an alpha; None without one.
         premultiplied: whether colours are multiplied by the alpha already.
         white_is_zero: whether 0 is white.
-        sixteen_bits: whether a band has 16 bits without a sign.
+        bits: of a value without a sign, as the file states them: 8, 16, or a number between, such as 12; None for
+            numbers of other kinds.
     """
 
     path: Path
@@ -48,7 +49,7 @@ class Description:
     alpha: int | None
     premultiplied: bool
     white_is_zero: bool
-    sixteen_bits: bool
+    bits: int | None
 
     def shown_bands(self, bands: ChosenBands) -> list[int]:
         """Choose the bands that are shown, with a warning where nothing tells which.
@@ -93,18 +94,21 @@ class Description:
     def _limits(
         self, white: White | None, read: Callable[[Box], Values], nodata: float | None
     ) -> tuple[float, float] | None:
-        """Choose the values that are black and white; None for those of the file's type."""
+        """Choose the values that are black and white; None for those of 8 or 16 bits."""
         if white is None:
-            if self.sixteen_bits:
-                self._warn_of_range(read)
-            return None
+            if self.bits is None or self.bits == 8:
+                return None
+            largest = 2**self.bits - 1
+            if self.bits > 8:
+                self._warn_of_range(read, largest)
+            return None if self.bits == 16 else (0.0, float(largest))
         if isinstance(white, str):
             values = np.concatenate([read(box).ravel() for box in self._sample_boxes()])
             return black_and_white(white, values, nodata)
         return stated_limits(white)
 
-    def _warn_of_range(self, read: Callable[[Box], Values]) -> None:
-        """Warn of values of which little is seen."""
+    def _warn_of_range(self, read: Callable[[Box], Values], largest: int) -> None:
+        """Warn of values that take little of the range up to the `largest`."""
         samples = []
         # What cannot be decoded is refused where it is read.
         with suppress(Exception):
@@ -112,7 +116,7 @@ class Description:
         if samples:
             least = min(float(sample.min()) for sample in samples)
             most = max(float(sample.max()) for sample in samples)
-            warn_of_range(least, most, self.path)
+            warn_of_range(least, most, self.path, largest)
 
     def _sample_boxes(self) -> list[Box]:
         """Find windows that are spread evenly over the picture."""

@@ -16,7 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.deep import deep_values, is_deep
+from semfov.data.deep import deep_values, is_deep, jpeg2000_bits
+from semfov.data.signatures import kind_of
 from semfov.data.tiff_tags import HEIGHT, WHITE_IS_ZERO, WIDTH, TiffTags
 from semfov.data.tone import Values, White, between, black_and_white
 from semfov.data.windowed import Box, LargePicture
@@ -36,13 +37,11 @@ _FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "B
 Pillow knows others, of which some start programs (EPS) or are made of other files.
 """
 
-_UNKNOWN = f"not an image in a format that is read ({', '.join(_FORMATS)}); convert it"
-"""What is said of the content of a file that is none of these."""
-
 _SMALLER = "reduce it, or look at it by windows (how='windows'; the largest as a tiled TIFF)"
 _SMALL = 2**24  # pixels of a picture that may be blank
 _MOST_A_BYTE = 2**11  # pixels; the best of the common packers keeps about a thousand numbers in a byte
 _PAGES = 64  # of a TIFF that are looked through for one that is no thumbnail
+_JPEG2000_REMEDY = 'or a name that ends in .jp2 and pip install "semfov[geo]"'
 _ORIENTATION = 0x0112  # tag of EXIF
 _ORIENTATIONS = range(1, 9)
 _UPRIGHT = 1
@@ -72,16 +71,25 @@ def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: 
     with opening(Path(path), "decoded"), open_pillow(path) as image:
         check_proportion(image.size, Path(path).stat().st_size, path)
         check_area(image.size, name)
+        # Pillow spreads these over 8 or 16 bits, so that what is white is no longer known.
+        are_spread = white is not None and image.format == "JPEG2000" and jpeg2000_bits(path) > 8
+        check_data(not are_spread, name, f"white=None beside more than 8 bits of JPEG 2000, {_JPEG2000_REMEDY}", white)
         deep = is_deep(image)
         sixteen_bits = deep or image.mode in SIXTEEN_BITS
+        largest = _largest_grey(image)
         if not deep:
             pixels = colours = _pixels(image, name, upright=oriented, white=white)
     if deep:
         pixels, colours = _deep_pixels(path, upright=oriented, white=white)
     # The warning is given outside the silence of the decoders.
     if sixteen_bits and white is None:
-        warn_of_range(float(colours.min()) * 65535, float(colours.max()) * 65535, path)
+        warn_of_range(float(colours.min()) * largest, float(colours.max()) * largest, path, largest)
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
+
+
+def _largest_grey(image: "Image") -> int:
+    """Tell the largest value of a grey picture of 16 bits; of a TIFF of 12 bits it is 4095."""
+    return 4095 if TiffTags.of_image(image).bits == (12,) else 65535
 
 
 def _deep_pixels(
@@ -89,6 +97,7 @@ def _deep_pixels(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Read a file with more than 8 bits a channel: pixels `(H, W, 3)` in [0, 1] over white, and the colours alone."""
     with opening(Path(path), "decoded"), open_pillow(path) as image, open_pillow(path) as again:
+        transparent = image.info.get("transparency")
         values, most = deep_values((image, again), partial(_loaded, upright=upright))
     samples = values.shape[-1]
     has_alpha = samples in (2, 4)
@@ -100,15 +109,23 @@ def _deep_pixels(
     if has_alpha:
         alpha = between(values[..., -1:], full_range)
         pixels = pixels * alpha + (1 - alpha)
+    elif transparent is not None:
+        pixels = _without(pixels, values == np.array(transparent))
     return pixels, colours
 
 
-def warn_of_range(least: float, most: float, path: str | PathLike[str]) -> None:
-    """Warn of a picture of 16 bits whose values, from `least` to `most`, take less than a quarter of their range."""
-    if 0 < most - least < 65535 / 4:
+def _without(pixels: NDArray[np.float32], is_transparent: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Show pixels `(H, W, 3)` as white where all their channels, `(H, W, C)`, are those of the transparent colour."""
+    return np.where(is_transparent.all(-1, keepdims=True), np.float32(1), pixels)
+
+
+def warn_of_range(least: float, most: float, path: str | PathLike[str], largest: int = 65535) -> None:
+    """Warn of a picture whose values, from `least` to `most`, take less than a quarter of those up to the `largest`."""
+    if 0 < most - least < largest / 4:
+        bits = largest.bit_length()
         warnings.warn(
-            f"image {Path(path)}: values from {least:.0f} to {most:.0f} of 16 bits, whose white is 65535, show little; "
-            f"give the value that is white, white={most:.0f}, or white='auto' for percentiles",
+            f"image {Path(path)}: values from {least:.0f} to {most:.0f} of {bits} bits, whose white is {largest}, show "
+            f"little; give the value that is white, white={most:.0f}, or white='auto' for percentiles",
             stacklevel=3,
         )
 
@@ -182,12 +199,24 @@ def _fault(error: Exception, source: Path | str, action: str) -> str:
     if type(error).__name__ == "DecompressionBombError":
         most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
         return f"{most}, got more; convert it to a tiled TIFF"
-    if type(error).__name__ == "UnidentifiedImageError":
-        return _UNKNOWN
     reason = " ".join(str(error).split()) or type(error).__name__
-    if isinstance(source, Path):
-        return f"truncated, damaged or of an unsupported kind, and cannot be {action} ({reason}); replace it"
-    return f"truncated, damaged or closed, and cannot be {action} ({reason}); open it again or replace it"
+    if not isinstance(source, Path):
+        return f"truncated, damaged or closed, and cannot be {action} ({reason}); open it again or replace it"
+    is_unidentified = type(error).__name__ == "UnidentifiedImageError"
+    kind, is_read = kind_of(source)
+    if (kind or is_unidentified) and not is_read:
+        return _of_another_kind(kind)
+    reason = f"as {kind}" if is_unidentified else reason
+    return f"truncated, damaged or of an unsupported kind, and cannot be {action} ({reason}); replace it"
+
+
+def _of_another_kind(kind: str) -> str:
+    """Say that a file is of a kind that is not read, which may have no name."""
+    from PIL import Image
+
+    Image.init()  # without it Pillow knows few formats
+    got = f", got {kind}" if kind else ""
+    return f"not an image in a format that is read ({', '.join(_known_to_pillow(_FORMATS))}){got}; convert it"
 
 
 @contextmanager
@@ -329,6 +358,7 @@ def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) ->
     sixteen_bits = image.mode in SIXTEEN_BITS
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
     is_inverted = sixteen_bits and TiffTags.of_image(image).photometric == WHITE_IS_ZERO
+    largest = _largest_grey(image)
     image = _loaded(image, upright=upright)
     is_grey = image.mode in SIXTEEN_BITS or image.mode == "F"
     if not is_grey:
@@ -337,22 +367,23 @@ def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) ->
     if white is not None:
         pixels = between(values, black_and_white(white, values))
     elif is_grey:
-        pixels = _grey_pixels(values, image.mode, name)
+        pixels = _grey_pixels(values, 1 if image.mode == "F" else largest, name)
     else:
         pixels = values.astype(np.float32) / np.float32(255)
     if is_grey:
         pixels = np.repeat(pixels[..., None], 3, axis=-1)
+    if is_grey and "transparency" in image.info:
+        pixels = _without(pixels, values[..., None] == image.info["transparency"])
     return 1 - pixels if is_inverted else pixels
 
 
-def _grey_pixels(values: Values, mode: str, name: str) -> NDArray[np.float32]:
-    """Scale grey values of 16 bits, or floats, to [0, 1]; raises `DataError` for values whose white is not known."""
-    most = 1.0 if mode == "F" else 65535.0
+def _grey_pixels(values: Values, most: int, name: str) -> NDArray[np.float32]:
+    """Scale grey values to [0, 1] by the largest; raises `DataError` for values whose white is not known."""
     least = values.min()
     greatest = values.max()
     got = f"{least:g} to {greatest:g}; give white='auto', or the values that are black and white"
     inside = bool(least >= 0 and greatest <= most)  # false for NaN, too
-    check_data(inside, name, f"values from 0 to {most:g} in mode {mode}", got)
+    check_data(inside, name, f"values from 0 to {most}", got)
     return values.astype(np.float32) / np.float32(most)
 
 

@@ -142,8 +142,9 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
     if isinstance(source, str | PathLike):
         path = Path(source)
         if path.suffix.lower() in BY_WINDOWS:
-            with suppress(DataError):  # a file of another kind than its name says
-                return open_large(path).size
+            # A white, whichever, lets floats in. A file of another kind than its name says is Pillow's.
+            with suppress(DataError):
+                return open_large(path, white=1.0).size
         with opening(path, "opened"), open_pillow(path) as image:
             return upright_size(image)
     if isinstance(source, Pillow.Image):

@@ -154,8 +154,21 @@ def _describe(path: Path, file: Raster) -> Description:
         alpha=numbers.get("alpha"),
         premultiplied=tags.is_premultiplied,
         white_is_zero=tags.photometric == WHITE_IS_ZERO,
-        sixteen_bits="uint16" in file.dtypes,
+        bits=_bits_of(file),
     )
+
+
+def _bits_of(file: Raster) -> int | None:
+    """Tell the bits of the values without a sign, as the file states them; None for numbers of other kinds."""
+    kinds = {*file.dtypes}
+    if not kinds <= {"uint8", "uint16"}:
+        return None
+    bits = 16 if "uint16" in kinds else 8
+    if isinstance(file, Mosaic):  # of files that may differ
+        return bits
+    # GDAL has no type of 12 bits, and gives those of the next larger one.
+    stated = file.tags(ns="IMAGE_STRUCTURE", bidx=1).get("NBITS", "")
+    return min(int(stated), bits) if stated.isdecimal() and int(stated) else bits
 
 
 def open_by_windows(

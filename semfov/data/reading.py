@@ -8,6 +8,7 @@ from torch import Tensor
 
 from semfov.data.images import SIXTEEN_BITS, check_area, open_pillow, quiet_decoders, read_photograph
 from semfov.data.rasters import open_by_windows
+from semfov.data.tiff_tags import UPRIGHT, TiffTags
 from semfov.data.tone import White, check_white
 from semfov.data.windowed import BY_WINDOWS
 
@@ -39,22 +40,26 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     torch.Size([3, 2, 4])
     """
     check_white(white)
-    if oriented and _is_read_by_windows(path):
+    if _is_read_by_windows(path, white, oriented):
         picture = open_by_windows(path, white=white)
         check_area(picture.size, f"image {Path(path)}")
         return picture.read((0, 0, *picture.size)).float().div_(255)
     return read_photograph(path, oriented=oriented, white=white)
 
 
-def _is_read_by_windows(path: str | PathLike[str]) -> bool:
+def _is_read_by_windows(path: str | PathLike[str], white: White | None, oriented: bool) -> bool:
     """Tell whether a file is one of which Pillow would lose masks, channels that are pages, or 16 bits of colours.
 
-    Grey pictures of 16 bits are Pillow's, as it keeps their precision, which bytes do not.
+    Grey pictures of 16 bits are Pillow's, as it keeps their precision, which bytes do not. Where `white` is given they
+    are not: Pillow spreads 12 bits of JPEG 2000 over 16, and percentiles would be those of pixels without data, too.
     """
     kind = Path(path).suffix.lower()
     if kind not in BY_WINDOWS:
         return False
     with suppress(Exception), quiet_decoders, open_pillow(path) as image:
-        is_precise = image.mode in (*SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
-        return image.format in ("TIFF", "JPEG2000") and not is_precise
+        is_grey = image.mode in (*SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
+        is_precise = is_grey and white is None
+        # Readers by windows turn pictures upright.
+        is_turned = not oriented and TiffTags.of_image(image).orientation != UPRIGHT
+        return image.format in ("TIFF", "JPEG2000") and not is_precise and not is_turned
     return kind in (".tif", ".tiff")  # of a compression that Pillow has not, or of 12 bits

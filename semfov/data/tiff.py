@@ -7,7 +7,9 @@ same page (planes) or in a page of its own (layers).
 """
 
 import lzma
+import math
 import re
+import warnings
 import weakref
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -125,11 +127,14 @@ class TiffPicture(LargePicture):
             self.file = tifffile.TiffFile(path)
             weakref.finalize(self, self.file.close)
             self.page = _first_page(self.file)
-            layers = _layers_of(self.file, self.page)
+            layers, pictures = _layers_of(self.file, self.page)
             self.size = int(self.page.imagewidth), int(self.page.imagelength)
             _check_kind(self.page, self.path, has_white=white is not None)
             check_size(self.size, self.path.stat().st_size, self.path)
             self._tiles = _Tiles(self.path, self.file, self.page, layers)
+        if pictures > 1:
+            remedy = "save the others as files of their own"
+            warnings.warn(f"image {path}: the first of {pictures} pictures in it is shown; {remedy}", stacklevel=2)
         description = _describe(self.path, self.page, layers)
         self._channels = [band - 1 for band in description.shown_bands(bands)]
         self._colours = len(self._channels)
@@ -154,7 +159,9 @@ class TiffPicture(LargePicture):
         with opening(self.path, "opened"):
             # A page that has the tags of the first has none of its own, and is neither.
             kinds = [getattr(page, "subfiletype", 0) for page in self.file.pages[1:]]
-            return not self.page.subifds and not any(kind & (REDUCED | MASK) for kind in kinds)
+            # The channels of GDAL are those of one page.
+            has_copies = bool(self.page.subifds) and not self._tiles.has_layers
+            return not has_copies and not any(kind & (REDUCED | MASK) for kind in kinds)
 
     def _values(self, box: Box) -> Values:
         """Read the values of the channels in a window, the alpha last, `(h, w, C)`."""
@@ -240,16 +247,16 @@ class _Tiles:
             self.height = min(_ROWS, self._size[1]) if self._has_plain_rows else page.rowsperstrip
         self.columns = -(-self._size[0] // self.width)
         self.rows = -(-self._size[1] // self.height)
-        self.separate = self._has_layers or (page.planarconfig == PLANES and page.samplesperpixel > 1)
+        self.separate = self.has_layers or (page.planarconfig == PLANES and page.samplesperpixel > 1)
 
     @property
-    def _has_layers(self) -> bool:
+    def has_layers(self) -> bool:
         return len(self._layers) > 1
 
     @cached_property
     def _is_stored(self) -> NDArray[np.bool_]:
         """Which tiles the file has of any channel, `(rows, columns)`."""
-        if self._has_plain_rows or self._has_layers:
+        if self._has_plain_rows or self.has_layers:
             return np.ones((self.rows, self.columns), np.bool_)
         counts = np.asarray(self._page.databytecounts, np.int64)
         tiles = self.rows * self.columns
@@ -290,8 +297,8 @@ class _Tiles:
 
     def _tile(self, row: int, column: int, channel: int) -> Values | None:
         """Read a tile, `(h, w, samples)`; None for one that is not stored in the file."""
-        layer = self._layers[channel] if self._has_layers else self._page
-        plane = channel if self.separate and not self._has_layers else 0
+        layer = self._layers[channel] if self.has_layers else self._page
+        plane = channel if self.separate and not self.has_layers else 0
         if self._has_plain_rows:
             return self._plain_rows(layer, plane, row)
         # In a page, the tiles of a plane follow those of the planes before it.
@@ -368,18 +375,32 @@ def _first_page(file: "TiffFile") -> _Page:
     return pages[0]
 
 
-def _layers_of(file: "TiffFile", page: _Page) -> Sequence[_Layer]:
-    """List the pages that are the channels of one picture (OME, ImageJ's composites), else the page alone."""
+def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
+    """List the pages that are the channels of one picture (OME, ImageJ's composites), else the page alone.
+
+    Of a stack, such as planes of a microscope or moments, they are those of the first picture.
+
+    Returns:
+        The pages, and the number of pictures in the stack.
+    """
     if not file.series:
-        return [page]
+        return [page], 1
     series = file.series[0]
     pages = cast(Sequence[_Layer | None], series.pages)
-    # Each page is a channel (C) of rows (Y) and columns (X).
-    are_channels = series.axes == "CYX" and page.samplesperpixel == 1
-    if not are_channels or not 2 <= len(pages) <= _MOST_LAYERS:
-        return [page]
-    layers = [layer for layer in pages if layer is not None and layer.shape == page.shape]
-    return layers if len(layers) == len(pages) else [page]
+    # Each page has rows (Y) and columns (X), and perhaps samples (S).
+    axes = series.axes.removesuffix("S").removesuffix("YX")
+    lengths = series.shape[: len(axes)]
+    is_of_stack = page.index == series.keyframe.index and math.prod(lengths) == len(pages)
+    if not is_of_stack:
+        return [page], 1
+    channels = lengths[axes.index("C")] if "C" in axes else 1
+    pictures = len(pages) // channels
+    if page.samplesperpixel > 1 or not 2 <= channels <= _MOST_LAYERS:
+        return [page], pictures
+    numbers = np.arange(len(pages)).reshape(lengths)
+    first = numbers[tuple(slice(None) if axis == "C" else 0 for axis in axes)]
+    layers = [layer for number in first.tolist() if (layer := pages[number]) is not None and layer.shape == page.shape]
+    return (layers if len(layers) == channels else [page]), pictures
 
 
 def _check_kind(page: _Page, path: Path, *, has_white: bool) -> None:
@@ -427,7 +448,7 @@ def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
         alpha=alpha,
         premultiplied=alpha is not None and extra[alpha - first_extra] == PREMULTIPLIED,
         white_is_zero=page.photometric == WHITE_IS_ZERO,
-        sixteen_bits=page.dtype == np.uint16,
+        bits=8 * page.dtype.itemsize if page.dtype in (np.uint8, np.uint16) else None,
     )
 
 

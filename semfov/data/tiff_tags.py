@@ -96,10 +96,10 @@ class TiffTags:
 
     @property
     def has_signed_bytes(self) -> bool:
-        return SIGNED in self.values.get(SAMPLE_FORMAT, ()) and max(self._bits) == 8
+        return SIGNED in self.values.get(SAMPLE_FORMAT, ()) and max(self.bits) == 8
 
     @property
-    def _bits(self) -> tuple[int, ...]:
+    def bits(self) -> tuple[int, ...]:
         """Bits of each channel."""
         return self.values.get(BITS, (1,))
 
@@ -110,7 +110,7 @@ class TiffTags:
             pixels = math.prod((self.values[TILE_WIDTH], self.values[TILE_HEIGHT]))
         else:
             pixels = math.prod((width, self.values.get(ROWS_PER_STRIP, height)))
-        return pixels * max(self.samples, len(self._bits)) * max(self._bits) // 8
+        return pixels * max(self.samples, len(self.bits)) * max(self.bits) // 8
 
     @property
     def stored_bytes(self) -> tuple[int, ...]:

@@ -106,21 +106,33 @@ def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> dict[str, Any
         every: one of how many places is a corner, from the first on.
 
     Returns:
-        A polygon, or two where the ring crosses the antimeridian.
+        A polygon, or two where the ring crosses the antimeridian, or goes round a pole.
 
     >>> polygon_on_earth(np.array([[200.0, 1], [201, 1], [201, 2], [200, 2]]))["coordinates"][0][0]
     [-160.0, 1.0]
     """
     # A step from one corner to the next is the shorter way round the globe.
-    steps = np.diff(ring[:, 0])
+    steps = np.diff(ring[:, 0], append=ring[0, 0])
     east = ring[0, 0] + np.concatenate([[0.0], np.cumsum((steps + 180) % 360 - 180)])
-    corners = np.stack([east - 360 * np.floor((east.min() + 180) / 360), ring[:, 1]], -1)[::every]
+    if abs(east[-1] - east[0]) > 180:
+        corners = _with_pole(east, ring[:, 1])
+    else:
+        corners = np.stack([east[:-1], ring[:, 1]], -1)[::every]
+    corners[:, 0] -= 360 * np.floor((corners[:, 0].min() + 180) / 360)
     area = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - np.roll(corners[:, 0], -1) * corners[:, 1])
     corners = corners if area >= 0 else corners[::-1]  # outer rings are counterclockwise
     if corners[:, 0].max() <= 180:
         return {"type": "Polygon", "coordinates": [_closed(corners)]}
     parts = _cut(corners, 1.0), _cut(corners, -1.0) - [360.0, 0.0]
     return {"type": "MultiPolygon", "coordinates": [[_closed(part)] for part in parts]}
+
+
+def _with_pole(east: NDArray[np.float64], north: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lead a ring that goes round a pole to the pole and back, `(N + 3, 2)`; `east` ends once round the globe."""
+    pole = np.copysign(90.0, north.mean())
+    longitudes = [*east, east[-1], east[0]]
+    latitudes = [*north, north[0], pole, pole]
+    return np.stack([longitudes, latitudes], -1)
 
 
 def _closed(corners: NDArray[np.float64]) -> list[list[float]]:

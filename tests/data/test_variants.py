@@ -1,6 +1,7 @@
 """The product of what a picture's file may be: every reader shows what its numbers say."""
 
 import itertools
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import tifffile
 
 from semfov import read_image
 from semfov.data import windowed
-from semfov.data.large import open_large
+from semfov.data.large import open_large, picture_size
 from tests.data.test_large import pixels
 from tests.refusals import unusable
 
@@ -26,6 +27,14 @@ VARIANTS = [
     for *given, alpha in itertools.product((8, 16), LAYOUTS, ("minisblack", "miniswhite", "rgb"), (0, 1), (None, 1, 2))
     if given[2] == "rgb" or (alpha is None and "planes" not in given[1])
 ]
+
+
+def shown(path, **given):
+    """The bytes that windows and the fovea show of a file."""
+    picture = open_large(path, **given)
+    width, height = picture.size
+    fovea = read_image(path, **given).permute(1, 2, 0).numpy() * 255
+    return picture.pixels((0, 0, width, height)).astype(float), fovea
 
 
 @pytest.mark.parametrize(("bits", "layout", "photometric", "copies", "alpha"), VARIANTS)
@@ -66,28 +75,39 @@ def test_a_tiff_has_one_answer(tmp_path, bits, layout, photometric, copies, alph
     assert np.abs(fovea - want).max() <= 1.01
 
 
+@pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize("copies", [(), (2, 4)])
-def test_a_mask_in_a_tiff_is_white(tmp_path, copies):
+@pytest.mark.parametrize("photometric", ["rgb", "minisblack", "miniswhite"])
+@pytest.mark.parametrize("hidden", ["mask", "value"])
+def test_what_a_tiff_hides_has_one_answer(tmp_path, bits, copies, photometric, hidden):
+    """A mask is white paper; a value without data is shown as it is, and `nothing` tells its colour."""
     rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
-    array = pixels(HIGH, WIDE)
+    most, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
+    values = pixels(HIGH, WIDE)[..., : 3 if photometric == "rgb" else 1].astype(kind) * (most // 255)
     mask = np.full((HIGH, WIDE), 255, np.uint8)
     mask[40:90, 60:200] = 0
+    if hidden == "value":
+        values = np.where(mask[..., None] > 0, np.maximum(values, 1), 0).astype(kind)
     with (
         rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
         rasterio.open(
-            tmp_path / "a.tif", "w", driver="GTiff", width=WIDE, height=HIGH, count=3, dtype="uint8", tiled=True,
-            blockxsize=64, blockysize=64, photometric="rgb", transform=rasterio.transform.Affine.scale(2.0),
+            tmp_path / "a.tif", "w", driver="GTiff", width=WIDE, height=HIGH, count=values.shape[-1], dtype=kind,
+            tiled=True, blockxsize=64, blockysize=64, photometric=photometric,
+            nodata=0 if hidden == "value" else None, transform=rasterio.transform.Affine.scale(2.0),
         ) as file,
     ):  # fmt: skip
-        file.write(np.moveaxis(array, -1, 0))
-        file.write_mask(mask)
+        file.write(np.moveaxis(values, -1, 0))
+        if hidden == "mask":
+            file.write_mask(mask)
         if copies:
             file.build_overviews(copies)
-    want = np.where(mask[..., None] > 0, array, 255)
-    picture = open_large(tmp_path / "a.tif")
-    assert np.array_equal(picture.pixels((0, 0, WIDE, HIGH)), want)
-    assert np.array_equal((read_image(tmp_path / "a.tif").permute(1, 2, 0).numpy() * 255).round(), want)
-    assert picture.nothing == (255, 255, 255)
+    want = values / most * 255
+    want = 255 - want if photometric == "miniswhite" else want
+    want = np.where((mask[..., None] > 0) | (hidden == "value"), want, 255)
+    for got in shown(tmp_path / "a.tif"):
+        assert np.abs(got - want).max() <= 0.51
+    nothing = 255 if hidden == "mask" or photometric == "miniswhite" else 0
+    assert open_large(tmp_path / "a.tif").nothing == (nothing,) * 3
 
 
 @pytest.mark.parametrize("kind", ["OME", "ImageJ"])
@@ -219,3 +239,116 @@ def test_compressions_that_gdal_has(tmp_path, kind):
     assert np.array_equal(open_large(path, white=white).pixels((0, 0, WIDE, HIGH)), pixels(HIGH, WIDE))
     fovea = read_image(path, white=white).permute(1, 2, 0).numpy() * 255
     assert np.array_equal(fovea.round(), pixels(HIGH, WIDE))
+
+
+@pytest.mark.parametrize("bits", [2, 4, 10, 12, 14])
+@pytest.mark.parametrize("kind", ["black is zero", "white is zero", "JPEG 2000"])
+def test_the_largest_value_is_that_of_the_bits_that_a_file_states(tmp_path, bits, kind):
+    rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    values = (pixels(HIGH, WIDE)[..., 0].astype(np.uint16) << 8) >> (16 - bits)
+    options = {"driver": "GTiff", "photometric": "miniswhite" if kind == "white is zero" else "minisblack"}
+    if kind == "JPEG 2000":
+        options = {"driver": "JP2OpenJPEG", "quality": 100, "reversible": "yes"}
+    path = tmp_path / ("a.jp2" if kind == "JPEG 2000" else "a.tif")
+    with rasterio.open(
+        path, "w", width=WIDE, height=HIGH, count=1, dtype="uint8" if bits < 8 else "uint16", nbits=bits,
+        transform=rasterio.transform.Affine.scale(2.0), **options,
+    ) as file:  # fmt: skip
+        file.write(values.astype(np.uint8 if bits < 8 else np.uint16), 1)
+    want = values[..., None] * (255 / (2**bits - 1))
+    for got in shown(path):
+        assert np.abs(got - (255 - want if kind == "white is zero" else want)).max() <= 0.51
+    if kind != "white is zero":
+        for got in shown(path, white=2 ** (bits - 1)):
+            assert np.abs(got - (2 * want * (1 - 0.5**bits)).clip(0, 255)).max() <= 0.51
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_the_transparent_colour_of_16_bits_is_white(tmp_path, count):
+    rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    values = pixels(HIGH, WIDE)[..., :count].astype(np.uint16) * 257
+    values[20:60, 30:90] = 4321
+    # Of one channel alone, which is not transparent.
+    values[60:70, 30:90, 0] = 4321 if count > 1 else 4322
+    shape = {"width": WIDE, "height": HIGH, "count": count, "dtype": "uint16"}
+    path = tmp_path / "a.png"
+    transform = rasterio.transform.Affine.scale(2.0)
+    with rasterio.open(path, "w", driver="PNG", nodata=4321, transform=transform, **shape) as file:
+        file.write(np.moveaxis(values, -1, 0))
+    assert b"tRNS" in path.read_bytes()
+    is_transparent = (values == 4321).all(-1, keepdims=True)
+    want = np.where(is_transparent, 255, np.broadcast_to(values / 257, (HIGH, WIDE, 3)))
+    for got in shown(path):
+        assert np.abs(got - want).max() <= 0.51
+
+
+@pytest.mark.parametrize("axes", ["ZCYX", "CZYX", "TZCYX", "ZYX", "YX"])
+@pytest.mark.parametrize("kind", ["OME", "ImageJ"])
+def test_the_first_picture_of_a_stack_is_shown_with_all_its_channels(tmp_path, axes, kind):
+    if kind == "ImageJ" and axes == "CZYX":
+        pytest.skip("ImageJ has channels after planes")
+    channels = np.moveaxis(pixels(HIGH, WIDE), -1, 0)
+    stack = channels if "C" in axes else channels[0]
+    want = pixels(HIGH, WIDE) if "C" in axes else pixels(HIGH, WIDE)[..., :1]
+    others = len(axes) - 2 - ("C" in axes)
+    for _ in range(others):
+        stack = np.stack([stack, 255 - stack], int(axes.startswith("C")))
+    path = tmp_path / ("a.ome.tif" if kind == "OME" else "a.tif")
+    options = {"imagej": True} if kind == "ImageJ" else {"photometric": "minisblack"}
+    tifffile.imwrite(path, stack, metadata={"axes": axes}, **options)
+    said = pytest.warns(UserWarning, match=f"the first of {2**others} pictures") if others else nullcontext()
+    with said:
+        for got in shown(path):
+            assert np.abs(got - want).max() < 1e-3
+
+
+def test_channels_with_reduced_copies_are_colours(tmp_path):
+    channels = np.moveaxis(pixels(HIGH, WIDE), -1, 0)
+    with tifffile.TiffWriter(tmp_path / "a.ome.tif") as file:
+        file.write(channels, metadata={"axes": "CYX"}, photometric="minisblack", subifds=1, tile=(64, 64))
+        file.write(channels[:, ::2, ::2], subfiletype=1, photometric="minisblack", tile=(64, 64))
+    for got in shown(tmp_path / "a.ome.tif"):
+        assert np.abs(got - pixels(HIGH, WIDE)).max() < 1e-3
+
+
+def test_percentiles_are_those_of_pixels_with_data(tmp_path):
+    """In windows as in the fovea, whether floats have reduced copies or not."""
+    values = pixels(HIGH, WIDE)[..., 0].astype(np.float32)
+    values[:60] = -9999
+    tags = [(42113, "s", 0, "-9999", True)]
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", extratags=tags)
+    windows, fovea = shown(tmp_path / "a.tif", white="auto")
+    assert np.abs(windows - fovea).max() < 1e-3
+    assert abs(windows[60:].mean() - values[60:].mean()) < 3
+    assert picture_size(tmp_path / "a.tif") == (WIDE, HIGH)
+
+
+FOREIGN = {
+    "JPEG XL": b"\xff\x0a" + bytes(40),
+    "HEIC": b"\0\0\0\x18ftypheic" + bytes(40),
+    "PDF": b"%PDF-1.4",
+    "a web page": b"<!DOCTYPE html><p>404</p>",
+    "an empty file": b"",
+    "OpenEXR": b"\x76\x2f\x31\x01" + bytes(40),
+    "a pointer of Git LFS": b"version https://git-lfs.github.com/spec/v1\n",
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+@pytest.mark.parametrize("end", ["jpg", "tif"])
+def test_files_of_other_kinds_are_refused_by_name(tmp_path, kind, end):
+    (tmp_path / f"a.{end}").write_bytes(FOREIGN[kind])
+    for read in (read_image, open_large, picture_size):
+        unusable(f"not an image in a format that is read .*, got {kind}.*; convert it", read, tmp_path / f"a.{end}")
+
+
+def test_more_than_8_bits_of_jpeg_2000_need_the_reader_that_keeps_them(tmp_path):
+    rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    shape = {"width": WIDE, "height": HIGH, "count": 1, "dtype": "uint16", "nbits": 12}
+    shape |= {"quality": 100, "reversible": "yes", "transform": rasterio.transform.Affine.scale(2.0)}
+    with rasterio.open(tmp_path / "a.jp2", "w", driver="JP2OpenJPEG", **shape) as file:
+        file.write(pixels(HIGH, WIDE)[..., 0].astype(np.uint16) * 16, 1)
+    (tmp_path / "a.j2k").write_bytes((tmp_path / "a.jp2").read_bytes())
+    unusable(r"expected white=None beside more than 8 bits.*\.jp2", read_image, tmp_path / "a.j2k", white=4080)
+    for got in shown(tmp_path / "a.jp2", white=4080):
+        assert np.abs(got - pixels(HIGH, WIDE)[..., :1]).max() <= 0.51

@@ -63,3 +63,16 @@ def test_a_box_may_be_wider_than_half_the_globe(west, width):
     shown = rings(box_on_earth(box(west, -60.0, width, 120.0), lambda points: points - [360.0, 0.0]))
     assert sum(map(area, shown)) == pytest.approx(width * 120)
     assert all(-180 <= x <= 180 for part in shown for x, _ in part)
+
+
+@pytest.mark.parametrize("pole", [90.0, -90.0])
+@pytest.mark.parametrize("first", [-180.0, -100.0, 33.0, 300.0])
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_ring_round_a_pole_holds_it(pole, first, way):
+    """The cap from a parallel to the pole is 360 × 20 square degrees of longitude and latitude."""
+    longitudes = first + way * np.arange(0, 360, 30.0)
+    ring = np.stack([longitudes, np.full(12, pole * 7 / 9)], -1)
+    found = rings(polygon_on_earth(ring))
+    assert sum(map(area, found)) == pytest.approx(360 * 20)
+    assert {abs(x) for part in found for x, y in part if y == pole} >= {180.0}
+    assert all(-180 <= x <= 180 for part in found for x, _ in part)
