@@ -220,7 +220,7 @@ _COMMANDS = {
     " or semfov.fit_detector": "",
     "find_all": "`semfov find`",
     "name them by columns={…}": _RENAME,
-    "use read_table with columns={…}": f"name its columns picture, subject, x, y, width and height: {_RENAME}",
+    "name its column by columns={…}": "name the picture's column by --columns",
 }
 """What the command calls that messages name as Python does."""
 

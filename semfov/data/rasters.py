@@ -5,6 +5,7 @@ from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from threading import Lock
+from typing import cast
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.description import Description, as_rgb, named_colours
-from semfov.data.gdal import Raster, WindowOptions, raster_settings
+from semfov.data.gdal import Dataset, Raster, WindowOptions, raster_settings
 from semfov.data.images import PhotographPicture, open_pillow, opening, quiet_decoders
 from semfov.data.tiff import TiffPicture
 from semfov.data.tiff_tags import JPEG, PALETTE, UPRIGHT, WHITE_IS_ZERO, YCBCR, TiffTags
@@ -167,7 +168,8 @@ def _bits_of(file: Raster) -> int | None:
     if isinstance(file, Mosaic):  # of files that may differ
         return bits
     # GDAL has no type of 12 bits, and gives those of the next larger one.
-    stated = file.tags(ns="IMAGE_STRUCTURE", bidx=1).get("NBITS", "")
+    dataset = cast(Dataset, file)
+    stated = dataset.tags(ns="IMAGE_STRUCTURE", bidx=1).get("NBITS", "")
     return min(int(stated), bits) if stated.isdecimal() and int(stated) else bits
 
 

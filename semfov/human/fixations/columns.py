@@ -4,6 +4,7 @@ import csv
 import io
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -31,6 +32,9 @@ _REMEDIES = {
 
 _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")
 """First bytes of pictures, whatever the names of their files say."""
+
+LOST = ("", ".", "-", "nan", "none", "null", "na", "undefined", "undefinednull")
+"""Fields that hold nothing, in lower case."""
 
 _LARGEST = 1e6  # largest coordinate and side in pixels
 
@@ -80,16 +84,30 @@ class Row(NamedTuple):
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise DataError(f"{self}, {name}: expected a number, got {text[:40]!r}")
+            remedy = "; write decimal points" if _DECIMAL.fullmatch(text) else ""
+            raise DataError(f"{self}, {name}: expected a number, got {text[:40]!r}{remedy}")
         return value
 
 
 class Table(NamedTuple):
-    """A table: its name for messages, the names of its columns, and its rows."""
+    """A table.
+
+    Attributes:
+        name: for messages.
+        columns: their names.
+        rows: of fields by these names.
+        repeated: names of several columns, of which the rows have the last one.
+    """
 
     name: str
     columns: list[str]
     rows: list[Row]
+    repeated: frozenset[str] = frozenset()
+
+    def check_different(self, columns: Iterable[str | None]) -> None:
+        """Raise `DataError` for columns to be read whose names others have, too."""
+        repeated = sorted(self.repeated.intersection(columns))
+        check_data(not repeated, self.name, "one column of a name", f"several named {', '.join(repeated)}")
 
 
 def table_of(source: str | PathLike[str] | DataFrame) -> Table:
@@ -116,12 +134,11 @@ def table_of(source: str | PathLike[str] | DataFrame) -> Table:
 def _table_of_frame(frame: DataFrame) -> Table:
     name = "the table"
     columns = [str(column) for column in frame.columns]
-    _check_different(name, columns)
     rows = []
     for number, values in enumerate(frame.itertuples(index=False, name=None)):
         texts = [_text_of(value) for value in values]
         rows.append(Row(name, f"row {number}", dict(zip(columns, texts, strict=True))))
-    return Table(name, columns, rows)
+    return Table(name, columns, rows, _repeated(columns))
 
 
 def _text_of(value: object) -> str:
@@ -142,24 +159,24 @@ def _table_of_file(path: Path, name: str) -> Table:
     # The separator is what the names of the columns have most of.
     separator = max(",;\t|", key=text.partition("\n")[0].count)
     try:
-        reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
-        lines = [(f"line {reader.line_num}", line) for line in reader]
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+        columns = [column.strip() for column in next(reader, [])]
+        lines = [(f"line {reader.line_num}", line) for line in reader if any(line)]
     except csv.Error as error:
         raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
-    columns = [(column or "").strip() for column in reader.fieldnames or ()]
-    _check_different(str(path), columns)
     rows = []
     for place, line in lines:
-        if None in line:  # the key of fields beyond the columns
+        if len(line) > len(columns):
             raise DataError(f"{path}: {place}: expected {len(columns)} fields, got more; quote them with {separator!r}")
-        texts = [_field(field, separator) for field in line.values()]
+        # A line may end early.
+        texts = [_field(field, separator) for field in line] + [""] * (len(columns) - len(line))
         rows.append(Row(name, place, dict(zip(columns, texts, strict=True))))
-    return Table(name, columns, rows)
+    return Table(name, columns, rows, _repeated(columns))
 
 
-def _field(text: str | None, separator: str) -> str:
+def _field(text: str, separator: str) -> str:
     """Strip a field, and make a decimal comma a point where commas do not separate fields."""
-    plain = (text or "").strip()
+    plain = text.strip()
     if separator != "," and _DECIMAL.fullmatch(plain):
         return plain.replace(",", ".")
     return plain
@@ -176,7 +193,6 @@ def _check_text_file(path: Path) -> None:
     check_data(is_table, path, "a table of fixations (.csv, .tsv, .json, .asc, …)", got)
 
 
-def _check_different(name: str, columns: Sequence[str]) -> None:
-    """Raise `DataError` for columns of one name, of which fields would get lost."""
-    repeated = sorted({column for column in columns if columns.count(column) > 1 and column})
-    check_data(not repeated, name, "columns of different names", f"several named {', '.join(repeated)}")
+def _repeated(columns: Sequence[str]) -> frozenset[str]:
+    """Find the names that several columns have."""
+    return frozenset(column for column, count in Counter(columns).items() if count > 1)

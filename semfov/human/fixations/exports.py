@@ -10,9 +10,10 @@ from typing import Literal
 
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, check, check_data
-from semfov.human.fixations.columns import DataFrame, Row, Table, table_of
+from semfov.human.fixations.columns import LOST, DataFrame, Row, Table, table_of
 from semfov.human.fixations.programs import LENGTHS, PROGRAMS, TIMES, Column, Origin, Program, Units, program_of
-from semfov.human.fixations.table import Coordinates, FrameError, Size, named_columns, read_table, records_of
+from semfov.human.fixations.table import Coordinates, FrameError, Size, named_columns, read_table, records_of, scaled
+from semfov.human.fixations.unfolding import unfolded
 
 _SCANPATH = ("picture", "subject", "target", "trial")
 """Our names of the fields that the fixations of a scanpath share."""
@@ -20,7 +21,6 @@ _SCANPATH = ("picture", "subject", "target", "trial")
 _NAMED = (*_SCANPATH, "duration")  # fields whose columns a user may name
 _OTHERS = ("width", "height", "found", "x1", "y1", "x2", "y2")  # fields that `read_table` has, and few programs
 _EYE_KEYS = ("eye", "eyeused", "eyereported", "eyelr")
-_LOST = ("", ".", "-", "nan", "none", "null", "na", "undefined", "undefinednull")  # fields that hold nothing
 _EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
 """Sides of eyes by the first of these words in a field; the numbers are in psychopy/iohub/constants.py."""
 
@@ -44,11 +44,12 @@ def read_export(
 ) -> list[Fixations]:
     r"""Read the fixations in a table that the program of an eye tracker exports.
 
-    The names of the columns tell the program: Tobii Pro Lab and Tobii Studio; Pupil Cloud (also its reference images
-    and surfaces) and Pupil Player (also surfaces); PsychoPy (events `FixationEndEvent` of ioHub); Gazepoint; SMI BeGaze
-    (event statistics); PyGaze (the lists `Efix` of PyGazeAnalyser, under the names `starttime`, `endtime`, `duration`,
-    `endx` and `endy`); pymovements (events with a `location`); and EyeLink Data Viewer (fixation reports). Units are
-    those in the names of the columns (`[MCS norm]`, `[μs]`), else those of the program, as origins are. Lines that are
+    The names of the columns tell the program: Tobii Pro Lab (of glasses, the fixations that are mapped to snapshots, if
+    there are some) and Tobii Studio; Pupil Cloud (also its reference images and surfaces) and Pupil Player (also
+    surfaces); PsychoPy (events `FixationEndEvent` of ioHub); Gazepoint; SMI BeGaze (event statistics); PyGaze (the
+    lists `Efix` of PyGazeAnalyser, under the names `starttime`, `endtime`, `duration`, `endx` and `endy`); pymovements
+    (events with a `location`); iMotions; and EyeLink Data Viewer (fixation reports). Units are those in the names of
+    the columns (`[MCS norm]`, `[μs]`), else those of the program, as origins are. Lines that are
     no fixation, are not on the picture, or have no place are left out, and lines that repeat the number of a fixation
     are one. Fixations without a picture are left out with a warning where others have one, as between two pictures.
 
@@ -86,18 +87,15 @@ def read_export(
     named = named_columns(columns, _NAMED)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     stored = table_of(source)
-    table = _with_pairs(stored)
+    table = unfolded(stored)
     table_columns = [Column.of(name) for name in table.columns]
     program = program_of(table_columns)
     if program is None:
-        programs = ", ".join(dict.fromkeys(program.name for program in PROGRAMS))
-        got = ", ".join(map(repr, stored.columns))[:300]
-        raise DataError(
-            f"{table.name}: expected the columns of a table of {programs}, got {got}; use read_table with columns={{…}}"
-        )
+        raise DataError(f"{table.name}: {_of_no_program(stored)}")
     layout = _Layout.of(program, table_columns, named, table.name)
     if layout.unread:
         warnings.warn(f"{table.name}: {layout.unread}", stacklevel=2)
+    table.check_different([*layout.names.values(), layout.filter])
     rows = layout.fixations_of(table)
     _name_people(rows, subject, table)
     _name_pictures(rows, picture, table.name)
@@ -110,22 +108,6 @@ def read_export(
         raise FrameError(f"{table.name}: expected {expected}; give size=")
     coordinates = Coordinates(units or layout.units, origin or program.origin)
     return records_of(table.name, rows, size, coordinates)
-
-
-_PAIR = ("location_x", "location_y")  # columns that are made of one of pairs
-
-
-def _with_pairs(table: Table) -> Table:
-    """Make two columns of a column `location` of pairs, `[x, y]`, if a table has one."""
-    names = {Column.of(name).key: name for name in table.columns}
-    if "location" not in names or "locationx" in names:
-        return table
-    rows = []
-    for row in table.rows:
-        pair = re.split(r"[,\s]+", row.fields.get(names["location"], "").strip("[]() "))
-        texts = pair if len(pair) == 2 else ("", "")
-        rows.append(row._replace(fields={**row.fields, **dict(zip(_PAIR, texts, strict=True))}))
-    return Table(table.name, [*table.columns, *_PAIR], rows)
 
 
 @dataclass(frozen=True)
@@ -187,7 +169,7 @@ class _Layout:
             filter=None if program.keep is None else _column_name((program.keep[0],), columns),
             units=LENGTHS.get(x.unit, program.units),
             milliseconds=1.0 if duration is None else TIMES[duration.unit or program.time],
-            unread="" if duration is not None else _unread(columns),
+            unread="" if duration is not None else _unread(program, columns),
         )
 
     def fixations_of(self, table: Table) -> list[Row]:
@@ -213,19 +195,10 @@ class _Layout:
         for name, column in self.names.items():
             fields[name] = "" if column is None else stored.get(column, "")
         for name in (*_NAMED, "x", "y"):
-            if fields[name].lower() in _LOST:
+            if fields[name].lower() in LOST:
                 fields[name] = ""
-        if fields["duration"] and self.milliseconds != 1:
-            fields["duration"] = _scaled(fields["duration"], self.milliseconds)
+        fields["duration"] = scaled(fields["duration"], self.milliseconds)
         return fields
-
-
-def _scaled(text: str, factor: float) -> str:
-    """Multiply a number by a factor; what is none becomes NaN, which is refused with its place later."""
-    try:
-        return repr(float(text) * factor)
-    except ValueError:
-        return "nan"
 
 
 def _column_name(keys: Sequence[str], columns: Sequence[Column]) -> str | None:
@@ -258,9 +231,10 @@ def _point_columns(program: Program, columns: Sequence[Column], table: str) -> t
     return min(read, key=lambda pair: LENGTHS.get(pair[0].unit) != "fractions")
 
 
-def _unread(columns: Sequence[Column]) -> str:
+def _unread(program: Program, columns: Sequence[Column]) -> str:
     """Say which columns may be durations of fixations, but are not read; empty where there is none."""
-    names = ", ".join(repr(column.name) for column in columns if _LASTING.search(column.key))
+    lasting = [column for column in columns if column.key in program.duration or _LASTING.search(column.key)]
+    names = ", ".join(repr(column.name) for column in lasting)
     return names and f"no duration is read, although there is {names}; name it by columns={{'duration': …}}, in ms or s"
 
 
@@ -326,7 +300,9 @@ def _with_picture(rows: Sequence[Row], layout: _Layout, table: str) -> list[Row]
     with_picture = [row for row in rows if row.fields["picture"]]
     if not with_picture:
         expected = f"the name of the picture, which {layout.program.name} does not give"
-        raise PictureError(f"{table}: expected {expected}, got none; give picture=")
+        raise PictureError(
+            f"{table}: expected {expected}, got none; give picture=, or name its column by columns={{…}}"
+        )
     if len(with_picture) < len(rows):
         warnings.warn(
             f"{table}: {len(rows) - len(with_picture)} of {len(rows)} fixations are left out, as "
@@ -349,10 +325,27 @@ def table_reader(
         `read_table` or `read_export`.
     """
     table = table_of(source)
-    is_ours = {"picture", "subject", "x", "y"} <= {name.lower() for name in table.columns}
+    is_ours = {"picture", "subject", "x", "y"} <= {Column.of(name).key for name in table.columns}
     names_points = not {*(columns or ())} <= {*_NAMED}
     if is_ours or names_points:
         return read_table
-    columns_of_pairs = _with_pairs(table._replace(rows=[])).columns
-    program = program_of([Column.of(name) for name in columns_of_pairs])
-    return read_table if program is None else read_export
+    whole = unfolded(table._replace(rows=[]))
+    if program_of([Column.of(name) for name in whole.columns]) is None:
+        raise DataError(f"{table.name}: {_of_no_program(table)}")
+    return read_export
+
+
+_GAZE = re.compile(r"gaze|pog|pred|raw[xy]|pupil")  # keys of samples
+_PLACE = re.compile(r"fix.*[xy]$")  # keys of places of fixations
+
+
+def _of_no_program(table: Table) -> str:
+    """Say that a table is not known, with what it may be, and the remedy."""
+    programs = ", ".join(dict.fromkeys(program.name for program in PROGRAMS))
+    got = ", ".join(map(repr, table.columns))[:300]
+    keys = [Column.of(column).key for column in table.columns]
+    are_samples = any(map(_GAZE.search, keys)) and not any(map(_PLACE.search, keys))
+    remedy = "name them by columns={…}"
+    if are_samples:
+        remedy = f"these look like samples, in which fixations are to be found first; of fixations {remedy}"
+    return f"expected the columns of a table of {programs}, or picture, subject, x and y, got {got}; {remedy}"

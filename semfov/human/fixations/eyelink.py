@@ -21,7 +21,10 @@ _MESSAGE = re.compile(r"^MSG\s+(\d+(?:\.\d+)?)\s+(?:(-?\d+)\s+(?=!V\s|TRIAL))?(.
 
 # Messages of a trial: a picture is loaded, its name, and the screen is cleared.
 _LOAD = re.compile(r"^!V\s+IMGLOAD\s+(\S+)\s+(.+?)\s*$", re.IGNORECASE)
-_VARIABLE = re.compile(r"^!V\s+TRIAL_VAR\s+(?:image|picture|img|stimulus)\s+(.+?)\s*$", re.IGNORECASE)
+_VARIABLE = re.compile(r"^(?:!V\s+TRIAL_VAR|var)\s+(?:image|picture|img|stimulus)\s+(.+?)\s*$", re.IGNORECASE)
+# Trials of Experiment Builder, and of OpenSesame.
+_BEGIN = re.compile(r"^(?:TRIALID|start_trial)\b\s*(.*)$")
+_RESULT = re.compile(r"^(?:TRIAL_RESULT|end_trial|stop_trial)\b")
 _CLEAR = re.compile(r"^!V\s+CLEAR\b", re.IGNORECASE)
 # What follows `IMGLOAD` and its mode: a name, x and y, and perhaps width and height.
 _PLACED = re.compile(r"^(.+?)\s+(-?[\d.]+)\s+(-?[\d.]+)(?:\s+([\d.]+)\s+([\d.]+))?$")
@@ -86,10 +89,11 @@ def read_eyelink(
 ) -> list[Fixations]:
     r"""Read the fixations of an ASC file of an EyeLink tracker.
 
-    Fixations are the lines `EFIX`, and trials begin with the message `TRIALID`. A picture is on the screen from its
-    message `!V IMGLOAD` to the next one, to `!V CLEAR` or `TRIAL_RESULT`, or to the `END` of the recording; it has the
-    fixations that begin in this time. A trial without such a message is of the picture that `!V TRIAL_VAR image` names,
-    else of the name after `TRIALID`.
+    Fixations are the lines `EFIX`, and trials begin with the message `TRIALID`, or with `start_trial` of OpenSesame;
+    without them, a recording with messages of pictures is one trial. A picture is on the screen from its message `!V
+    IMGLOAD` to the next one, to `!V CLEAR` or `TRIAL_RESULT`, or to the `END` of the recording; it has the fixations
+    that begin in this time. A trial without such a message is of the picture that `!V TRIAL_VAR image`, or
+    `var image`, names, else of the name after `TRIALID`.
 
     The frame is that of `DISPLAY_COORDS` or `GAZE_COORDS`, from whose first corner the points are counted (EyeLink 1000
     User Manual, section 4.9). It is the picture where `!V IMGLOAD CENTER` or `TOP_LEFT` has its place and size.
@@ -124,7 +128,7 @@ def read_eyelink(
     views = [view for trial in trials for view in trial.viewed()]
     _share_out(fixations, views)
     viewed = [view for view in views if view.fixations]
-    check_data(bool(viewed), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials))
+    check_data(bool(viewed), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials, lines))
     screen = _screen(path, lines, size)
     person = path.stem if subject is None else subject
     records = [record for view in viewed if (record := _record(view, screen, person, eye)) is not None]
@@ -161,10 +165,13 @@ def _record(view: _View, screen: _Place, person: str, eye: str | None) -> Fixati
     return Fixations(view.picture, person, points, (round(width), round(height)), durations=durations)
 
 
-def _events(path: Path, lines: Iterable[str]) -> tuple[list[_Trial], list[_Fixation]]:
+def _events(path: Path, lines: Sequence[str]) -> tuple[list[_Trial], list[_Fixation]]:
     """Read the trials of a recording with the pictures in them, and all fixations that have a place."""
     trials: list[_Trial] = []
     fixations: list[_Fixation] = []
+    messages = [message[3] for line in lines if (message := _MESSAGE.match(line))]
+    if any(map(_LOAD.match, messages)) and not any(map(_BEGIN.match, messages)):
+        trials.append(_Trial("trial 1", -math.inf))
     for number, line in enumerate(lines, start=1):
         try:
             fixation = _read_event(line, trials)
@@ -194,16 +201,16 @@ def _read_event(line: str, trials: list[_Trial]) -> _Fixation | None:
 
 def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
     """Add what a message tells to the trials: a new one, its end, or the pictures on the screen."""
-    if text.startswith("TRIALID"):
+    if begin := _BEGIN.match(text):
         if trials:
             trials[-1].close(time)
         # Some experiments give a trial no name.
-        trials.append(_Trial(text[7:].strip() or f"trial {len(trials) + 1}", time))
+        trials.append(_Trial(begin[1].strip() or f"trial {len(trials) + 1}", time))
         return
     if not trials:
         return
     trial = trials[-1]
-    if text.startswith("TRIAL_RESULT"):
+    if _RESULT.match(text):
         trial.close(time)
     elif _CLEAR.match(text):
         trial.hide(time)
@@ -261,9 +268,14 @@ def _of_one_eye(fixations: Sequence[_Fixation], eye: str | None) -> list[_Fixati
     return [fixation for fixation in fixations if fixation.eye == side]
 
 
-def _lack_of_fixations(trials: Sequence[_Trial]) -> str:
+def _lack_of_fixations(trials: Sequence[_Trial], lines: Iterable[str]) -> str:
     """Say what is there instead of fixations in trials."""
-    return "none in the time of a picture" if trials else "none; convert the events, too"
+    if trials:
+        return "none in the time of a picture"
+    count = sum(line.startswith("EFIX") for line in lines)
+    if count == 0:
+        return "none; convert the events, too"
+    return f"{count} EFIX, but no such message, nor !V IMGLOAD, so no picture; write a table for read_table"
 
 
 def _lost(lines: Sequence[str]) -> list[str]:

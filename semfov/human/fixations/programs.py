@@ -64,11 +64,25 @@ class Column(NamedTuple):
         unit = ""
         if end := _BRACKET.search(name) or _ENDING.search(name):
             plain = name[: end.start()]
-            unit = unicodedata.normalize("NFKC", end[1]).lower().strip()  # there are two signs for micro
+            unit = unicodedata.normalize("NFKC", end[1]).lower().strip().removeprefix("in ")  # two signs are micro
             if prefix := _FRAME.match(unit):
                 frame = prefix[1]
                 unit = unit[prefix.end() :]
-        return cls(name, re.sub(r"[^a-z0-9]", "", plain.lower()), frame, unit)
+        return cls(name, key_of(plain), frame, unit)
+
+    @property
+    def milliseconds(self) -> float | None:
+        """Milliseconds of the unit of a duration; None for a unit that is not read. Without a unit, 1."""
+        return TIMES.get(self.unit) if self.unit else 1.0
+
+
+def key_of(name: str) -> str:
+    """Find the key of a name: its letters and digits, in lower case.
+
+    >>> key_of("Fixation point X")
+    'fixationpointx'
+    """
+    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 class Program(NamedTuple):
@@ -160,6 +174,13 @@ _PLAYER = Program("Pupil Player", point=("normposx", "normposy"), units="fractio
 
 # From the particular to the general: a table of pictures or surfaces has the columns of a plain one, too.
 PROGRAMS = (
+    _TOBII._replace(
+        name="Tobii Pro Lab",
+        point=("mappedx", "mappedy"),
+        picture=("snapshot",),
+        number=("mappedindex",),
+        keep=("mappedtype", ("fixation",)),
+    ),
     _PRO_LAB._replace(
         frames=("mcs",),
         size=("presentedmediawidth", "presentedmediaheight"),
@@ -224,10 +245,19 @@ PROGRAMS = (
         needs=("onset", "offset"),
     ),
     Program(
+        "iMotions",
+        ("fixationx", "fixationy"),
+        duration=("fixationduration",),
+        picture=("sourcestimuliname", "stimulusname"),
+        subject=("respondentname", "respondent"),
+        number=("fixationindex", "fixationindexbystimulus"),
+        needs=("sourcestimuliname", "fixationduration"),
+    ),
+    Program(
         "EyeLink Data Viewer",
         ("currentfixx", "currentfixy"),
         duration=("currentfixduration",),
-        picture=("image", "imagename", "imagefile", "picture"),
+        picture=("image", "imagename", "imagefile", "picture", "stimulus", "currentfixcomponentimagefile"),
         subject=("recordingsessionlabel", "datafile"),
         trial=("trialindex", "triallabel"),
     ),

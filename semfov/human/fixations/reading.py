@@ -29,9 +29,10 @@ _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
 def read_fixations(source: str | PathLike[str] | DataFrame, **options: Any) -> list[Fixations]:
     r"""Read fixations from a file of any format that is known, or from a `pandas.DataFrame`.
 
-    Files `.asc` are those of EyeLink (`read_eyelink`), files `.json` those of COCO-Search18, OSIE, or Ruarte and
-    others. Other files are tables, as this library writes them (`read_table`) or as the programs of eye trackers export
-    them (`read_export`), which the columns tell, unless `columns` names those of the points.
+    Files `.asc`, and texts that begin as these, are those of EyeLink (`read_eyelink`), files `.json` those of
+    COCO-Search18, OSIE, or Ruarte and others. Other files are tables, as this library writes them (`read_table`) or as
+    the programs of eye trackers export them (`read_export`), which the columns tell, unless `columns` names those of
+    the points.
 
     Args:
         source: the file or table.
@@ -104,7 +105,7 @@ def reader_of(source: str | PathLike[str] | DataFrame, columns: Mapping[str, str
     if kind == ".asc":
         return read_eyelink
     if kind != ".json":
-        return table_reader(source, columns)
+        return read_eyelink if kind == ".txt" and _is_eyelink(source) else table_reader(source, columns)
     beginning = _BEGINNING.match(read_text(source))
     if beginning is None:
         raise DataError(f"{source}: expected JSON, a list or an object, got other text; correct or replace the file")
@@ -112,6 +113,11 @@ def reader_of(source: str | PathLike[str] | DataFrame, columns: Mapping[str, str
     if list_of_trials:
         return read_cocosearch
     return read_osie if list_of_people else read_ruarte
+
+
+def _is_eyelink(source: str | PathLike[str]) -> bool:
+    """Tell whether a text is one of EyeLink by its beginning."""
+    return read_text(source, "cp1252").lstrip().startswith(("** CONVERTED FROM", "MSG\t"))
 
 
 def frame_of(text: str) -> tuple[int, int]:

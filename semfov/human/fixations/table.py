@@ -2,6 +2,7 @@
 
 import csv
 import io
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, InputError, check, check_data, lookup
-from semfov.human.fixations.columns import DataFrame, Row, Table, table_of
-from semfov.human.fixations.programs import Origin, Units
+from semfov.human.fixations.columns import LOST, DataFrame, Row, Table, table_of
+from semfov.human.fixations.programs import LENGTHS, Column, Origin, Units
 from semfov.human.fixations.suspicions import warn_of_frames
 from semfov.io.files import write_text
 
@@ -55,13 +56,14 @@ def read_table(
     lines of a scanpath must follow each other.
 
     Fields are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma in all but the first,
-    as spreadsheets write them.
+    as spreadsheets write them. Units in the names of columns count: `x [px]` or `x [norm]`, `duration [s]`,
+    `duration (μs)`. Lines without a place, such as those of samples that were lost, are left out with a warning.
 
     Args:
         source: the file, or a `pandas.DataFrame`.
         columns: names of the columns in the source by the names above, such as `{"x": "FPOGX"}`.
         size: `(width, height)` of the frame, or of each picture by its name, for a table without these columns.
-        units: `pixels`, or `fractions` of the sides of the frame.
+        units: `pixels`, or `fractions` of the sides of the frame, where the names of the columns have no unit.
         origin: `top left`, `bottom left`, `centre`, or `centre, y up`, as in PsychoPy.
 
     Returns:
@@ -87,24 +89,65 @@ def read_table(
     needed = _COLUMNS if size is not None else (*_COLUMNS, *_SIZE)
     theirs = _column_names(table, named)
     _check_columns(table, [theirs[name] for name in needed], needed)
+    table.check_different(theirs.values())
+    units = _stated_units(table.name, theirs) or units
+    milliseconds = _stated_milliseconds(table.name, theirs["duration"])
     rows = []
     for row in table.rows:
         fields = {name: row.fields.get(theirs[name], "") for name in (*needed, *_MORE)}
+        for name in ("duration", *_EDGES):
+            fields[name] = "" if fields[name].lower() in LOST else fields[name]
+        fields["duration"] = scaled(fields["duration"], milliseconds)
         rows.append(row._replace(fields=fields))
-    return records_of(table.name, rows, size, Coordinates(units, origin))
+    return records_of(table.name, _with_place(table.name, rows), size, Coordinates(units, origin))
 
 
 def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
-    """Find the names of a table's columns by ours: those that a user gives, else ours in any case of letters."""
+    """Find the names of a table's columns by ours: those that a user gives, else ours, in any case and with a unit."""
     # Reversed, so that the first of several such columns counts.
-    by_lower = {column.lower(): column for column in reversed(table.columns)}
+    by_key = {Column.of(column).key: column for column in reversed(table.columns)}
     names = {}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
         if name in named:
             names[name] = named[name]
         else:
-            names[name] = name if name in table.columns else by_lower.get(name, name)
+            names[name] = name if name in table.columns else by_key.get(name, name)
     return names
+
+
+def _stated_units(table: str, names: Mapping[str, str]) -> Units | None:
+    """Read the unit of points from the names of their columns; None where these have none."""
+    x, y = (Column.of(names[name]) for name in ("x", "y"))
+    is_read = x.unit == y.unit and (not x.unit or x.unit in LENGTHS)
+    check_data(is_read, table, "x and y in px or norm", f"the columns {x.name!r} and {y.name!r}")
+    return LENGTHS.get(x.unit)
+
+
+def _stated_milliseconds(table: str, name: str) -> float:
+    """Read the milliseconds of the unit of durations from the name of their column; 1 where it has none."""
+    milliseconds = Column.of(name).milliseconds
+    if milliseconds is None:
+        raise DataError(f"{table}: expected durations in s, ms or μs, got the column {name!r}; write them in ms")
+    return milliseconds
+
+
+def scaled(text: str, factor: float) -> str:
+    """Multiply a number by a factor; a text that is none stays, and is refused with its place later."""
+    if factor == 1:
+        return text
+    try:
+        return repr(float(text) * factor)
+    except ValueError:
+        return text
+
+
+def _with_place(table: str, rows: Sequence[Row]) -> list[Row]:
+    """Take the rows that have a place, with a warning of those that have none."""
+    with_place = [row for row in rows if not {row.fields["x"].lower(), row.fields["y"].lower()} <= {*LOST}]
+    if with_place and len(with_place) < len(rows):
+        count = len(rows) - len(with_place)
+        warnings.warn(f"{table}: {count} of {len(rows)} lines are left out, as they have no place", stacklevel=3)
+    return with_place or [*rows]
 
 
 def _check_columns(table: Table, columns: Sequence[str], needed: Sequence[str]) -> None:
@@ -286,7 +329,7 @@ def _durations(rows: Sequence[Row]) -> NDArray[np.float64] | None:
         return None
     for row, time in zip(rows, times, strict=True):
         expected = "a number, as in other lines of the scanpath"
-        check_data(time is not None, f"{row}, duration", expected, "nothing")
+        check_data(time is not None, f"{row}, duration", expected, "nothing; leave the line or the column out")
     return np.array(times, dtype=np.float64)
 
 

@@ -104,7 +104,10 @@ def test_units_and_origins(units, origin, given):
         ({"width": "-800"}, "line 2, size: expected a width"),
         ({"x": "inf"}, "line 2, x: expected a number, got 'inf'"),
         ({"duration": "-5"}, "line 2, durations: expected milliseconds, 0 or more"),
-        ({"duration": "nan"}, "line 2, duration: expected a number, got 'nan'"),
+        (
+            {"duration": "nan"},
+            "line 2, duration: expected a number, as in other lines of the scanpath, got nothing; leave",
+        ),
         ({"duration": ""}, "line 2, duration: expected a number, as in other lines"),
         ({"x1": "50"}, r"line 2, box: expected \(x1, y1, x2, y2\) with x1 <= x2"),
         ({"x1": ""}, "line 2: expected all of x1, y1, x2 and y2, or none"),
@@ -245,7 +248,7 @@ def test_columns_of_one_name_are_refused_in_files_and_frames(tmp_path):
     frame = pandas.DataFrame([["a", 1, 1, 9, 2]], columns=["picture", "subject", "x", "x", "y"])
     frame.to_csv(tmp_path / "t.csv", index=False)
     for source in (frame, tmp_path / "t.csv"):
-        unusable("expected columns of different names, got several named x", read_table, source, size=(80, 60))
+        unusable("expected one column of a name, got several named x", read_table, source, size=(80, 60))
 
 
 def test_a_record_takes_lists_and_tensors_and_refuses_what_is_no_size():

@@ -1,0 +1,65 @@
+"""Tables in which a fixation is not one row with a column for x and one for y."""
+
+import re
+from typing import NamedTuple
+
+from semfov.human.fixations.columns import Row, Table
+from semfov.human.fixations.programs import Column, key_of
+
+_PAIR = ("location_x", "location_y")  # columns that are made of one of pairs
+_SNAPSHOT = ("snapshot", "mapped x", "mapped y", "mapped type", "mapped index")
+"""Columns that are made of those of a snapshot: its name, and place, kind and number of a fixation in it."""
+
+_MAPPED = re.compile(r"mapped (fixation [xy]|eye movement type(?: index)?) \[(.+)\]", re.IGNORECASE)
+"""Columns of Tobii Pro Lab for fixations of glasses on the snapshot in the brackets."""
+
+
+def unfolded(table: Table) -> Table:
+    """Give each fixation a row, and its place two columns.
+
+    Args:
+        table: a column `location` may have pairs `[x, y]`, and each snapshot of glasses columns of its own.
+
+    Returns:
+        The table with further columns; that which is given, where it has neither.
+    """
+    return _with_snapshots(_with_pairs(table))
+
+
+def _with_pairs(table: Table) -> Table:
+    """Make two columns of a column `location` of pairs, `[x, y]`, if a table has one."""
+    names = {Column.of(name).key: name for name in table.columns}
+    if "location" not in names or "locationx" in names:
+        return table
+    rows = []
+    for row in table.rows:
+        pair = re.split(r"[,\s]+", row.fields.get(names["location"], "").strip("[]() "))
+        texts = pair if len(pair) == 2 else ("", "")
+        rows.append(row._replace(fields={**row.fields, **dict(zip(_PAIR, texts, strict=True))}))
+    return table._replace(columns=[*table.columns, *_PAIR], rows=rows)
+
+
+class _Snapshot(NamedTuple):
+    """A picture on which fixations of glasses are mapped, and the names of its columns by their keys."""
+
+    name: str
+    columns: dict[str, str]
+
+    def row(self, row: Row) -> Row:
+        """Write what a row has of the snapshot into the columns of all snapshots."""
+        keys = ("fixationx", "fixationy", "eyemovementtype", "eyemovementtypeindex")
+        texts = [self.name, *(row.fields.get(self.columns.get(key, ""), "") for key in keys)]
+        return row._replace(fields={**row.fields, **dict(zip(_SNAPSHOT, texts, strict=True))})
+
+
+def _with_snapshots(table: Table) -> Table:
+    """Make a row of each row and snapshot, one snapshot after the other, if a table has some."""
+    snapshots: dict[str, _Snapshot] = {}
+    for name in table.columns:
+        if mapped := _MAPPED.fullmatch(name):
+            key, snapshot = mapped.groups()
+            snapshots.setdefault(snapshot, _Snapshot(snapshot, {})).columns[key_of(key)] = name
+    if not snapshots:
+        return table
+    rows = [snapshot.row(row) for snapshot in snapshots.values() for row in table.rows]
+    return table._replace(columns=[*table.columns, *_SNAPSHOT], rows=rows)
