@@ -206,7 +206,8 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     lookup(rule, RULES, "fusion rule")
     check_parameters(beta)
     _check_footprint(footprint)
-    return fuse_scaled(beta, scale_covering(likelihood, footprint), footprint, rule)
+    # Kinds of numbers may differ; the result has that of the belief.
+    return fuse_scaled(beta, scale_covering(likelihood.to(beta.dtype), footprint), footprint, rule)
 
 
 def _check_footprint(footprint: Tensor) -> None:

@@ -203,9 +203,11 @@ class CellGazes(Gazes[CellEpisode]):
         raise InputError(f"episode: expected one of {type(self.scenery).__name__}.episodes, got {episode!r}")
 
     def action(self, action: object) -> Tensor:
+        cell = action.item() if isinstance(action, Tensor) and action.ndim == 0 else action
         expected = f"a whole number from 0 to {int(self.action_space.n) - 1}"
-        check(self.action_space.contains(action), "action", expected, repr(action))
-        return torch.from_numpy(np.asarray(action, dtype=np.int64).reshape(1))
+        is_cell = not isinstance(cell, bool | np.bool_) and self.action_space.contains(cell)
+        check(is_cell, "action", expected, repr(action))
+        return torch.from_numpy(np.asarray(cell, dtype=np.int64).reshape(1))
 
     @torch.inference_mode()
     def planes(self, rows: Tensor) -> NDArray[np.float32]:

@@ -95,11 +95,13 @@ class WindowGaze(Gazes[_WindowEpisode]):
 
     def action(self, action: object) -> Tensor:
         try:
-            place = np.asarray(action, dtype=np.float64)
-        except (ValueError, TypeError):  # it has no numbers
-            place = np.empty(0)
-        # The space warns of lists. An array is checked with its own type of numbers.
-        is_action = self.action_space.contains(action if isinstance(action, np.ndarray) else place)
+            given = np.asarray(action)
+        except (ValueError, TypeError):  # it has no numbers in a row
+            given = np.empty(0)
+        place = given.astype(np.float64) if given.dtype.kind in "iuf" else np.empty(0)
+        # The space warns of lists. An array is checked with its own type of numbers, but one of booleans is none.
+        is_array = isinstance(action, np.ndarray) and place.size > 0
+        is_action = self.action_space.contains(action if is_array else place)
         check(is_action, "action", "(x, y, magnification), each from 0 to 1", repr(action))
         return torch.from_numpy(place)[None]
 

@@ -7,10 +7,11 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_shape
+from semfov.errors import check, check_shape, check_whole
 from semfov.metrics.labels import as_numbers, as_outcomes
 
 _ROUNDING = 1e-3
+_MOST_BINS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
     """
     p = _probabilities(probabilities, "probabilities")
     check_shape(p, "probabilities", None, None)
-    check(bins >= 1, "bins", "at least 1", bins)
+    check_whole(bins, "bins", 1, _MOST_BINS)
     classes = _class_numbers(labels, p)
     if not len(classes):
         return Calibration(0, *[float("nan")] * 5)
@@ -147,7 +148,12 @@ def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) ->
     Returns:
         `(3, bins)`: numbers of predictions, sums of their probabilities, and numbers that came true.
     """
-    edges = torch.arange(1, bins, dtype=torch.float64) / bins if isinstance(bins, int) else bins
+    if isinstance(bins, Tensor):
+        edges = bins
+        check(bool((edges.diff() > 0).all()), "bins", "edges that ascend", edges.tolist())
+    else:
+        check_whole(bins, "bins", 1, _MOST_BINS)
+        edges = torch.arange(1, bins, dtype=torch.float64) / bins
     p = _probabilities(confidence, "confidence").detach().cpu().contiguous()
     came_true = as_outcomes(correct, "correct")
     check_shape(came_true, "correct", len(p))

@@ -8,8 +8,10 @@ from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.data.scene import Annotation
-from semfov.errors import check
+from semfov.errors import check, check_whole
 from semfov.metrics.labels import as_numbers, as_outcomes
+
+_MOST_SHIFTS = 1_000_000
 
 FloatArray = NDArray[np.float64]
 
@@ -22,11 +24,17 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> FloatArr
         shifts: last gaze shift.
 
     Returns:
-        `(..., shifts + 1)`, after 0, 1, … gaze shifts.
+        `(..., shifts + 1)`, after 0, 1, … gaze shifts; NaN without episodes.
+
+    Raises:
+        InputError: `shifts` is no whole number of 0 or more.
     """
+    check_whole(shifts, "shifts", 0, _MOST_SHIFTS)
     steps = np.arange(shifts + 1)
     shift = np.asarray(found_at)[..., None]
     found = (shift >= 0) & (shift <= steps)
+    if not found.shape[-2]:
+        return np.full((*found.shape[:-2], len(steps)), np.nan)
     return np.asarray(found.mean(-2), dtype=np.float64)
 
 
@@ -112,6 +120,7 @@ def standard_error(values: FloatArray) -> FloatArray:
         `(...)`; NaN for fewer than two values.
     """
     values = np.asarray(values, dtype=np.float64)
+    check(values.ndim > 0, "values", "several values", values)
     if len(values) < 2:
         return np.full(values.shape[1:], np.nan)
     return np.asarray(values.std(0, ddof=1) / np.sqrt(len(values)))

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.errors import InputError, check
+from semfov.errors import InputError, check, check_shape
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.metrics.labels import as_numbers, as_outcomes
@@ -48,9 +48,16 @@ class AreaUnderRoc(Metric):
         Args:
             score: `(M,)`, higher where the target is more likely.
             present: `(M,)`, whether it is there: booleans, or 0 and 1.
+
+        Raises:
+            InputError: these are other values, or the shapes differ.
         """
-        self.score.append(as_numbers(score, "score").detach().double())
-        self.present.append(as_outcomes(present, "present"))
+        scores = as_numbers(score, "score").detach().double()
+        is_present = as_outcomes(present, "present")
+        check(scores.ndim == 1, "score", "scores of shape (M,)", (*scores.shape,))
+        check_shape(is_present, "present", len(scores))
+        self.score.append(scores)
+        self.present.append(is_present.to(scores.device))
 
     def sync(self, *arguments: Any, **options: Any) -> None:
         """Join the cases of all processes, of which each takes part, even without a case.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.inputs import as_positions
-from semfov.errors import check, check_finite, values_known
+from semfov.errors import check, check_finite, check_tensor, values_known
 from semfov.io.compatibility import Settings
 from semfov.io.state import StatedModule
 
@@ -237,6 +237,7 @@ def fixations(gaze: Tensor, like: Tensor) -> Tensor:
     Raises:
         InputError: the shape is another one, or a number is not finite.
     """
+    check_tensor(gaze, "gaze")
     batch = like.shape[0]
     for_all = gaze.shape == (2,)
     for_each = gaze.ndim in (2, 3) and gaze.shape[0] == batch and gaze.shape[-1] == 2

@@ -440,3 +440,17 @@ def test_points_and_boxes_near_borders_and_outside():
     boxes = torch.tensor([[8.9, 4, 10.9, 6], [9.1, 4, 11.1, 6], [14, 8.9, 16, 10.9], [14, 9.1, 16, 11.1]])
     assert grid.footprint(boxes, "box_centre").int().argmax(-1).tolist() == [0, 1, 1, 5]
     assert (grid.footprint(boxes, "box_centre").sum(-1) == 1).all()
+
+
+@pytest.mark.parametrize("rule", fusion.RULES)
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_the_belief_keeps_its_kind_of_numbers(rule, kind):
+    """Whatever those of likelihoods and footprints are."""
+    random = torch.Generator().manual_seed(0)
+    beta = torch.rand(2, 6, 3, generator=random) + 0.5
+    likelihood = torch.rand(2, 4, 3, generator=random)
+    footprint = torch.rand(2, 4, 6, generator=random)
+    expected = fuse(beta, likelihood, footprint, rule)
+    found = fuse(beta.to(kind), likelihood.double(), footprint.double(), rule)
+    assert found.dtype == kind
+    torch.testing.assert_close(found.float(), expected, rtol=1e-5, atol=1e-6)

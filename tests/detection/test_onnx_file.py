@@ -4,6 +4,8 @@ import copy
 import json
 import os
 import pickle
+import subprocess
+import sys
 import tracemalloc
 
 import numpy as np
@@ -307,6 +309,15 @@ def test_the_reason_of_onnxruntime_is_not_cut_and_its_telemetry_is_off(tmp_path,
     long = tmp_path / ("long" * 40) / "model.onnx"
     long.parent.mkdir()
     unusable("Unknown", OnnxSession, open_ended(long, nodes, {}, 9))
+
+
+@pytest.mark.lab
+def test_onnxruntime_writes_nothing_about_the_machine(tmp_path):
+    """In a process of its own: it writes while it is imported."""
+    code = "from semfov.detection.onnx_program import runtime; runtime()"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("ORT_", "XDG_"))}
+    subprocess.run([sys.executable, "-c", code], env={**environment, "HOME": str(tmp_path)}, check=True)
+    assert not [path for path in tmp_path.rglob("*") if "onnxruntime" in str(path).lower()]
 
 
 NET = "[net]\nwidth=32\nheight=32\nchannels=3\n"

@@ -271,6 +271,10 @@ def test_actions_are_those_of_the_space(sceneries):
             env.step(action)
         else:
             refused("action: expected a whole number from 0 to 19", env.step, action)
+    env.reset(seed=0)
+    assert env.step(torch.tensor(2))[0]["gaze"].tolist() == (env.reset(seed=0), env.step(2))[1][0]["gaze"].tolist()
+    for action in (True, torch.tensor(True), torch.tensor(2.0), torch.tensor([1, 2])):
+        refused("action: expected a whole number from 0 to 19", env.step, action)
     envs = GazeVectorEnv("search", 2, sceneries["search"])
     envs.reset()
     envs.step([0, 1])

@@ -209,6 +209,8 @@ def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_
         assert not env.action_space.contains(np.asarray(action))
         env.reset(seed=0)
         refused(r"action: expected \(x, y, magnification\), each from 0 to 1", env.step, action)
+    for action in ([True, False, True], np.array([True, False, True])):
+        refused(r"action: expected \(x, y, magnification\), each from 0 to 1", env.step, action)
     twin = pickle.loads(pickle.dumps(env))
     assert env.reset(seed=3)[0]["target"] == twin.reset(seed=3)[0]["target"]
 

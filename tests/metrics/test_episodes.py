@@ -239,7 +239,7 @@ def test_calibration_with_settings_at_their_limits_of_few_and_of_certain_but_wro
     many = torch.rand(300, 2, generator=torch.Generator().manual_seed(0)).softmax(1)
     truth = (torch.arange(300) % 3 == 0).long()
     assert calibration(many, truth) == calibration(many, truth, bins=15) != calibration(many, truth, bins=16)
-    refused("bins: expected at least 1, got 0", calibration, p, labels, bins=0)
+    refused("bins: expected a whole number from 1 to 1,000,000, got 0", calibration, p, labels, bins=0)
     refused("probabilities: expected a tensor of shape", calibration, torch.rand(3), labels)
     assert calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).count == 0
     assert math.isfinite(calibration(torch.tensor([[1.0, 0.0]]), torch.tensor([1])).nll)

@@ -36,7 +36,7 @@ class Letterbox:
     def __post_init__(self) -> None:
         """Check the sizes."""
         for name, size in (("screen", self.screen), ("picture", self.picture)):
-            _check_size(name, size)
+            check_sides(name, size)
 
     @property
     def scale(self) -> float:
@@ -96,8 +96,8 @@ class Letterbox:
         return _box(np.array(box).reshape(2, 2) * self.scale + self.offset)
 
 
-def _check_size(name: str, size: object) -> None:
-    """Raise `InputError` for what is no `(width, height)`."""
+def check_sides(name: str, size: object) -> None:
+    """Raise `InputError` for what is no `(width, height)` above 0."""
     sides = size if isinstance(size, tuple | list | np.ndarray) else ()
     are_above_0 = all(isinstance(side, Real) and 0 < float(side) < np.inf for side in sides)
     check(len(sides) == 2 and are_above_0, name, "a width and a height above 0", size)
@@ -206,7 +206,7 @@ class Fixations:
         shape = self.points.shape
         check(len(shape) == 2 and shape[1] == 2 and shape[0] > 0, "points", "(n, 2), at least one fixation", shape)
         check(bool(np.isfinite(self.points).all()), "points", "finite numbers", "NaN or infinite ones")
-        _check_size("size", self.size)
+        check_sides("size", self.size)
         if self.durations is not None:
             check(self.durations.shape == shape[:1], "durations", f"{shape[0]} numbers", self.durations.shape)
             are_times = bool(np.isfinite(self.durations).all() and (self.durations >= 0).all())

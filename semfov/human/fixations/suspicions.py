@@ -14,6 +14,8 @@ from semfov.errors import check
 
 _Array = NDArray[np.float64]
 
+_DEGREES = 0.05  # of a side of the frame: numbers up to here from its centre are no pixels
+
 _FAR = 0.5
 """Fixations that lie farther than this outside their frame, in its longer sides, are not what a noisy tracker gives."""
 
@@ -42,9 +44,9 @@ _LONG = 5000.0
 def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]] | None = None) -> list[str]:
     """Say what is suspicious in fixations, in plain lines; none where nothing is.
 
-    - Points that do not look like those of their frame: fractions, pixels from the centre, y before x, a smaller frame,
-      or many outside it; with `sizes`, frames of other proportions than those of their pictures, and points within the
-      pixels of pictures that are smaller than their frames.
+    - Points that do not look like those of their frame: fractions, pixels or degrees from the centre, y before x, a
+      smaller frame, or many outside it; with `sizes`, frames of other proportions than those of their pictures, and
+      points within the pixels of pictures that are smaller than their frames.
     - A letterbox: bars at two opposite sides without fixations, while the others reach the border; and a picture at its
       own size in the middle: bars at all sides.
     - Points that repeat the one before, records that occur twice, and many fixations at one same point, such as what
@@ -106,7 +108,9 @@ def other_frame_of(fixations: Sequence[Fixations], *, units: bool = True) -> str
     negative = (points < -0.5).mean(0)
     in_middle = (np.abs(points) <= sides / 2).all(1).mean()
     if negative.min() >= 0.2 and in_middle > 0.95:
-        return "pixels from the centre (origin='centre', or 'centre, y up')"
+        are_degrees = bool((np.abs(points) < _DEGREES * sides.min()).all())
+        pixels = "pixels from the centre (origin='centre', or 'centre, y up')"
+        return "degrees from the centre (multiply them by the pixels of a degree)" if are_degrees else pixels
     inside = 1 - _outside(points, sides).mean()
     inside_if_swapped = 1 - _outside(points[:, ::-1], sides).mean()
     if inside < 0.9 and inside_if_swapped > max(0.98, inside + 0.1):
@@ -196,7 +200,11 @@ def _of_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
     lines = []
     if unknown:
         lines.append(f"{len(unknown)} of {len(pictures)} pictures are not there, such as {unknown[0]}")
-    return [*lines, *_other_proportions(records, sizes), *_smaller_pictures(records, sizes)]
+    if other_frame_of(records) is not None:
+        return lines  # of which the frame tells nothing
+    # What tells where the pictures were comes before what asks.
+    explained = _own_size(records, sizes) + _smaller_pictures(records, sizes)
+    return lines + (_smaller_pictures(records, sizes) if explained else _other_proportions(records, sizes))
 
 
 def _other_proportions(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
@@ -211,7 +219,7 @@ def _other_proportions(records: Sequence[Fixations], sizes: Mapping[str, tuple[i
     return [
         f"{count} of {len({record.picture for record in records})} pictures have other proportions than their frames, "
         f"such as {picture}, {width} × {height} in {frame[0]} × {frame[1]}: was it letterboxed on a screen? "
-        "(Fixations.in_picture)"
+        "(Fixations.in_picture; with scale=1 at its own size, with place= elsewhere)"
     ]
 
 

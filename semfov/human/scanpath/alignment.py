@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semfov.data.fixations.record import as_array, as_path
+from semfov.data.fixations.record import as_array, as_path, check_sides
 from semfov.errors import check, check_number, check_whole
 from semfov.human.scanpath.sequence import cell_labels
 
@@ -85,7 +85,7 @@ def multimatch(
     """
     a = as_path(ours, "ours")
     b = as_path(theirs, "theirs")
-    check(all(np.isfinite(side) and side > 0 for side in size), "size", "(width, height), positive numbers", size)
+    check_sides("size", size)
     if len(a) < 3 or len(b) < 3:
         return MultiMatch(*[float("nan")] * 5)
     diagonal = float(np.hypot(*size))
@@ -127,9 +127,10 @@ def _distances(first: NDArray[np.number], second: NDArray[np.number]) -> _Array:
 
 def _checked_durations(durations: tuple[ArrayLike, ArrayLike], first: int, second: int) -> tuple[_Array, _Array]:
     """Take the durations of two scanpaths of some numbers of fixations, and check them."""
+    check(len(durations) == 2, "durations", "those of both scanpaths", f"{len(durations)} of them")
     s, t = (as_array(values, "durations") for values in durations)
     expected = f"{first} and {second} numbers, one for each fixation"
-    check(len(s) == first and len(t) == second, "durations", expected, (len(s), len(t)))
+    check(s.shape == (first,) and t.shape == (second,), "durations", expected, (s.shape, t.shape))
     is_usable = bool((s >= 0).all() and (t >= 0).all() and np.isfinite([s.sum(), t.sum()]).all())
     check(is_usable, "durations", "finite numbers of 0 or more", "others")
     return s, t
@@ -204,8 +205,10 @@ def scanmatch(
     check_number(threshold, "threshold", 1e-6, 1e6)
     check_number(gap, "gap", -1e6, 0)
     check_number(bin_ms, "bin_ms", 1e-6, 1e6)
+    check(len(cells) == 2, "cells", "(columns, rows)", cells)
     for count in cells:
         check_whole(count, "cells", 1, 1000)
+    check(durations is None or len(durations) == 2, "durations", "those of both scanpaths", durations)
     words = []
     for number, path in enumerate((as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1))):
         word = cell_labels(path, *cells, size)

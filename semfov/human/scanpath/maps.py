@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.data.fixations.record import as_array
-from semfov.errors import check, check_number
+from semfov.errors import check, check_number, check_whole
 
 _Array = NDArray[np.float64]
 
@@ -97,7 +97,9 @@ def auc_borji(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, *, draws: int = 1
     0.9
     """
     values, fixated = _looked_up(saliency, x, y)
-    check(fixated.size > 0 and draws > 0, "x, draws", "at least one", (fixated.size, draws))
+    check(fixated.size > 0, "x, y", "at least one fixation", "none")
+    check_whole(draws, "draws", 1, 1_000_000)
+    check_whole(seed, "seed", 0, 2**63 - 1)
     samples = np.random.default_rng(seed).choice(values.reshape(-1), (draws, fixated.size))
     areas = [_share_below(np.sort(sample), fixated.reshape(-1)).mean() for sample in samples]
     return float(np.mean(areas))

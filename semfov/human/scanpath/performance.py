@@ -56,7 +56,10 @@ def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: i
     >>> mean_performance([1, -1, 0], ["ann", "ann", "bob"], 1)
     array([0.5 , 0.75])
     """
-    shifts_found = as_numbers(found, "found").tolist()
+    numbers = as_numbers(found, "found")
+    are_shifts = bool(((numbers == numbers.floor()) & (numbers >= -1)).all())
+    check(are_shifts, "found", "numbers of gaze shifts, and -1 where the target was not found", numbers.tolist()[:5])
+    shifts_found = numbers.tolist()
     names = as_labels(groups, "groups")
     expected = f"one for each of {len(shifts_found)} searches, at least one"
     check(len(shifts_found) == len(names) > 0, "groups", expected, len(names))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.data.fixations.record import as_array, as_path
+from semfov.errors import check
 
 _Array = NDArray[np.float64]
 
@@ -49,13 +50,20 @@ def length_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> length_distance([1.0, 2.0], [2.0, 3.0])
     1.0
     """
-    a = np.sort(as_array(ours, "ours", finite=True))
-    b = np.sort(as_array(theirs, "theirs", finite=True))
+    a = np.sort(_sample(ours, "ours"))
+    b = np.sort(_sample(theirs, "theirs"))
     if not (len(a) and len(b)):
         return float("nan")
     lengths = np.sort(np.concatenate([a, b]))
     gap = _distribution(a, lengths) - _distribution(b, lengths)
     return float((np.abs(gap[:-1]) * np.diff(lengths)).sum())
+
+
+def _sample(values: ArrayLike, argument: str) -> _Array:
+    """Take a sample of finite numbers `(n,)`."""
+    sample = as_array(values, argument, finite=True)
+    check(sample.ndim == 1, argument, "numbers in a row", f"shape {sample.shape}")
+    return sample
 
 
 def _distribution(sample: _Array, values: _Array) -> _Array:
@@ -78,8 +86,8 @@ def direction_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> direction_distance([3.0], [-3.0]).__round__(3)
     0.283
     """
-    a = np.sort((as_array(ours, "ours", finite=True) + np.pi) % (2 * np.pi))
-    b = np.sort((as_array(theirs, "theirs", finite=True) + np.pi) % (2 * np.pi))
+    a = np.sort((_sample(ours, "ours") + np.pi) % (2 * np.pi))
+    b = np.sort((_sample(theirs, "theirs") + np.pi) % (2 * np.pi))
     if not (len(a) and len(b)):
         return float("nan")
     angles = np.concatenate([[0.0], np.sort(np.concatenate([a, b])), [2 * np.pi]])

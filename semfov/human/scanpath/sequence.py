@@ -7,11 +7,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semfov.data.fixations.record import as_array, as_path
-from semfov.errors import InputError, check
+from semfov.data.fixations.record import as_path, check_sides
+from semfov.errors import InputError, check, check_number, check_whole
 from semfov.metrics.labels import as_labels
 
 _Labels = NDArray[np.int64]
+
+_MOST_CELLS = 1_000_000  # in a row, and in a column
 
 
 def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, float]) -> _Labels:
@@ -32,7 +34,10 @@ def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, f
     >>> cell_labels([[0, 0], [99, 0], [99, 99]], 2, 2, (100, 100))
     array([0, 1, 3])
     """
-    shares = (as_path(points, "points") + 0.5) / as_array(size, "size")  # of the picture's width and height
+    check_whole(columns, "columns", 1, _MOST_CELLS)
+    check_whole(rows, "rows", 1, _MOST_CELLS)
+    check_sides("size", size)
+    shares = (as_path(points, "points") + 0.5) / size  # of the picture's width and height
     outside = int((~((shares >= 0) & (shares <= 1))).any(-1).sum())
     check(outside == 0, "points", f"points inside a picture of {size} pixels", f"{outside} outside it; remove them")
     # A point on the last edge belongs to the last cell.
@@ -87,8 +92,9 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Cluste
         from sklearn.cluster import MeanShift
     except ImportError:
         raise InputError("cluster_labels needs scikit-learn: pip install semfov[human]") from None
-    points = as_path(others, "others")
-    check(len(points) > 0, "others", "at least one fixation", "none")
+    points = as_path(others, "others", least=1)
+    if bandwidth is not None:
+        check_number(bandwidth, "bandwidth", 1e-9, 1e9)
     shift = MeanShift(bandwidth=bandwidth, bin_seeding=True)
     with warnings.catch_warnings():
         # The warning says that no two fixations share a bin. All of them are seeds then, which does no harm.
@@ -177,7 +183,8 @@ def merge_close(points: ArrayLike, size: tuple[float, float]) -> NDArray[np.floa
            [9., 9.]])
     """
     path = list(as_path(points, "points"))
-    half = as_array(size, "size") / 2
+    check_sides("size", size)
+    half = np.array(size) / 2
     index = 0
     while index < len(path) - 1:
         if (np.abs(path[index] - path[index + 1]) < half).all():

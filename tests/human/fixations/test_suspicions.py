@@ -226,3 +226,31 @@ def test_pictures_at_their_own_size_are_told_with_their_sizes_and_without():
     one = [replace(each, picture="a.jpg", subject=each.picture) for each in own]
     assert suspicions(one) == []
     assert len(suspicions(one, {"a.jpg": (400, 300)})) == 1
+
+
+DRAWN = np.random.default_rng(0).normal((400, 300), (180, 130), (400, 2)).clip(0, (799, 599))
+"""Fixations in a picture of 800 × 600."""
+
+
+@pytest.mark.parametrize(
+    ("shown", "frame", "said"),
+    [
+        (DRAWN + np.array([560, 240]), (1920, 1080), "at its own size"),
+        (DRAWN, (1920, 1080), "no fixation lies beyond the pixels of its picture"),
+        (DRAWN * 1.8 + (240, 0), (1920, 1080), "no x lies in 13 %"),
+        (
+            DRAWN * 1.5 + (360, 90),
+            (1920, 1080),
+            r"other proportions .* \(Fixations.in_picture; with scale=1 at its own size",
+        ),
+        ((DRAWN - (400, 300)) / 35, (1920, 1080), "points look like degrees from the centre"),
+        (DRAWN - (400, 300), (1920, 1080), "points look like pixels from the centre"),
+    ],
+    ids=["own size", "own size in the corner", "letterboxed", "smaller", "degrees", "centre"],
+)
+def test_where_a_picture_was_shown_is_said_once(shown, frame, said):
+    """What is clear from the fixations is not asked again by proportions that differ."""
+    people = [Fixations("a.jpg", str(n), shown[n::20], frame) for n in range(20)]
+    first, *others = suspicions(people, {"a.jpg": (800, 600)})
+    assert re.search(said, first)
+    assert all("letterboxed" in first and "letterboxed" in other for other in others)

@@ -129,7 +129,9 @@ def test_invalid_and_short_scanpaths_are_refused_by_name():
     assert all(map(math.isnan, multimatch([[0, 0], [1, 1]], [[0, 0], [1, 1], [2, 2]], (10, 10))))
     refused(r"^ours:", multimatch, [0, 1, 2], [[0, 0]] * 3, (10, 10))
     refused(r"^theirs:", multimatch, [[0, 0]] * 3, [0, 1, 2], (10, 10))
-    with pytest.raises(InputError, match=r"^durations: expected 3 and 4 numbers, one for each fixation, got \(3, 2\)"):
+    with pytest.raises(
+        InputError, match=r"^durations: expected 3 and 4 numbers, one for each fixation, got \(\(3,\), \(2,\)\)"
+    ):
         multimatch([[0, 0]] * 3, [[0, 0]] * 4, (10, 10), ([1, 2, 3], [1, 2]))
     refused(r"^points: .*got 2 outside it", cell_labels, [[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
     for figure in [sequence_score, edit_distance]:
