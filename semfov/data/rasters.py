@@ -1,5 +1,6 @@
 """TIFFs and rasters, which are read window by window: by tifffile, by GDAL, or by Pillow where both leave them."""
 
+import warnings
 import weakref
 from contextlib import suppress
 from os import PathLike
@@ -225,6 +226,8 @@ def _open_tiff(path: str | PathLike[str], white: White | None, bands: ChosenBand
     try:
         return RasterPicture(path, white=white, bands=bands)
     except DataError:
+        if tiff.has_mask():
+            warnings.warn(f'image {path}: its mask is not read; pip install "semfov[geo]"', stacklevel=2)
         return tiff
 
 

@@ -156,12 +156,18 @@ class TiffPicture(LargePicture):
 
     def stands_alone(self) -> bool:
         """Tell whether the file has no reduced copies and no masks of the picture, of which tifffile knows nothing."""
+        # The channels of GDAL are those of one page.
+        has_copies = bool(self.page.subifds) and not self._tiles.has_layers
+        return not has_copies and not any(kind & (REDUCED | MASK) for kind in self._kinds())
+
+    def has_mask(self) -> bool:
+        """Tell whether the file has a mask of the picture, which is not read."""
+        return any(kind & MASK for kind in self._kinds())
+
+    def _kinds(self) -> list[int]:
+        """List what the pages after the first are; one that has the tags of the first has none of its own."""
         with opening(self.path, "opened"):
-            # A page that has the tags of the first has none of its own, and is neither.
-            kinds = [getattr(page, "subfiletype", 0) for page in self.file.pages[1:]]
-            # The channels of GDAL are those of one page.
-            has_copies = bool(self.page.subifds) and not self._tiles.has_layers
-            return not has_copies and not any(kind & (REDUCED | MASK) for kind in kinds)
+            return [getattr(page, "subfiletype", 0) for page in self.file.pages[1:]]
 
     def _values(self, box: Box) -> Values:
         """Read the values of the channels in a window, the alpha last, `(h, w, C)`."""

@@ -1,6 +1,7 @@
 """The product of what a picture's file may be: every reader shows what its numbers say."""
 
 import itertools
+import sys
 from contextlib import nullcontext
 
 import numpy as np
@@ -352,3 +353,17 @@ def test_more_than_8_bits_of_jpeg_2000_need_the_reader_that_keeps_them(tmp_path)
     unusable(r"expected white=None beside more than 8 bits.*\.jp2", read_image, tmp_path / "a.j2k", white=4080)
     for got in shown(tmp_path / "a.jp2", white=4080):
         assert np.abs(got - pixels(HIGH, WIDE)[..., :1]).max() <= 0.51
+
+
+def test_without_its_reader_a_mask_is_missed_with_a_word(tmp_path, monkeypatch):
+    rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
+    shape = {"width": WIDE, "height": HIGH, "count": 3, "dtype": "uint8", "photometric": "rgb"}
+    shape["transform"] = rasterio.transform.Affine.scale(2.0)
+    path = tmp_path / "a.tif"
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "w", driver="GTiff", **shape) as file:
+        file.write(np.moveaxis(pixels(HIGH, WIDE), -1, 0))
+        file.write_mask(np.zeros((HIGH, WIDE), np.uint8))
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    for read in (open_large, read_image):
+        with pytest.warns(UserWarning, match=r'its mask is not read; pip install "semfov\[geo\]"'):
+            read(path)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from numbers import Real
+from pathlib import PureWindowsPath
 
 import numpy as np
 import torch
@@ -295,6 +296,15 @@ class Fixations:
     def inside(self) -> NDArray[np.bool_]:
         """Whether each fixation is inside the frame, `(n,)` boolean."""
         return np.asarray(((self.points >= -0.5) & (self.points < np.array(self.size) - 0.5)).all(1))
+
+
+def bare_name(picture: str) -> str:
+    r"""Take the name of a picture without folders, whatever system has written them, and without the suffix.
+
+    >>> bare_name("C:\\pictures\\1013.jpg"), bare_name("pictures/1013.jpg")
+    ('1013', '1013')
+    """
+    return PureWindowsPath(picture).stem  # which takes both kinds of slashes
 
 
 def by_picture(fixations: Iterable[Fixations]) -> dict[str, list[Fixations]]:

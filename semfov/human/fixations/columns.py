@@ -125,8 +125,10 @@ def table_of(source: str | PathLike[str] | DataFrame) -> Table:
     """
     if isinstance(source, str | PathLike):
         return _table_of_file(Path(source), str(source))
-    is_frame = hasattr(source, "to_dict") and hasattr(source, "columns")
-    expected = "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists)"
+    is_frame = hasattr(source, "itertuples") and hasattr(source, "columns")
+    expected = (
+        "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists, source.to_pandas() of Polars)"
+    )
     check(is_frame, "source", expected, f"a {type(source).__name__}")
     return _table_of_frame(source)
 

@@ -4,12 +4,11 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations.record import Fixations, Letterbox
+from semfov.data.fixations.record import Fixations, Letterbox, bare_name
 from semfov.errors import check
 
 _Array = NDArray[np.float64]
@@ -322,9 +321,9 @@ def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], pic
         "the picture was shown at its own size)"
     )
     check(_alike(fixations.size, size), argument, expected, got)
-    name = Path(picture or fixations.picture).stem
+    name = bare_name(picture or fixations.picture)
     remedy = "if both are one picture, dataclasses.replace(fixations, picture=…) names it"
-    is_same = Path(fixations.picture).stem == name
+    is_same = bare_name(fixations.picture) == name
     check(is_same, argument, f"fixations in {name!r}", f"in {fixations.picture!r}; {remedy}")
 
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterable, Sequence, Sized
 from os import PathLike
-from pathlib import Path
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.fixations import Fixations
+from semfov.data.fixations.record import bare_name
 from semfov.errors import check
 from semfov.human.fixations.reading import read_fixations
 from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
@@ -165,8 +165,8 @@ def _fixations_in_file(path: str | PathLike[str], picture: str | None) -> list[F
     table = read_fixations(path)
     if picture is None:
         return [*table]
-    name = Path(picture).stem
-    viewed = [fixations for fixations in table if Path(fixations.picture).stem == name]
+    name = bare_name(picture)
+    viewed = [fixations for fixations in table if bare_name(fixations.picture) == name]
     check(len(viewed) > 0, "people", f"fixations in {name!r}", f"others, such as those in {table[0].picture!r}")
     return viewed
 

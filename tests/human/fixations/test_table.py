@@ -263,3 +263,10 @@ def test_a_record_takes_lists_and_tensors_and_refuses_what_is_no_size():
         (([[1, 2]], (80, float("nan"))), "size: expected a width and a height above 0"),
     ):
         refused(said, Fixations, "a.jpg", "1", *given)
+
+
+def test_frames_of_other_libraries_are_refused_with_the_call_that_converts_them():
+    class Frame:
+        columns = ("picture", "x")
+
+    refused(r"expected a file, or a pandas.DataFrame \(.*source\.to_pandas\(\) of Polars", read_fixations, Frame())

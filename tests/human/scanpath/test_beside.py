@@ -106,3 +106,12 @@ def test_what_cannot_be_compared_is_refused():
     assert back["sequence score"].scanpath == compare_scanpath(mine, [mine, *others])["sequence score"].scanpath
     rounded = compare_scanpath(mine.resized((641, 480)), others)
     assert rounded["AUC"].scanpath == pytest.approx(compare_scanpath(mine, others)["AUC"].scanpath, abs=0.01)
+
+
+def test_pictures_are_the_same_in_whatever_folder_a_tracker_saw_them():
+    path = Fixations("a.jpg", "1", np.array([[10.0, 10], [60, 10], [60, 40]]), (80, 60))
+    for name in ("a", "b/a.png", "C:\\pictures\\a.jpg"):
+        assert compare_scanpath(path, [replace(path, picture=name)])["sequence score"].scanpath == 1
+    refused(
+        "people: expected fixations in 'a', got in", compare_scanpath, path, [replace(path, picture="C:\\a\\b.jpg")]
+    )
