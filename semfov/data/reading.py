@@ -18,13 +18,16 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
 
     The EXIF orientation is applied, so the image has the orientation that viewers show. Grey images get three equal
     channels, CMYK and YCbCr are converted to RGB, and transparent pixels are blended with white. Grey images of 16 bits
-    keep their precision. The first frame of an animation is read. Colour profiles are not applied.
+    keep their precision (TIFFs: without `white`). The first frame of an animation, or page of a TIFF, is read. Colour
+    profiles are not applied.
 
     Args:
-        path: a file of JPEG, JPEG 2000, PNG, WebP, AVIF, HEIF, TIFF, GIF, BMP or PPM, whatever its name.
+        path: a file of JPEG, JPEG 2000, PNG, WebP, AVIF, TIFF, GIF, BMP or PPM, whatever its name, and of HEIF where
+            pillow-heif is registered.
         oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
         white: the value that is white where 0 is black, such as 4095 for 12 bits; the values `(black, white)`; or
-            `auto`, for the 1st and the 99th percentile. None: the largest value of the file's type, and 1 for floats.
+            `auto`, for the 1st and the 99th percentile. None: the largest value of the bits that the file states, and
+            1 for floats.
 
     Returns:
         `(3, H, W)`, float32 in [0, 1].

@@ -347,5 +347,5 @@ def _of_no_program(table: Table) -> str:
     are_samples = any(map(_GAZE.search, keys)) and not any(map(_PLACE.search, keys))
     remedy = "name them by columns={…}"
     if are_samples:
-        remedy = f"these look like samples, in which fixations are to be found first; of fixations {remedy}"
+        remedy = f"these look like samples, in which fixations are to be found first; else {remedy}"
     return f"expected the columns of a table of {programs}, or picture, subject, x and y, got {got}; {remedy}"
