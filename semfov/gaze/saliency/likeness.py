@@ -131,5 +131,8 @@ def pooled(features: FeatureMaps, layers: Iterable[str]) -> Tensor:
         maps = features.maps[name]
         rows, columns = sides_of(features, (int(maps.shape[-2]), int(maps.shape[-1])))
         part = maps[..., rows.first : rows.stop, columns.first : columns.stop].float().flatten(2)
-        values += [part.mean(2), part.std(2, correction=0).clamp(min=_LEAST).log()]
+        means = part.mean(2, keepdim=True)
+        # `Tensor.std` along rows takes twenty times as long.
+        deviations = torch.linalg.vector_norm(part - means, dim=2) / part.shape[2] ** 0.5
+        values += [means[..., 0], deviations.clamp(min=_LEAST).log()]
     return torch.cat(values, 1)
