@@ -50,10 +50,11 @@ def fit_gaze(config: FitGazeConfig) -> None:
     """Look at all pictures, evaluate on folds, fit to all, and write model and report."""
     prepare_worker()
     detector = load_detector(config.detector.name, **detector_options(config.detector))
-    model, scored = fit_gaze_model(config, detector, config.out / "folds")
+    fitted = fit_gaze_model(config, detector, config.out / "folds")
     path = model_path(config, detector.name)
-    model.save(path)
-    write_outputs(config, gaze_report(scored), ("folds.json", json.dumps(summaries(scored), indent=2) + "\n"), path)
+    fitted.model.save(path)
+    means = json.dumps(summaries(fitted.scores[fitted.way]), indent=2)
+    write_outputs(config, gaze_report(fitted), ("folds.json", f"{means}\n"), path)
 
 
 main = command(fit_gaze, FitGazeConfig, __doc__)

@@ -155,10 +155,10 @@ def fit_folder(config: FitDetectorConfig) -> None:
 def _fit_gaze(config: FitDetectorConfig) -> None:
     """Fit where people look, and write the model and its report."""
     settings = replace(config.gaze, cache=config.gaze.cache or config.cache)
-    model, scores = fit_gaze_model(settings, make_detector(config.detector), config.out / "progress" / "gaze")
+    fitted = fit_gaze_model(settings, make_detector(config.detector), config.out / "progress" / "gaze")
     path = config.out / "gaze.safetensors"
-    text = gaze_report(scores)
-    model.save(path)
+    text = gaze_report(fitted)
+    fitted.model.save(path)
     write_text(config.out / "gaze.md", text)
     print(text, "written:", f"  {path}", f"  {config.out / 'gaze.md'}", sep="\n")
     print(f"\nnext:\n  semfov gaze PHOTO.jpg --detector {config.model} --model {path}")

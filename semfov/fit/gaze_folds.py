@@ -18,7 +18,8 @@ from semfov.runs.scene_run import digest_of
 Scores = dict[tuple[str, int], Tensor]
 """By row and data set, NSS, AUC and log likelihood in bits above uniform, means of each picture `(P, 3)`."""
 
-_Groups = Callable[[], Sequence[Viewed]]  # gives the pictures, by data set and size
+Groups = Callable[[], Sequence[Viewed]]
+"""Gives the pictures, by data set and size."""
 
 CENTRE = "centre bias"
 ROWS = {False: ("map", "map and centre bias"), True: ("map and oculomotor biases", "all terms")}
@@ -37,7 +38,7 @@ class Fold:
         judges: gives the same pictures, with the fixations that are predicted.
     """
 
-    def __init__(self, groups: _Groups, number: int, count: int, settings: GazeFit) -> None:
+    def __init__(self, groups: Groups, number: int, count: int, settings: GazeFit) -> None:
         self.groups = groups
         self.number = number
         self.count = count
@@ -51,7 +52,7 @@ class Fold:
         return {"fit": self.settings.plain(), "fold": [self.number, self.count]}
 
     @cached_property
-    def _split(self) -> list[tuple[list[int], list[int]]]:
+    def split(self) -> list[tuple[list[int], list[int]]]:
         """For each group the other pictures and those held out."""
         pictures_before: dict[int, int] = {}  # of the data set in earlier groups
         split = []
@@ -68,7 +69,7 @@ class Fold:
         """Return the pictures of each group that models are fitted to, of one data set or of all."""
         return [
             others if source in (None, group.source) else []
-            for group, (others, _) in zip(self.groups(), self._split, strict=True)
+            for group, (others, _) in zip(self.groups(), self.split, strict=True)
         ]
 
     @cached_property
@@ -88,7 +89,7 @@ class Fold:
     def scores(self, model: FixationDensity) -> Scores:
         """Score a model on the held-out pictures with and without each term, and the centre bias of each data set."""
         scores: dict[tuple[str, int], list[Tensor]] = {}
-        for group, judge, (_, held_out) in zip(self.groups(), self.judges(), self._split, strict=True):
+        for group, judge, (_, held_out) in zip(self.groups(), self.judges(), self.split, strict=True):
             for row, of_pictures in self._group_scores(model, group, judge, held_out).items():
                 scores.setdefault((row, group.source), []).append(of_pictures)
         return {key: torch.cat(parts) for key, parts in scores.items()}

@@ -1,9 +1,9 @@
-"""A model of where people look for a detector: fitted to all pictures, and evaluated on folds of them."""
+"""A model of where people look for a detector: fitted anew or adapted, and evaluated on folds of the pictures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from semfov.data.fixations import Fixations
 from semfov.detection.detector import Detector
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, fitted_density
+from semfov.fit.gaze_adapted import AdaptedFold, adapted_density
 from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores
 from semfov.fit.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -19,6 +20,9 @@ from semfov.gaze.saliency.likeness import FEWEST, PictureLikeness, pooled
 from semfov.io.ranges import Whole
 from semfov.runs.tables import table
 
+ANEW = "fitted anew"
+ADAPTED = "the shipped model, adapted by four numbers"
+_FEWEST_ADAPTED = 4  # pictures of a fold to which a model is adapted
 _DURATIONS = 5  # numbers of fixations with a duration of their own; later ones have that of the last
 
 
@@ -30,6 +34,8 @@ class GazeModelFit(ViewingData):
         layers: names of the feature maps (none: those of the shipped model, or of backbone and head at
             strides 8 to 32 that the detector has).
         folds: number of folds for the evaluation, 2 or more (0: none).
+        adapt: also adapt the model that is shipped for the detector, and keep the one that predicts held-out pictures
+            better; not for pictures that it was fitted to.
         fit: how the model is fitted.
     """
 
@@ -37,6 +43,7 @@ class GazeModelFit(ViewingData):
 
     layers: tuple[str, ...] = ()
     folds: Whole = 5
+    adapt: bool = True
     fit: GazeFit = field(default_factory=GazeFit)
 
     def __post_init__(self) -> None:
@@ -81,8 +88,22 @@ def _timed(group: Viewed) -> Iterator[Fixations]:
                 yield scanpath
 
 
-def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tuple[FixationDensity, Scores]:
-    """Look at all pictures, evaluate on folds, and fit to all.
+class FittedGaze(NamedTuple):
+    """A model of where people look, and how well it predicts.
+
+    Attributes:
+        model: the model.
+        way: how it was made, `ANEW` or `ADAPTED`.
+        scores: by way, the scores of models that were made without each fold.
+    """
+
+    model: FixationDensity
+    way: str
+    scores: Mapping[str, Scores]
+
+
+def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> FittedGaze:
+    """Look at all pictures, evaluate on folds, and make a model of all in the way that predicts best.
 
     Args:
         config: pictures, fixations, and how the model is fitted.
@@ -90,7 +111,7 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
         store: folder that keeps models and scores of folds.
 
     Returns:
-        The model, and the scores of models that were fitted without each fold.
+        The model, with the scores.
 
     Raises:
         InputError: no file of fixations is given, or one has too few pictures for the folds.
@@ -100,22 +121,58 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> tup
     groups = look(config, source)
     _check_pictures(config, groups)
     kept = FoldStore(store, {**source.what, "data": config.fingerprint})
-    folds = [Fold(lambda: groups, number, config.folds, config.fit) for number in range(config.folds)]
-    scores = kept.scores(detector.name, folds)
-    model = fitted_density(config.fit, groups, [list(range(len(group))) for group in groups], "all pictures")
+    numbers = range(config.folds)
+    scores = {ANEW: kept.scores(detector.name, [Fold(lambda: groups, n, config.folds, config.fit) for n in numbers])}
+    shipped = _adaptable(config, detector, groups)
+    if shipped is not None:
+        folds = [AdaptedFold(lambda: groups, number, config.folds, config.fit, shipped) for number in numbers]
+        scores[ADAPTED] = kept.scores(f"{detector.name} adapted", folds)
+    way = max(scores, key=lambda way: _likelihood(scores[way]) if config.folds else 0.0)
+    everything = [list(range(len(group))) for group in groups]
+    if shipped is None or way == ANEW:
+        model = fitted_density(config.fit, groups, everything, "all pictures")
+        model.likeness = fitted_likeness(model, groups)
+    else:
+        model = adapted_density(shipped, groups, everything, "adapting, all pictures")
     _describe_viewing(model, groups)
-    model.likeness = fitted_likeness(model, groups)
     settings = detector.settings()
     model.metadata |= {
         "detector": {name: settings[name] for name in ("name", "digest", "input_size", "stretch")},
         "data": config.fingerprint,
         "training": {
             **config.fit.plain(),
+            "way": way,
             "pictures": sum(map(len, groups)),
             "scanpaths": sum(len(people) for group in groups for people in group.people),
         },
     }
-    return model, scores
+    return FittedGaze(model, way, scores)
+
+
+def _adaptable(config: GazeModelFit, detector: Detector, groups: Sequence[Viewed]) -> FixationDensity | None:
+    """Find the shipped model of a detector that can be adapted, and compared with one that is fitted anew.
+
+    Args:
+        config: the settings of the fit.
+        detector: the detector.
+        groups: the pictures.
+
+    Returns:
+        The model; None where there is none for the layers, where it was fitted to some of these pictures, which it
+        would predict too well, or where folds are too small.
+    """
+    shipped = FixationDensity.if_shipped(detector.name) if config.adapt else None
+    if shipped is None or shipped.layers != {name: maps.shape[1] for name, maps in groups[0].features.maps.items()}:
+        return None
+    is_new = not set(config.fingerprint) & set(shipped.metadata.get("data", []))
+    fewest = sum(map(len, groups)) * (config.folds - 1) // max(config.folds, 1)
+    return shipped if is_new and fewest >= _FEWEST_ADAPTED else None
+
+
+def _likelihood(scores: Scores) -> float:
+    """Average the log likelihood of fixations in held-out pictures, by map and centre bias; data sets count alike."""
+    means = [values[:, 2].mean() for (row, _), values in scores.items() if row == ROWS[False][1]]
+    return float(torch.stack(means).mean())
 
 
 def fitted_likeness(model: FixationDensity, groups: Sequence[Viewed]) -> PictureLikeness | None:
@@ -174,15 +231,17 @@ def _summary(metrics: Tensor, centre: Tensor) -> dict[str, float]:
     }
 
 
-def gaze_report(scores: Scores) -> str:
-    """Report the scores of folds in Markdown."""
-    if not scores:
+def gaze_report(fitted: FittedGaze) -> str:
+    """Report how well the ways to make a model predict held-out pictures, in Markdown."""
+    if not fitted.scores[ANEW]:
         return "fitted to all pictures; no folds were held out\n"
-    lines = []
-    for source, rows in summaries(scores).items():
-        cells = [["", "NSS", "AUC", "gain over the centre bias, bit/fixation"]]
-        for name, row in rows.items():
-            cells.append([name, *(f"{row[figure]:.3f}" for figure in ("NSS", "AUC", "gain"))])
-        lines += [f"Data set {source}: {rows[CENTRE]['pictures']} pictures, each held out once", ""]
-        lines += [*table(cells), ""]
+    lines = [f"Kept: {fitted.way}.", ""] if len(fitted.scores) > 1 else []
+    for way, scores in fitted.scores.items():
+        for source, rows in summaries(scores).items():
+            cells = [["", "NSS", "AUC", "gain over the centre bias, bit/fixation"]]
+            for name, row in rows.items():
+                cells.append([name, *(f"{row[figure]:.3f}" for figure in ("NSS", "AUC", "gain"))])
+            pictures = f"{rows[CENTRE]['pictures']} pictures, each held out once"
+            title = f"Data set {source}: {pictures}"
+            lines += [title if len(fitted.scores) == 1 else f"{title}; {way}", "", *table(cells), ""]
     return "\n".join(lines)
