@@ -13,6 +13,10 @@ Pictures unlike those of the fit: how well the gaze model tells pages, charts an
 
     python -m eval.human unlike --fitted "[osie/images, crowd/images]" --others photographs
 
+One view of each picture beside six, on held-out pictures:
+
+    python -m eval.human quality --fixations "[osie/fixations.json]" --pictures "[osie/images]"
+
 To continue a stopped run, give the same command again.
 """
 
@@ -20,6 +24,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from eval.human.quality import QualityConfig, compare_qualities
 from eval.human.search.compare import compare
 from eval.human.search.run import PeopleSearchConfig
 from eval.human.unlike import UnlikeConfig, tell_apart
@@ -30,6 +35,7 @@ JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
     "search": (compare, PeopleSearchConfig),
     "viewing": (compare_viewing, ViewingConfig),
     "unlike": (tell_apart, UnlikeConfig),
+    "quality": (compare_qualities, QualityConfig),
 }
 
 
@@ -38,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command_line = list(sys.argv[1:] if arguments is None else arguments)
     if not command_line or command_line[0] not in JOBS:
         print(__doc__)
-        print("`python -m eval.human search --help`, `… viewing --help` and `… unlike --help` list the settings.")
+        print("`python -m eval.human JOB --help` lists the settings of search, viewing, unlike or quality.")
         if command_line in (["--help"], ["-h"]):
             return 0
         got = repr(command_line[0]) if command_line else "nothing"

@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import Literal
+from functools import cached_property
+from itertools import product
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.fit.gaze import GazeFit, fit_oculomotor
-from semfov.fit.gaze_folds import Fold
+from semfov.fit.gaze_folds import Fold, Groups
 from semfov.fit.viewing import Viewed, counted, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
 
-Groups = Callable[[], Sequence[Viewed]]
-"""Gives the pictures, by data set and size."""
-
 Maps = Literal["features", "none", "other people"]
 """What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""
+
+_BLURS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.5)  # standard deviations in cells from which one is chosen
+_SHARES = (0.02, 0.05, 0.1, 0.15, 0.2)  # shares of the centre bias
+_JUDGED = 100  # pictures of a data set by which blur and share are chosen, about
+
+
+class Smoothing(NamedTuple):
+    """How the fixations of people are made a density.
+
+    Attributes:
+        blur: standard deviation of the Gaussian around each fixation, in cells.
+        share: share of the centre bias that is mixed in.
+    """
+
+    blur: float
+    share: float
 
 
 class StudiedFold(Fold):
@@ -62,7 +77,16 @@ class StudiedFold(Fold):
             return super().maps(model, group, pictures)
         if self._given == "none":
             return [torch.zeros(1, *cells_of(group.size))] * len(pictures)
-        return [others_of(group, each, self.centres[group.source]) for each in pictures]
+        smoothing = self.smoothings[group.source]
+        return [others_of(group, each, self.centres[group.source], smoothing) for each in pictures]
+
+    @cached_property
+    def smoothings(self) -> dict[int, Smoothing]:
+        """How people predict each other best in the pictures of each data set that models are fitted to."""
+        return {
+            source: likeliest_smoothing(self.groups(), self.fitted(source), centre)
+            for source, centre in self.centres.items()
+        }
 
 
 def spread(number: int, count: int) -> list[int]:
@@ -82,16 +106,50 @@ def viewed_by(group: Viewed, subjects: Collection[str]) -> Viewed:
     return replace(group, people=some)
 
 
-def others_of(group: Viewed, picture: int, centre: Tensor, *, blur: float = 1.3, share: float = 0.05) -> Tensor:
-    """Log density of the fixations of all other people, for each person of a picture, `(people, rows, columns)`.
+def others_of(group: Viewed, picture: int, centre: Tensor, smoothing: Smoothing) -> Tensor:
+    """Log density of the fixations of all other people, for each person of a picture, without first fixations.
 
-    Counts without first fixations are blurred by `blur` cells, and mixed with a `share` of the centre bias `centre`, a
-    log density `(rows, columns)`.
+    Args:
+        group: pictures of one size.
+        picture: number of the picture.
+        centre: log density of the centre bias, `(rows, columns)`.
+        smoothing: how fixations are made a density.
+
+    Returns:
+        `(people, rows, columns)`.
     """
     cells = cells_of(group.size)
     bias = F.interpolate(centre[None, None], cells, mode="bilinear")[0, 0].flatten().softmax(0)
     counts = counted(group.paths[picture], group.size, cells)
-    smooth = blurred(counts.sum(0) - counts, torch.tensor(blur)).flatten(1)
+    smooth = blurred(counts.sum(0) - counts, torch.tensor(smoothing.blur)).flatten(1)
     total = smooth.sum(1, keepdim=True)
-    density = (1 - share) * torch.where(total > 0, smooth / total, bias) + share * bias
+    density = (1 - smoothing.share) * torch.where(total > 0, smooth / total, bias) + smoothing.share * bias
     return density.log().unflatten(1, cells)
+
+
+def likeliest_smoothing(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], centre: Tensor) -> Smoothing:
+    """Choose the smoothing by which the fixations of each person are likeliest, given those of all others.
+
+    A fixed width would make people predict each other worse than they can, or the centre bias do part of it.
+
+    Args:
+        groups: pictures of one size each.
+        pictures: numbers of the pictures of each group.
+        centre: log density of the centre bias.
+
+    Returns:
+        Blur and share with the largest mean over pictures of the log likelihood of a fixation.
+    """
+    chosen = [(group, number) for group, numbers in zip(groups, pictures, strict=True) for number in numbers]
+    judged = chosen[:: max(1, len(chosen) // _JUDGED)]
+
+    def likelihood(smoothing: Smoothing) -> float:
+        """Average the log likelihood of a fixation over pictures."""
+        total = 0.0
+        for group, number in judged:
+            counts = counted(group.paths[number], group.size, cells_of(group.size))
+            log_density = others_of(group, number, centre, smoothing)
+            total += float((counts * log_density).sum() / counts.sum().clamp(min=1))
+        return total
+
+    return max((Smoothing(blur, share) for blur, share in product(_BLURS, _SHARES)), key=likelihood)

@@ -25,7 +25,9 @@ from semfov.gaze.saliency.likeness import PictureLikeness, pooled
 from semfov.io.files import write_text
 from semfov.io.ranges import Range, Seed
 from semfov.metrics.episodes import area_under_roc
+from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Settings
+from semfov.runs.setup import detector_options
 from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker
 
@@ -40,7 +42,7 @@ class UnlikeConfig(Settings):
         fitted: folders of the pictures of the fit; the distance is fitted to every second one, and measured on the
             others.
         others: folder of other photographs, on which nothing was fitted or chosen.
-        detectors: names of the detectors.
+        detectors: the detectors, each by name or by settings.
         count: number of drawn pictures of each kind.
         seed: seed of all drawn pictures.
         page: page with a place for the table (`<!-- table unlike -->` to `<!-- end -->`); none: it is left alone.
@@ -49,7 +51,7 @@ class UnlikeConfig(Settings):
 
     fitted: tuple[Path, ...] = ()
     others: Path | None = None
-    detectors: tuple[str, ...] = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
+    detectors: tuple[str | DetectorConfig, ...] = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
     count: Annotated[int, Range(2, 10_000)] = 40
     seed: Seed = 1
     page: Path | None = None
@@ -64,7 +66,8 @@ def tell_apart(config: UnlikeConfig) -> None:
     prepare_worker()
     files = [path for folder in config.fitted for path in picture_files(folder)]
     others = picture_files(config.others)
-    columns = {name: _measured(name, files, others, config) for name in config.detectors}
+    detectors = [DetectorConfig(name=each) if isinstance(each, str) else each for each in config.detectors]
+    columns = {each.name: _measured(each, files, others, config) for each in detectors}
     lines = unlike_table(columns)
     print("\n".join(lines))
     written = [config.out / "summary.md"]
@@ -75,9 +78,12 @@ def tell_apart(config: UnlikeConfig) -> None:
     print("written:", *(f"  {path}" for path in written), sep="\n")
 
 
-def _measured(name: str, files: Sequence[Path], others: Sequence[Path], config: UnlikeConfig) -> dict[str, Tensor]:
+def _measured(
+    detector: DetectorConfig, files: Sequence[Path], others: Sequence[Path], config: UnlikeConfig
+) -> dict[str, Tensor]:
     """Compute the distances of all pictures by their kind, with the feature maps of a detector."""
-    source = features_of(load_detector(name))
+    name = detector.name
+    source = features_of(load_detector(name, **detector_options(detector)))
     likeness = PictureLikeness.fitted(_pooled(_read(files[::2]), source, f"{name}, fit", len(files[::2])))
     made: dict[str, tuple[Iterable[Tensor], int]] = {
         FITTED: (_read(files[1::2]), len(files[1::2])),

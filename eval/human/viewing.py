@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eval.comparison.saliency import SALIENCY_CLASSES
-from eval.human.folds import Groups, Maps, StudiedFold, in_first, spread, viewed_by
+from eval.human.folds import Maps, StudiedFold, in_first, spread, viewed_by
 from eval.human.glimpses import glimpsed, glimpses_table
 from eval.page.origin import END, PLACE
 from semfov.detection.detections import Detections
@@ -26,7 +26,7 @@ from semfov.detection.load import load_detector
 from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, maps_of
-from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores
+from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Groups, Scores
 from semfov.fit.viewing import MapSource, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import cells_of
@@ -54,7 +54,8 @@ class ViewingConfig(ViewingData):
     """Comparison of models with people who view the same pictures without a task.
 
     Args:
-        detectors: detectors whose feature maps are read, each by name or by settings.
+        detectors: detectors whose feature maps are read, each by name or by settings. Without any, and without
+            saliency, people are compared with the centre bias alone.
         saliency: saliency models.
         studied: number of the detector that is also fitted to half of the people, and to the first data set alone.
         folds: number of folds; every picture is held out once.
@@ -79,7 +80,8 @@ class ViewingConfig(ViewingData):
 def compare_viewing(config: ViewingConfig) -> None:
     """Fit all models to the folds of the pictures, and write the tables."""
     check(len(config.fixations) > 0, "fixations", "at least one file", "none")
-    check(config.studied < len(config.detectors), "studied", "the number of a detector", config.studied)
+    is_there = config.studied < len(config.detectors) or not config.detectors
+    check(is_there, "studied", "the number of a detector", config.studied)
     prepare_worker()
     detectors = [DetectorConfig(name=each) if isinstance(each, str) else each for each in config.detectors]
     made: dict[str, Callable[[], MapSource]] = {name: partial(_saliency, name) for name in config.saliency}
@@ -95,7 +97,7 @@ def compare_viewing(config: ViewingConfig) -> None:
         own = replace(fit, **_OF_ONE_MAP) if name in config.saliency else fit
         folds = [Fold(groups, number, config.folds, own) for number in numbers]
         rows[name] = store.scores(name, _bar(folds, name))
-        if name == detectors[config.studied].name:
+        if detectors and name == detectors[config.studied].name:
             splits[f"{name}: all data sets, all people"] = rows[name]
             alone = replace(fit, saccade_epochs=0)
             if len(config.fixations) > 1:
@@ -110,7 +112,7 @@ def compare_viewing(config: ViewingConfig) -> None:
             if config.glimpses:
                 chosen = spread(len(config.people(0)), config.glimpses)
                 seen = glimpsed(name, opened, config.pictures[0], store, folds, chosen)
-    plain, store = cache(lambda: [_without_maps(group) for group in groups()]), FoldStore(config.out, {"data": data})
+    plain, store = cache(partial(look, config, _blank())), FoldStore(config.out, {"data": data})
     known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
     for name, maps in known.items():
         folds = [StudiedFold(plain, number, config.folds, fit, maps=maps) for number in numbers]
@@ -160,11 +162,14 @@ def covering(maps: Mapping[str, Tensor], size: tuple[int, int]) -> FeatureMaps:
     return FeatureMaps(maps, (columns, rows), placement, Detections.empty(0, 0))
 
 
-def _without_maps(group: Viewed) -> Viewed:
-    """Return the same viewing with a map of zeros alone."""
-    width, height = group.size[1], group.size[0]
-    zeros = torch.zeros(len(group), 1, *cells_of(group.size), dtype=torch.half)
-    return Viewed(covering({"none": zeros}, (height, width)), group.people, group.seconds, group.source)
+def _blank() -> MapSource:
+    """Give every picture a map of zeros, for models that read none."""
+
+    def maps(image: Tensor) -> FeatureMaps:
+        height, width = image.shape[-2:]
+        return covering({"none": torch.zeros(1, 1, *cells_of((height, width)))}, (height, width))
+
+    return MapSource(("none",), maps, {"none": 0})
 
 
 def _by_people(store: FoldStore, name: str, groups: Groups, fit: GazeFit, count: int) -> Scores:

@@ -1,6 +1,7 @@
 """The fit of where people look, on fixations that were drawn from a known density."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,15 +13,24 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from eval.human import main as compare
-from eval.human.folds import StudiedFold, others_of, viewed_by
+from eval.human.folds import Smoothing, StudiedFold, likeliest_smoothing, others_of, viewed_by
 from eval.human.glimpses import so_far
 from eval.human.viewing import covering
 from semfov import InputError, saliency
 from semfov.cli.main import main
 from semfov.data.fixations import Fixations, write_table
-from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, maps_of, score
+from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, fitted_density, maps_of, score
+from semfov.fit.gaze_adapted import adapted_density
 from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
-from semfov.fit.gaze_model import GazeModelFit, _describe_viewing, summaries
+from semfov.fit.gaze_model import (
+    ADAPTED,
+    ANEW,
+    GazeModelFit,
+    _describe_viewing,
+    fit_gaze_model,
+    gaze_report,
+    summaries,
+)
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.viewing import (
     Events,
@@ -77,7 +87,7 @@ def group():
 
 def test_a_fitted_map_is_high_where_people_looked_in_other_pictures(group):
     torch.manual_seed(0)
-    ((fitted, held),) = Fold(lambda: [group], 0, 4, GazeFit())._split
+    ((fitted, held),) = Fold(lambda: [group], 0, 4, GazeFit()).split
     model = saliency.FixationDensity({"backbone8": 3}, units=8, centre=log_centre([group], [fitted]))
     fit = GazeFit(epochs=60, saccade_epochs=15, rate=0.02, dropout=0.0)
 
@@ -140,7 +150,7 @@ def test_views_that_are_all_sharp_show_what_the_sharp_picture_shows(group):
 
 def test_the_density_of_other_people_is_that_of_their_blurred_fixations(group):
     """Twin: `scipy.ndimage.gaussian_filter`, far from the border."""
-    density = others_of(group, 5, torch.zeros(39, 52), blur=1.3, share=0.05).exp()
+    density = others_of(group, 5, torch.zeros(39, 52), Smoothing(1.3, 0.05)).exp()
     for person in range(len(group.paths[5])):
         counts = np.zeros((39, 52))
         for other, theirs in enumerate(group.paths[5]):
@@ -151,6 +161,83 @@ def test_the_density_of_other_people_is_that_of_their_blurred_fixations(group):
         np.testing.assert_allclose(density[person], expected, atol=1e-4)
 
 
+def test_the_blur_follows_the_spread_of_people(group):
+    """Twin: of all others, the likelihood of a person's fixations is largest at the smoothing that is chosen."""
+    centre = torch.zeros(39, 52)
+    chosen = {}
+    for spread in (0.2, 1.0):
+
+        def nearer(person, spread=spread):
+            middle = person.points.mean(0)
+            return replace(person, points=middle + spread * (person.points - middle))
+
+        scattered = replace(group, people=tuple(tuple(map(nearer, people)) for people in group.people))
+        chosen[spread] = likeliest_smoothing([scattered], [range(6)], centre)
+    assert chosen[0.2].blur < chosen[1.0].blur
+
+    def bits(smoothing):
+        """Sum over all fixations of people, one after the other."""
+        total = 0.0
+        for picture in range(6):
+            log_density = others_of(group, picture, centre, smoothing).numpy()
+            points = [path[1:].numpy() for path in group.paths[picture]]
+            logs = [log_density[k][tuple(((p[:, ::-1] + 0.5) * 52 / 80).astype(int).T)] for k, p in enumerate(points)]
+            total += float(np.concatenate(logs).mean())
+        return total
+
+    best = chosen[1.0]
+    others = [Smoothing(1.3, best.share), Smoothing(0.7, best.share), Smoothing(best.blur, 0.2)]
+    assert bits(best) >= max(bits(other) for other in others)
+
+
+def test_a_model_is_adapted_to_few_pictures(group):
+    """A model whose map, blur and centre are far off predicts others as well as before it was spoilt."""
+    torch.manual_seed(0)
+    fit = GazeFit(readouts=1, units=8, epochs=30, saccade_epochs=0, rate=0.02, dropout=0.0)
+    model = fitted_density(fit, [group], [range(16)], "a test")
+
+    def bits(model):
+        held = range(16, 24)
+        return float(score(model, group, maps_of(model, group, held), held, conditional=False)[0][:, 2].mean())
+
+    spoilt = deepcopy(model)
+    spoilt.out.mul_(3.0)
+    spoilt.blur.sub_(1.0)
+    spoilt.centre = (torch.arange(52.0) / 10).expand(39, 52).flatten().log_softmax(0).view(39, 52)
+    adapted = adapted_density(spoilt, [group], [range(8)], "a test")
+    assert bits(spoilt) < bits(model) - 0.5
+    assert bits(adapted) > bits(model) - 0.1
+    assert torch.equal(spoilt.centre[0], spoilt.centre[1])  # what was given stays
+
+
+def test_the_better_of_two_ways_is_kept(tmp_path, monkeypatch):
+    """A shipped model is adapted where pictures are few, unless it was fitted to them."""
+    everyone = []
+    for seed in range(8):
+        image, place = picture(seed)
+        Image.fromarray((image * 255).byte().permute(1, 2, 0).numpy()).save(tmp_path / f"{seed}.png")
+        everyone += people(seed, place, 2)
+    write_table(tmp_path / "people.csv", everyone)
+    detector = Shown("colours", ("none",), (80, 60), stride=4).eval()
+    monkeypatch.setattr(saliency.FixationDensity, "shipped", tmp_path / "shipped")
+    data = {"fixations": (tmp_path / "people.csv",), "pictures": (tmp_path,), "cache": tmp_path, "folds": 2}
+    good = GazeFit(readouts=1, units=8, epochs=40, saccade_epochs=0, rate=0.02, dropout=0.0)
+    alone = fit_gaze_model(GazeModelFit(**data, fit=good), detector, tmp_path / "alone")
+    assert [*alone.scores] == [ANEW]
+    alone.model.metadata["data"] = ["of other pictures"]
+    alone.model.save(tmp_path / "shipped/colours.safetensors")
+    poor = GazeModelFit(**data, fit=replace(good, epochs=1))
+    few = fit_gaze_model(poor, detector, tmp_path / "few")
+    assert few.way == ADAPTED
+    assert f"Kept: {ADAPTED}." in gaze_report(few)
+    few.model.save(tmp_path / "few.safetensors")
+    read = saliency.FixationDensity.from_pretrained(tmp_path / "few.safetensors")
+    torch.testing.assert_close(read.centre, few.model.centre)
+    alone.model.metadata["data"] = poor.fingerprint
+    alone.model.save(tmp_path / "shipped/colours.safetensors")
+    assert fit_gaze_model(poor, detector, tmp_path / "known").way == ANEW
+
+
 def test_people_are_predicted_by_the_others(group):
     """A density of other people predicts better than a centre bias, and is not that of a person's own fixations."""
     fit = GazeFit(saccade_epochs=1)
@@ -158,7 +245,7 @@ def test_people_are_predicted_by_the_others(group):
     scored = fold.scores(fold.fit())
     assert summary_of(scored["map and centre bias", 0], scored[CENTRE, 0])["gain"] > 1
     alone = viewed_by(group, {"0"})
-    assert float(others_of(alone, 5, torch.zeros(39, 52)).std()) < 1e-6
+    assert float(others_of(alone, 5, torch.zeros(39, 52), Smoothing(1.3, 0.05)).std()) < 1e-6
 
 
 def test_models_are_scored_by_other_people_and_read_again(group, tmp_path, monkeypatch):
@@ -205,7 +292,7 @@ def test_folds_hold_out_each_picture_once(group):
     """Also where the pictures of a data set have two sizes, and there is another data set."""
     few = replace(group, people=group.people[:11])
     groups = [few, replace(few, people=few.people[:5]), replace(few, source=1)]
-    splits = [Fold(lambda: groups, number, 3, GazeFit())._split for number in range(3)]
+    splits = [Fold(lambda: groups, number, 3, GazeFit()).split for number in range(3)]
     for place, each in enumerate(groups):
         assert sorted(one for split in splits for one in split[place][1]) == list(range(len(each)))
         for fitted, held in (split[place] for split in splits):
