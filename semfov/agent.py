@@ -29,12 +29,12 @@ from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
-from semfov.kinds import KindName
+from semfov.kinds import KindName, Quality
 from semfov.live import LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazePrediction, Record
-from semfov.paths.gaze import ScanpathLike
+from semfov.paths.viewed import ScanpathLike
 from semfov.presets import learned_chain_arguments, published_arguments, raw_arguments, recommended_arguments
 from semfov.settings import (
     ExploreSettings,
@@ -510,17 +510,19 @@ class ActivePerception(nn.Module):
         *,
         model: FixationDensity | str | PathLike[str] | None = None,
         seen: ScanpathLike | None = None,
+        quality: Quality = "quick",
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
     ) -> GazePrediction:
-        """Predict where people look in a picture that they view freely, from the features of one pass of the detector.
+        """Predict where people look in a picture that they view freely, from the features that the detector computes.
 
         Args:
-            picture: a photograph, as for `search`.
+            picture: a photograph, as for `search`, or a `semfov.Panorama`.
             model: a model fitted to the detector (`semfov fit`), its file or folder; None for the one that is shipped.
             seen: fixations, a record, or points, a pass for each; the prediction then knows only what the agent's fovea
                 has shown at them (`semfov.saliency.features_so_far`). None for the sharp picture.
+            quality: `quick`, one pass of the detector; or `best`, six.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
             bands: the bands that are shown, as for `search`.
@@ -533,8 +535,11 @@ class ActivePerception(nn.Module):
             DataError: the file of the picture or of the model cannot be read.
         """
         opened = OpenedPicture.of(picture, color, white, bands)
-        image = opened.image(self.eye.sensor.like)[0]
-        return GazePrediction.of(self.eye, image, model=model, source=opened.path, seen=seen)
+        image = opened.whole(self.eye.sensor.like)[0]
+        panorama = opened.is_panorama
+        return GazePrediction.of(
+            self.eye, image, model=model, source=opened.path, seen=seen, quality=quality, panorama=panorama
+        )
 
     @checked_keywords
     @documented_by(StreamSettings)

@@ -9,6 +9,9 @@ KindName = Literal["fovea", "windows", "head"]
 Drawing = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 """Figure that can be drawn of an episode."""
 
+Quality = Literal["quick", "best"]
+"""How a picture is looked at to predict where people look: once, or in six views."""
+
 
 @dataclass(frozen=True)
 class LookKind:

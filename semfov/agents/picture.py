@@ -18,7 +18,7 @@ from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
 from semfov.errors import InputError, SemfovError, check, lookup
 from semfov.head.camera import PanTiltCamera, open_scene
-from semfov.head.scenes import World
+from semfov.head.scenes import Panorama, World
 from semfov.kinds import KindName
 from semfov.paths import Record
 from semfov.settings import How
@@ -130,6 +130,27 @@ class OpenedPicture:
         expected = f"at most {MAX_PIXELS:,} pixels for a fovea"
         check(width * height <= MAX_PIXELS, "picture", expected, f"{width} × {height}; use how='windows'")
         return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether it is a `Panorama` with its picture."""
+        return isinstance(self.source, Panorama) and self.source.image() is not None
+
+    def whole(self, like: Tensor) -> Tensor:
+        """Read the pixels of a flat picture, or of a panorama.
+
+        Args:
+            like: as for `image`.
+
+        Returns:
+            As for `image`.
+
+        Raises:
+            InputError: it is another scene, or too large to be read as a whole.
+            DataError: the file cannot be read.
+        """
+        around = self.source.image() if isinstance(self.source, Panorama) else None
+        return around.to(like)[None] if isinstance(around, Tensor) else self.image(like)
 
     def _is_read_by_windows(self) -> bool:
         """Tell whether the pixels are read by windows, as those of a TIFF are."""

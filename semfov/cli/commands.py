@@ -163,13 +163,15 @@ usage: semfov gaze [PICTURE ...] [options]
   --detector NAME      the detector whose features are read: yolox-nano (default), yolov3-tiny, nanodet-plus-m-1.5x
   --weights FILE       its weights, where they are not downloaded
   --model FILE         a model for your own detector or of your own fixations, from semfov fit
+  --quality best       six passes of the detector in place of one (quick): windows and a mirror image, too
+  --panorama           pictures of 360°, whose left and right edge meet
   --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
   --seconds S          time for which each views a picture (default 3)
   --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
   --out FOLDER         scanpaths, and a heat map of each picture; with scanpaths comes a table of the pictures
   --report PAGE.html   a page with heat map, areas and scanpaths, in which to step through the fixations
   --areas NAME:L,T,R,B share of all fixations in areas: left, top, right and bottom edge in pixels; or a file .json with
-                       {"logo": [10, 20, 200, 80]}
+                       {"logo": [10, 20, 200, 80]}, or with these by picture, {"before.png": {"logo": …}, …}
   --compare            two pictures side by side: both maps on one scale, and what differs (default: a page,
                        semfov-compare.html)
 

@@ -122,7 +122,9 @@ class _GazeJob:
         image = OpenedPicture.of(source.picture()).image(torch.zeros(1))[0]
         file = None if source.file is None else str(source.file)
         given = None if self.options.model is None else self.model
-        prediction = GazePrediction.of(self.detector, image, model=given, source=file)
+        prediction = GazePrediction.of(
+            self.detector, image, model=given, source=file, quality=options.quality, panorama=options.panorama
+        )
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
         shares = {} if self.areas is None else prediction.share(self.areas)
         outcome: _Outcome = {
@@ -232,7 +234,7 @@ def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], sha
 def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> dict[str, object]:
     """List what the table of pictures says of a prediction."""
     facts: dict[str, object] = {"width": prediction.size[0], "height": prediction.size[1], "unlike": prediction.unlike}
-    facts["unlikeness"] = prediction.unlikeness
+    facts |= {"unlikeness": prediction.unlikeness, "caution": prediction.caution}
     for number, place in enumerate(prediction.first_fixations(), 1):
         facts |= {f"x {number}": place["x"], f"y {number}": place["y"], f"viewers {number}": place["share"]}
     return facts | {f"share of {area}": digits(share) for area, share in shares.items()}

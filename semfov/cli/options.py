@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from semfov.data.tone import White
 from semfov.errors import InputError
 from semfov.io.ranges import Count, Form, Range, Seed, Whole, Workers
-from semfov.kinds import Drawing
+from semfov.kinds import Drawing, Quality
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 from semfov.settings import (
@@ -217,6 +217,8 @@ class GazeOptions(DetectorOptions):
         recursive: also take the photographs of the folders in a folder.
         detector: name or file of the detector whose features are read, as for `semfov.load_detector`.
         model: file of a model for your own detector, from `semfov fit` (none: the one that is shipped).
+        quality: `quick`, one pass of the detector; or `best`, six, over windows and a mirror image, too.
+        panorama: each picture is a panorama of 360°, whose left and right edge meet.
         people: number of viewers whose scanpaths are drawn.
         seconds: time in seconds for which each views a picture.
         white: values that are black and white, as for `semfov search`.
@@ -227,7 +229,7 @@ class GazeOptions(DetectorOptions):
         report: HTML page to write, in which to step through the fixations.
         areas: areas of interest in pixels of each picture, of which the share of the fixations is said and drawn, as
             `logo:10,20,200,80` (left, top, right and bottom edge), several with blanks between them; or a JSON file,
-            `{"logo": [10, 20, 200, 80]}`.
+            `{"logo": [10, 20, 200, 80]}`, or one of each picture, `{"before.png": {"logo": …}, "after.png": …}`.
         compare: compare two pictures: both maps on one scale, what differs, and the shares of areas beside each other.
         quiet: print errors and warnings alone.
     """
@@ -235,6 +237,8 @@ class GazeOptions(DetectorOptions):
     pictures: tuple[str, ...] = ()
     recursive: bool = False
     model: Path | None = None
+    quality: Quality = "quick"
+    panorama: bool = False
     people: Annotated[int, Range(1, 1000)] = 15
     seconds: Annotated[float, Range(0.1, 60)] = 3.0
     white: str | None = None

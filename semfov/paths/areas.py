@@ -16,8 +16,12 @@ from semfov.io.files import read_json
 Area = tuple[float, float, float, float]
 """Left, top, right and bottom edge of a box, in pixels of the picture."""
 
-AreasLike = Mapping[str, Sequence[float]] | str | PathLike[str]
-"""Boxes by name; a text such as `logo:10,20,200,80 price:300,40,420,90`; or a JSON file of boxes by name."""
+Boxes = Mapping[str, Sequence[float]]
+"""Boxes by name."""
+
+AreasLike = Boxes | Mapping[str, Boxes] | str | PathLike[str]
+"""Boxes by name; the same for each picture by its name, where they lie elsewhere in each; a text such as
+`logo:10,20,200,80 price:300,40,420,90`; or a JSON file of one of the first two."""
 
 _MOST = 100  # areas of a picture
 _LONGEST = 60  # letters of a name
@@ -25,36 +29,45 @@ _NUMBER = r"-?\d+(?:\.\d+)?"
 _FORM = "areas by name as NAME:LEFT,TOP,RIGHT,BOTTOM, with blanks between them, or a file .json"
 
 
-def read_areas(areas: AreasLike, size: tuple[int, int]) -> dict[str, Area]:
+def read_areas(areas: AreasLike, size: tuple[int, int], names: Sequence[str] = ()) -> dict[str, Area]:
     """Read areas of interest, and check that they lie in a picture.
 
     Args:
-        areas: boxes by name, as left, top, right and bottom edge in pixels; a text; or a JSON file.
+        areas: boxes by name, as left, top, right and bottom edge in pixels; the same by picture; a text; or a file.
         size: `(width, height)` of the picture in pixels.
+        names: what the picture may be called where the boxes are by picture.
 
     Returns:
         The boxes by name, in their order.
 
     Raises:
-        InputError: an area has another form, is empty or reaches out of the picture.
+        InputError: an area has another form, is empty or reaches out of the picture, or there are none for the picture.
         DataError: the file cannot be read.
 
     >>> read_areas("logo:10,20,200,80 price:300,40,420,90", (640, 480))
     {'logo': (10.0, 20.0, 200.0, 80.0), 'price': (300.0, 40.0, 420.0, 90.0)}
+    >>> read_areas({"a.png": {"logo": (10, 20, 200, 80)}, "b.png": {"logo": (9, 9, 99, 99)}}, (640, 480), ["a.png"])
+    {'logo': (10.0, 20.0, 200.0, 80.0)}
     """
-    boxes = boxes_of(areas)
+    boxes: Mapping[str, object] = boxes_of(areas)
+    if boxes and all(isinstance(value, Mapping) for value in boxes.values()):
+        boxes_here = next((boxes[name] for name in names if name in boxes), None)
+        got = f"those of {', '.join(map(repr, boxes))}"
+        check(boxes_here is not None, "areas", f"boxes for {' or '.join(dict.fromkeys(names))}", got)
+        assert isinstance(boxes_here, Mapping)
+        boxes = boxes_here
     check(0 < len(boxes) <= _MOST, "areas", f"1 to {_MOST} areas by name", len(boxes))
     return {name: _checked(name, box, size) for name, box in boxes.items()}
 
 
-def boxes_of(areas: AreasLike) -> Mapping[str, Sequence[float]]:
+def boxes_of(areas: AreasLike) -> Boxes | Mapping[str, Boxes]:
     """Read the boxes by name from what a caller gave; `read_areas` checks them for a picture.
 
     Args:
         areas: as for `read_areas`.
 
     Returns:
-        The boxes by name.
+        The boxes by name, or those of each picture by its name.
 
     Raises:
         InputError: the text or the content of the file has another form.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
+from semfov.errors import check
 from semfov.paths.areas import AreasLike, percent
 from semfov.paths.gaze import GazePrediction
 
@@ -77,7 +78,8 @@ class Drafts:
         """Compute the shares of the fixations in areas of both drafts.
 
         Args:
-            areas: areas in pixels of each draft, as for `GazePrediction.share`.
+            areas: areas in pixels of each draft, as for `GazePrediction.share`. What moves between the drafts has its
+                box in each of them, by the names of the drafts.
 
         Returns:
             The shares by the name of the area.
@@ -88,6 +90,7 @@ class Drafts:
         """
         first = self.first.share(areas)
         second = self.second.share(areas)
+        check(first.keys() == second.keys(), "areas", f"the same areas in both drafts: {', '.join(first)}", [*second])
         return {name: AreaShares(first[name], second[name]) for name in first}
 
     def describe(self, areas: AreasLike | None = None) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, get_args
 
 import numpy as np
 import torch
@@ -18,18 +18,21 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations
-from semfov.detection import Detections, Detector, FeatureMaps
-from semfov.errors import InputError, check, check_number, check_whole, checked_keywords
+from semfov.detection import Detector, FeatureMaps
+from semfov.errors import InputError, check, check_number, check_whole, checked_keywords, lookup
 from semfov.eye import Eye
 from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density
 from semfov.gaze.saliency.glimpses import features_so_far
-from semfov.gaze.saliency.likeness import pooled
+from semfov.gaze.saliency.on_picture import interpolation
+from semfov.gaze.saliency.views import picture_terms
 from semfov.io.files import MADE_HERE, write_bytes
-from semfov.io.tables import digits
-from semfov.paths.areas import AreasLike, percent, read_areas, share_in
+from semfov.kinds import Quality
+from semfov.paths.areas import Area, AreasLike, percent, read_areas, share_in
 from semfov.paths.base import Record
+from semfov.paths.cautions import Cautions
 from semfov.paths.places import Place, are_apart, places_of
 from semfov.paths.stimulus import reduced_copy
+from semfov.paths.viewed import ScanpathLike, fixations_of
 from semfov.words import GAZE_PREDICTION, OtherWords
 
 if TYPE_CHECKING:
@@ -39,11 +42,9 @@ if TYPE_CHECKING:
 _MOST_FIXATIONS = 100  # of a drawn scanpath
 _SHORTEST = 60  # milliseconds of a fixation, by which the number of fixations in a time is bounded
 _VIEWERS = 100  # whose first fixations are counted
-_WIDE = 2  # width over height from which a picture is wider than those of the shipped models
 _MOST_FIRST = 10  # first fixations that can be asked for
-
-ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
-"""Fixations of one viewer: a record of people or of an agent, or points `(n, 2)` in pixels of the picture."""
+_BLANK = 2  # largest difference of bytes in a picture of one colour
+_ROUND = 1.5  # least width over height of a panorama
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -60,6 +61,7 @@ class GazePrediction(OtherWords):
         is_shipped: whether the model is the one that is shipped for the detector.
         unlikeness: distance of the picture from those of the fit, 1 where it begins to be unlike them
             (`semfov.gaze.saliency.PictureLikeness`); None where it is not known.
+        panorama: whether the left and the right edge of the picture meet.
 
     Example::
 
@@ -77,6 +79,7 @@ class GazePrediction(OtherWords):
     seen: int | None = None
     is_shipped: bool = False
     unlikeness: float | None = None
+    panorama: bool = False
 
     _other_words = GAZE_PREDICTION
 
@@ -89,8 +92,10 @@ class GazePrediction(OtherWords):
         model: FixationDensity | str | PathLike[str] | None = None,
         source: str | None = None,
         seen: ScanpathLike | None = None,
+        quality: Quality = "quick",
+        panorama: bool = False,
     ) -> Self:
-        """Predict where people look in a picture, from one pass of a detector.
+        """Predict where people look in a picture, from one pass of a detector, or from several.
 
         Args:
             looking: the detector, or an eye with it.
@@ -99,36 +104,56 @@ class GazePrediction(OtherWords):
             source: file of the picture.
             seen: fixations at which the eye has looked, or a record, in any size of the picture, or points in its
                 pixels; the prediction then knows only what the fovea has shown. None for the sharp picture.
+            quality: `quick`, one pass; or `best`, six passes, over windows and a mirror image, too.
+            panorama: whether it is a panorama of 360°, whose left and right edge meet. It is looked at in four windows
+                around it (`best`: eight), and no direction is the middle.
 
         Returns:
             The prediction.
 
         Raises:
-            InputError: no model is shipped for the detector, or the given one was fitted to another detector; or the
-                fixations of `seen` are not those of one viewer of this picture, or the sensor of the eye bends it.
+            InputError: no model is shipped for the detector, or the given one was fitted to another detector; the
+                fixations of `seen` are not those of one viewer of this picture, or the sensor of the eye bends it; or
+                `quality`, `panorama` and `seen` do not go together.
             DataError: the file of the model is missing or damaged.
         """
         detector = looking.detector if isinstance(looking, Eye) else looking
         fitted = _model_for(detector, model)
         size = int(image.shape[-1]), int(image.shape[-2])
+        lookup(quality, get_args(Quality), "quality")
+        is_wide = size[0] >= _ROUND * size[1]
+        check(is_wide or not panorama, "panorama", "a picture that is at least 1.5 times as wide as high", size)
+        suits = image.dtype == fitted.read.dtype and image.device == fitted.read.device
+        converted = fitted if suits else deepcopy(fitted).to(image)
+        number = None
         with torch.no_grad():
             if seen is None:
-                fixations = None
-                features = _sharp_features(detector, image, fitted)
+                terms, unlikeness = picture_terms(detector, image, converted, quality=quality, panorama=panorama)
             elif isinstance(looking, Eye):
-                fixations = _fixations_of(seen, "seen", size, source)
-                features = _foveal_features(looking, image, fixations, fitted)
+                alone = quality == "quick" and not panorama
+                check(alone, "seen", "None for a panorama and for quality='best', which a fovea does not show", "both")
+                fixations = fixations_of(seen, "seen", size, source)
+                number = len(fixations)
+                terms = converted.terms(_foveal_features(looking, image, fixations, fitted), size[::-1])
+                # What a fovea has shown is unlike a sharp picture, whatever the picture is.
+                unlikeness = None
             else:
                 raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
-            suits = image.dtype == fitted.read.dtype and image.device == fitted.read.device
-            terms = (fitted if suits else deepcopy(fitted).to(image)).terms(features, size[::-1])
-            # What a fovea has shown is unlike a sharp picture, whatever the picture is.
-            unlikeness = None if fitted.likeness is None or seen is not None else _unlikeness(fitted, features)
         on_processor = {name: term.cpu() for name, term in terms.items()}
-        number = None if fixations is None else len(fixations)
         photograph = reduced_copy(image)
+        if _is_blank(photograph):
+            # Only the padding around the picture would make a map.
+            on_processor["map"] = torch.zeros_like(on_processor["map"])
         return cls(
-            fitted, on_processor, size, photograph, source, number, is_shipped=model is None, unlikeness=unlikeness
+            fitted,
+            on_processor,
+            size,
+            photograph,
+            source,
+            number,
+            is_shipped=model is None,
+            unlikeness=unlikeness,
+            panorama=panorama,
         )
 
     @property
@@ -139,17 +164,8 @@ class GazePrediction(OtherWords):
     @property
     def caution(self) -> str | None:
         """Why the prediction may be wrong for this picture; None where nothing is known against it."""
-        width, height = self.size
-        cautions = []
-        if self.unlike:
-            cautions.append(
-                "this picture is unlike the photographs that the model learned from, so the map may be wrong"
-            )
-        if self.is_shipped and width <= height:
-            cautions.append("the model learned from pictures that are wider than high")
-        if self.is_shipped and width >= _WIDE * height:
-            cautions.append(f"the model learned from pictures of 4 : 3, and this one is {width / height:.1f} : 1")
-        return "; ".join(cautions) or None
+        blank = _is_blank(self.photograph)
+        return Cautions(self.size, self.unlike, blank, self.panorama, self.is_shipped).words()
 
     @cached_property
     def density(self) -> Tensor:
@@ -200,7 +216,7 @@ class GazePrediction(OtherWords):
     @cached_property
     def _places(self) -> list[Place]:
         """All places, as `peaks` orders them."""
-        return places_of(self.cells, self.size)
+        return places_of(self.cells, self.size, around=self.panorama)
 
     def first_fixations(self, count: int = 3) -> list[dict[str, float]]:
         """List where people look first, in order.
@@ -222,8 +238,8 @@ class GazePrediction(OtherWords):
         viewers = self._viewers(count) if len(self._first) < count else []
         while len(self._first) < count:
             cells = self.given(viewers, len(self._first) + 1)
-            places = places_of(cells, self.size)
-            apart = (place for place in places if are_apart(place, self._first, self.size))
+            places = places_of(cells, self.size, around=self.panorama)
+            apart = (place for place in places if are_apart(place, self._first, self.size, around=self.panorama))
             self._first.append(next(apart, places[0]))
         return [{**place} for place in self._first[:count]]
 
@@ -244,7 +260,8 @@ class GazePrediction(OtherWords):
 
         Args:
             areas: boxes by name, as left, top, right and bottom edge in pixels of the picture; a text such as
-                `logo:10,20,200,80 price:300,40,420,90`; or a JSON file, `{"logo": [10, 20, 200, 80]}`.
+                `logo:10,20,200,80 price:300,40,420,90`; or a JSON file, `{"logo": [10, 20, 200, 80]}`. Where they lie
+                elsewhere in each of several pictures, boxes by name for each picture by its name.
 
         Returns:
             The shares by name, from 0 to 1. Areas that overlap share fixations.
@@ -257,7 +274,11 @@ class GazePrediction(OtherWords):
 
             agent.gaze("poster.jpg").share({"logo": (10, 20, 200, 80)})  # {'logo': 0.07}
         """
-        return {name: share_in(self.density, area) for name, area in read_areas(areas, self.size).items()}
+        return {name: share_in(self.density, area) for name, area in self.areas(areas).items()}
+
+    def areas(self, areas: AreasLike) -> dict[str, Area]:
+        """Read areas of interest in this picture, as for `share`, and check that they lie in it."""
+        return read_areas(areas, self.size, [self.name, self.source or self.name])
 
     @checked_keywords
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
@@ -365,7 +386,7 @@ class GazePrediction(OtherWords):
         Raises:
             InputError: they are not the fixations of one viewer of this picture.
         """
-        viewed = _fixations_of(scanpath, "scanpath", self.size, self.source)
+        viewed = fixations_of(scanpath, "scanpath", self.size, self.source)
         return self._over_pixels(self.given([viewed], len(viewed)).log())
 
     def compare(
@@ -511,11 +532,21 @@ class GazePrediction(OtherWords):
             f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {percent(peak['share'])} of all fixations"
             for number, peak in enumerate(self.peaks(), 1)
         ]
+        if self.caution is not None:
+            lines.append(f"  caution: {self.caution}")
         return "\n".join([f"{type(self).__name__}: {self.describe()}", *lines])
 
     def _over_pixels(self, log: Tensor) -> Tensor:
         """Interpolate a log density over the cells, up to a constant, to the probability in each pixel, `(H, W)`."""
-        log = F.interpolate(log[None, None], self.size[::-1], mode="bilinear", align_corners=False)[0, 0]
+        width, height = self.size
+        if self.panorama:
+            columns = log.shape[1]
+            # Beyond an edge lie the cells of the other one.
+            round_the_seam = torch.cat([log[:, -1:], log, log[:, :1]], 1)
+            log = F.interpolate(round_the_seam[None, None], (height, columns + 2), mode="bilinear")[0, 0]
+            log = log @ interpolation(width, 1, columns + 1, columns + 2, log.dtype, log.device).mT
+        else:
+            log = F.interpolate(log[None, None], (height, width), mode="bilinear", align_corners=False)[0, 0]
         return (log - log.logsumexp((0, 1))).exp()
 
     def _log(self) -> Tensor:
@@ -543,18 +574,10 @@ def _model_for(detector: Detector, model: FixationDensity | str | PathLike[str] 
     return deepcopy(model).cpu()
 
 
-def _sharp_features(detector: Detector, image: Tensor, model: FixationDensity) -> FeatureMaps:
-    """Compute the layers of the detector that the model reads, from the whole picture `(3, H, W)`."""
-    canvas, placement = detector.fit(image[None])
-    maps = detector.feature_maps(canvas, [*model.layers])
-    return FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
-
-
-def _unlikeness(model: FixationDensity, features: FeatureMaps) -> float:
-    """Compute the distance of a picture from those of the fit of a model that knows it."""
-    assert model.likeness is not None
-    values = pooled(features, model.layers).to(model.likeness.mean)
-    return digits(float(model.likeness(values)[0]))
+def _is_blank(photograph: Tensor) -> bool:
+    """Tell whether a picture `(3, h, w)` in bytes has one colour."""
+    lowest, highest = photograph.flatten(1).aminmax(dim=1)
+    return int((highest.int() - lowest.int()).max()) <= _BLANK
 
 
 def _foveal_features(eye: Eye, image: Tensor, fixations: Fixations, model: FixationDensity) -> FeatureMaps:
@@ -562,36 +585,3 @@ def _foveal_features(eye: Eye, image: Tensor, fixations: Fixations, model: Fixat
     points = torch.from_numpy(fixations.points).to(image)
     views = eye.features(eye.open(image[None]), points, [*model.layers])
     return features_so_far(views, points, points[None])
-
-
-def _fixations_of(given: object, argument: str, size: tuple[int, int], source: str | None) -> Fixations:
-    """Convert the fixations of one viewer to pixels of the picture; those far outside give a warning.
-
-    Args:
-        given: fixations, a record, or points.
-        argument: name of the argument.
-        size: `(width, height)` of the picture.
-        source: file of the picture; None if it is not known.
-
-    Returns:
-        The fixations.
-
-    Raises:
-        InputError: they are not those of one viewer of this picture.
-    """
-    from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
-
-    expected = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
-    if isinstance(given, Record):
-        given = given.as_fixations(given.source or source or "")
-    elif isinstance(given, list | tuple) and any(isinstance(entry, Fixations | Record) for entry in given):
-        check(False, argument, expected, f"a {type(given).__name__} of {len(given)}; take one: {argument}=scanpaths[0]")
-    elif isinstance(given, list | tuple | np.ndarray | Tensor):
-        try:
-            given = Fixations(source or "", "viewer", given, size)  # type: ignore[arg-type]  # which makes an array
-        except InputError as error:
-            raise InputError(f"{argument}: expected {expected}, got a {type(given).__name__} ({error})") from None
-    if not isinstance(given, Fixations):
-        raise InputError(f"{argument}: expected {expected}, got {type(given).__name__}")
-    check_viewed(given, argument, size, source)
-    return warn_of_frames(argument, [given], stacklevel=4)[0].resized(size)

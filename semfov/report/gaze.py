@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.fixations import Fixations
-from semfov.paths.areas import AreasLike, border_of, percent, read_areas, shares_around
+from semfov.paths.areas import AreasLike, border_of, percent, shares_around
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
 from semfov.report.template import colour_steps, filled
@@ -36,7 +36,7 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
     """
     steps = min(max(map(len, scanpaths)), _MOST_STEPS)
     maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
-    boxes = {} if areas is None else read_areas(areas, prediction.size)
+    boxes = {} if areas is None else prediction.areas(areas)
     shares = {} if areas is None else prediction.share(areas)
     picture = {
         "name": prediction.name,

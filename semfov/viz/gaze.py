@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.errors import check
-from semfov.paths.areas import AreasLike, percent, read_areas, shares_around
+from semfov.paths.areas import AreasLike, percent, shares_around
 from semfov.paths.gaze import GazePrediction
 from semfov.viz.animation import Film, render
 from semfov.viz.drawing import draw_image
@@ -27,12 +27,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-BORDERS = "half of all fixations are inside the thick line, 90 % inside the thin one"
+BORDERS = "half of all fixations are inside the thick line, 90\N{NO-BREAK SPACE}% inside the thin one"
 """What the lines of a map are."""
 
 _FIRST = 3  # first fixations that are drawn
 _BANDS = tuple(share / 10 for share in range(1, 10))  # shares of the fixations in the areas between two colours
 _BORDERS = {0.5: 1.8, LARGEST_SHARE: 0.8}  # widths of the lines around the areas with these shares
+_LABELS = 20  # names of areas that find room below each other in a picture
 _FINER = 8  # points of a band for a cell along each side
 
 
@@ -118,6 +119,7 @@ def draw_first_fixations(axes: Axes, prediction: GazePrediction) -> None:
             ha="center",
             va="center",
             bbox={"boxstyle": "circle", "facecolor": GAZE, "edgecolor": "white"},
+            zorder=5,  # above the names of areas
         )
 
 
@@ -126,17 +128,19 @@ def draw_areas(axes: Axes, prediction: GazePrediction, areas: AreasLike) -> None
     from matplotlib.patches import Rectangle
 
     shares = prediction.share(areas)
-    for name, (left, top, right, bottom) in read_areas(areas, prediction.size).items():
+    for name, (left, top, right, bottom) in prediction.areas(areas).items():
         corner, sides = (left, top), (right - left, bottom - top)
         axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor="white", linewidth=2.6))
         axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor=TARGET, linewidth=1.4))
+        # Above the box, where it hides nothing of it, unless there is no room.
+        is_above = top > prediction.size[1] / _LABELS
         axes.text(
             left,
             top,
             f"{name} {percent(shares[name])}",
             color="white",
             fontsize=8,
-            va="top",
+            va="bottom" if is_above else "top",
             parse_math=False,
             bbox={"facecolor": TARGET, "edgecolor": "none", "pad": 1.5},
             zorder=4,

@@ -55,6 +55,10 @@ def test_areas_are_read_from_texts_mappings_and_files(tmp_path):
     (tmp_path / "areas.JSON").write_text(json.dumps(boxes))
     assert read_areas(tmp_path / "areas.JSON", SIZE) == expected
     assert read_areas(str(tmp_path / "areas.JSON"), SIZE) == expected
+    by_picture = {"a.png": boxes, "b.png": {"logo": (0, 0, 1, 1)}}
+    assert read_areas(by_picture, SIZE, ["a.png"]) == expected
+    assert read_areas(by_picture, SIZE, ["folder/c.png", "b.png"]) == {"logo": (0, 0, 1, 1)}
+    refused("areas: expected boxes for c.png, got those of 'a.png', 'b.png'", read_areas, by_picture, SIZE, ["c.png"])
     assert read_areas("logo:10,20,30,40.5  a:b:0,0,1,1", SIZE) == {"logo": (10, 20, 30, 40.5), "a:b": (0, 0, 1, 1)}
 
 

@@ -49,6 +49,17 @@ def test_shares_of_areas_are_those_of_each_draft(drafts):
     assert drafts.describe().count("\n") == 0
 
 
+def test_an_area_that_moves_has_its_box_in_each_draft(drafts):
+    moved = drafts.shares({"before.png": {"button": LEFT}, "after.png": {"button": RIGHT}})["button"]
+    assert moved.first == drafts.first.share({"button": LEFT})["button"]
+    assert moved.second == drafts.second.share({"button": RIGHT})["button"]
+    twins = Drafts(draft("a/x.png", 0.4), draft("b/x.png", 0.5))
+    assert [*twins.shares({"a/x.png": {"button": LEFT}, "b/x.png": {"button": RIGHT}})] == ["button"]
+    other = {"before.png": {"button": LEFT}, "after.png": {"logo": RIGHT}}
+    refused("areas: expected the same areas in both drafts: button", drafts.shares, other)
+    refused("areas: expected boxes for after.png", drafts.shares, {"before.png": {"button": LEFT}})
+
+
 def test_drafts_of_one_name_are_told_apart_by_their_folders():
     assert Drafts(draft("a/x.png", 0.4), draft("b/x.png", 0.5)).names == ("a/x.png", "b/x.png")
     assert Drafts(draft("a/x.png", 0.4), draft("b/y.png", 0.5)).names == ("x.png", "y.png")

@@ -116,9 +116,10 @@ def test_a_picture_unlike_those_of_the_fit_has_a_caution():
     alike = GazePrediction.of(detector, photographs[0], model=model)
     assert (alike.unlike, alike.caution) == (False, None)
     assert alike.unlikeness == pytest.approx(float(model.likeness(values[0])), rel=1e-3)
-    flat = GazePrediction.of(detector, torch.full((3, 60, 80), 0.5), model=model)
+    flat = GazePrediction.of(detector, torch.tensor([0.2, 0.8]).repeat(3, 60, 40), model=model)
     assert flat.unlike
     assert "unlike the photographs" in flat.caution
+    assert flat.caution in repr(flat)
     assert "Caution: this picture is unlike" in flat.plot().axes[0].get_title()
     # What a fovea has shown is not compared with sharp pictures.
     eye = Eye(Foveation(8.0, growth=1.0), detector, reference=80.0)
@@ -126,11 +127,67 @@ def test_a_picture_unlike_those_of_the_fit_has_a_caution():
 
 
 def test_proportions_unlike_those_of_the_shipped_fit_have_a_caution(gaze):
-    for size, said in (((104, 78), None), ((78, 104), "wider than high"), ((300, 100), "this one is 3.0 : 1")):
+    said_of = {
+        (104, 78): None,
+        (78, 104): "wider than high",
+        (300, 100): "this one is 3.0 : 1",
+        (200, 100): "--panorama",
+        (24, 18): "24 × 18 px show little",
+    }
+    for size, said in said_of.items():
         caution = replace(gaze, size=size, is_shipped=True).caution
         assert (caution is None) == (said is None)
         assert said is None or said in caution
         assert replace(gaze, size=size).caution is None
+    assert replace(gaze, size=(200, 100), is_shipped=True, panorama=True).caution is None
+
+
+@pytest.mark.parametrize("size", [(60, 80), (18, 24), (10, 400), (100, 50)])
+@pytest.mark.parametrize("quality", ["quick", "best"])
+def test_a_picture_of_one_colour_has_the_centre_bias_alone(size, quality):
+    """The padding of the canvas is not in the map."""
+    torch.manual_seed(0)
+    detector = Shown("colours", ("none",), (80, 60), stride=4).eval()
+    model = FixationDensity({"backbone8": 3}, centre=-rand(39, 52).float()).eval()
+    card = GazePrediction.of(detector, torch.full((3, *size), 0.5), model=model, quality=quality)
+    bias = model.centre_bias(size).flatten().softmax(0).view_as(card.cells)
+    torch.testing.assert_close(card.cells, bias)
+    assert "one colour" in card.caution
+    assert card.density.isfinite().all()
+
+
+def test_the_edges_of_a_panorama_meet():
+    """A quarter turn moves everything by a quarter, over the seam, too."""
+    torch.manual_seed(0)
+    detector = Shown("colours", ("none",), (80, 60), stride=4).eval()
+    model = FixationDensity({"backbone8": 3}, centre=-rand(39, 52).float()).eval().requires_grad_(False)
+    picture = 0.2 * rand(3, 104, 208).float()
+    picture[:, 40:64, :8] += 0.7
+    picture[:, 40:64, -8:] += 0.7
+    for quality in ("quick", "best"):
+        before = GazePrediction.of(detector, picture, model=model, quality=quality, panorama=True)
+        turned = GazePrediction.of(detector, picture.roll(52, -1), model=model, quality=quality, panorama=True)
+        torch.testing.assert_close(turned.density, before.density.roll(52, -1))
+    centre = model.centre_bias((104, 208)).exp().mean(1).log()
+    torch.testing.assert_close(before.terms["centre bias"][0], centre[:, None].expand(26, 52))
+    # Between the first and the last column is no larger step than between any others.
+    steps = (before.density.roll(1, -1) - before.density).abs().amax(0)
+    assert float(steps[0]) <= float(steps[1:].max())
+    seen = {"seen": [[3.0, 4.0]], "model": model}
+    eye = Eye(Foveation(8.0, growth=1.0), detector, reference=80.0)
+    refused("seen: expected None for a panorama", GazePrediction.of, eye, picture, **seen, panorama=True)
+    refused("seen: expected None for a panorama", GazePrediction.of, eye, picture, **seen, quality="best")
+    refused("panorama: expected", GazePrediction.of, detector, picture[..., :104], model=model, panorama=True)
+    refused("quality", GazePrediction.of, detector, picture, model=model, quality="better")
+
+
+def test_a_place_at_the_seam_of_a_panorama_is_one_place(gaze):
+    log = (0.02 + 3 * bump(0, 8) + 3 * bump(52, 8) + bump(26, 30)).log()
+    around = replace(gaze, terms={"map": log[None]}, panorama=True)
+    (first, second) = around.peaks(2)
+    assert min(first["x"], 104 - first["x"]) < 3
+    assert second["x"] == pytest.approx(52.5, abs=2)
+    assert first["share"] > 1.2 * replace(around, panorama=False).peaks(1)[0]["share"]
 
 
 def test_scanpaths_last_as_long_as_people_view(gaze):

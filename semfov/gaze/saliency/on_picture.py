@@ -71,16 +71,28 @@ def _interpolates(side: Side, cells: int) -> bool:
 
 
 def _line(side: Side, cells: int, like: Tensor) -> Tensor:
-    """Make the matrix of `_interpolation` for the pixels that it needs."""
-    matrix = _interpolation(cells, side.start, side.end, side.length, like.dtype, like.device)
+    """Make the matrix of `interpolation` for the pixels that it needs."""
+    matrix = interpolation(cells, side.start, side.end, side.length, like.dtype, like.device)
     return matrix[:, side.first : side.stop]
 
 
 @constant
-def _interpolation(
+def interpolation(
     cells: int, start: float, end: float, length: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Make the matrix `(cells, length)` of bilinear interpolation at centres of cells between two edges of a line."""
+    """Make the matrix of linear interpolation at the centres of cells.
+
+    Args:
+        cells: number of cells.
+        start: first edge of the cells, in pixels of the line that is interpolated.
+        end: their last edge.
+        length: number of pixels of the line.
+        dtype: of the matrix.
+        device: of the matrix.
+
+    Returns:
+        `(cells, length)`, whose rows sum to 1.
+    """
     centres = torch.arange(cells, device=device, dtype=dtype) + 0.5
     place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
     pixels = torch.arange(length, device=device, dtype=dtype)

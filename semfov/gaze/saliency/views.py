@@ -1,0 +1,220 @@
+"""Views of a picture for its map: the whole, its mirror image, and windows, joined on the cells of the picture."""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from semfov.detection import Detections, Detector, FeatureMaps
+from semfov.gaze.saliency.cells import cell_saliency
+from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.gaze.saliency.likeness import pooled
+from semfov.io.tables import digits
+from semfov.kinds import Quality
+
+_WHOLE = 0.7  # share of the whole picture in the map, where there are windows, too
+_SIDE = 2 / 3  # side of a window of a photograph, in sides of it
+_RING = 4  # windows around a panorama
+_PROPORTION = 4 / 3  # width over height of a window of a panorama, that of the pictures of the fit
+_GAIN = {"quick": 1.0, "best": 1.1}  # of the map: the mean of several is flatter than each of them
+_EDGE = 1 / 4  # share of a window's side over which its weight falls to an edge inside the picture
+
+
+class PictureView(NamedTuple):
+    """A part of a picture at which a detector looks, in cells of the picture.
+
+    Attributes:
+        top: its first row.
+        left: its first column; in a panorama it may reach past the last one, and continues at the first.
+        rows: its number of rows.
+        columns: its number of columns.
+        mirrored: whether it is looked at in its mirror image.
+    """
+
+    top: int
+    left: int
+    rows: int
+    columns: int
+    mirrored: bool = False
+
+    def covers(self, cells: tuple[int, int]) -> bool:
+        """Tell whether the view is of the whole picture."""
+        return (self.top, self.left, self.rows, self.columns) == (0, 0, *cells)
+
+    @property
+    def weight(self) -> Tensor:
+        """Weight of each of its cells, `(rows, columns)`: 1 in the middle, falling to the edges."""
+        return _ramp(self.rows)[:, None] * _ramp(self.columns)
+
+
+def _ramp(cells: int) -> Tensor:
+    """Compute the weights of cells along a side."""
+    place = torch.arange(cells) + 0.5
+    return (torch.minimum(place, cells - place) / max(cells * _EDGE, 1.0)).clamp(max=1)
+
+
+def views_of(cells: tuple[int, int], quality: Quality, *, panorama: bool = False) -> list[PictureView]:
+    """List the views from which the map of a picture is joined.
+
+    A photograph is looked at as a whole, for `best` also in its mirror image and in four windows of two thirds of its
+    sides. The windows on the right are mirrored, so that the mirror image of a photograph has the mirrored map. A
+    panorama of 360° is looked at in four windows of 4 : 3 around it, which overlap, so that no place is at the border
+    of all of them, and for `best` also in their mirror images.
+
+    Args:
+        cells: rows and columns of cells of the picture.
+        quality: `quick` or `best`.
+        panorama: whether the left and the right edge of the picture meet.
+
+    Returns:
+        The views.
+
+    >>> [len(views_of((39, 52), quality)) for quality in ("quick", "best")]
+    [1, 6]
+    >>> len(views_of((26, 52), "quick", panorama=True))
+    4
+    """
+    rows, columns = cells
+    if panorama:
+        width = min(columns, round(rows * _PROPORTION))
+        views = [PictureView(0, number * columns // _RING, rows, width) for number in range(_RING)]
+    else:
+        views = [PictureView(0, 0, rows, columns)]
+    if quality == "quick":
+        return views
+    views += [view._replace(mirrored=True) for view in views]
+    return views if panorama else [*views, *_windows(rows, columns)]
+
+
+def _windows(rows: int, columns: int) -> Iterable[PictureView]:
+    """List the windows at the corners of a photograph, the right ones mirrored."""
+    height = max(1, round(rows * _SIDE))
+    width = max(1, round(columns * _SIDE))
+    for top in (0, rows - height):
+        yield PictureView(top, 0, height, width)
+        yield PictureView(top, columns - width, height, width, mirrored=True)
+
+
+class PictureTerms(NamedTuple):
+    """What a model says of a picture.
+
+    Attributes:
+        terms: map and centre bias (`FixationDensity.terms`).
+        unlikeness: distance of the picture from those of the fit; None where the model does not know them.
+    """
+
+    terms: dict[str, Tensor]
+    unlikeness: float | None
+
+
+def picture_terms(
+    detector: Detector,
+    image: Tensor,
+    model: FixationDensity,
+    *,
+    quality: Quality = "quick",
+    panorama: bool = False,
+) -> PictureTerms:
+    """Compute the terms of a picture from a pass of the detector for each of its views.
+
+    Args:
+        detector: the detector.
+        image: `(3, H, W)`, RGB in [0, 1].
+        model: a model that was fitted to the detector.
+        quality: `quick` or `best`.
+        panorama: whether the left and the right edge of the picture meet.
+
+    Returns:
+        The terms over the cells of the picture, `(1, rows, columns)`, and its distance from the pictures of the fit.
+    """
+    size = (int(image.shape[-2]), int(image.shape[-1]))
+    cells = cells_of(size)
+    views = views_of(cells, quality, panorama=panorama)
+    maps: list[Tensor] = []
+    distances: list[float] = []
+    for view in views:
+        part = _pixels_of(view, image, cells)
+        features = _features(detector, part, model)
+        maps.append(model.map(features, (int(part.shape[-2]), int(part.shape[-1])))[0])
+        # Windows of a photograph are closer than the pictures of the fit are.
+        if model.likeness is not None and (panorama or not distances):
+            values = pooled(features, model.layers).to(model.likeness.mean)
+            distances.append(float(model.likeness(values)[0]))
+    centre = model.centre_bias(size)
+    if panorama:
+        # People turn round, so that no direction is the middle; how high they look stays.
+        centre = centre.logsumexp(1, keepdim=True).expand(cells) - math.log(cells[1])
+    unlikeness = digits(sum(distances) / len(distances)) if distances else None
+    map = joined(maps, views, cells)
+    if _GAIN[quality] != 1:
+        map = _GAIN[quality] * map
+    return PictureTerms({"map": map[None], "centre bias": centre[None]}, unlikeness)
+
+
+def _features(detector: Detector, image: Tensor, model: FixationDensity) -> FeatureMaps:
+    """Compute the layers of a detector that a model reads, from pixels `(3, H, W)`."""
+    canvas, placement = detector.fit(image[None])
+    maps = detector.feature_maps(canvas, [*model.layers])
+    return FeatureMaps(maps, (canvas.shape[-1], canvas.shape[-2]), placement, Detections.empty(1, 0))
+
+
+def _pixels_of(view: PictureView, image: Tensor, cells: tuple[int, int]) -> Tensor:
+    """Cut a view out of a picture `(3, H, W)`, round the seam of a panorama, and mirror it if that is asked for."""
+    if view.covers(cells):
+        pixels = image
+    else:
+        height, width = image.shape[-2:]
+        rows = _edges(view.top, view.rows, height / cells[0])
+        columns = _edges(view.left, view.columns, width / cells[1])
+        numbers = torch.arange(columns.start, columns.stop, device=image.device) % width
+        pixels = image[:, rows, :].index_select(2, numbers)
+    return pixels.flip(-1) if view.mirrored else pixels
+
+
+def _edges(first: int, count: int, pixels: float) -> slice:
+    """Find the pixels of cells along a side, at least one of them."""
+    start = round(first * pixels)
+    return slice(start, max(start + 1, round((first + count) * pixels)))
+
+
+def joined(maps: Sequence[Tensor], views: Iterable[PictureView], cells: tuple[int, int]) -> Tensor:
+    r"""Join the maps of views on the cells of a picture.
+
+    .. math:: m(u) = s \, \bar m_{\text{whole}}(u) + (1 - s) \frac{\sum_v w_v(u) \, m_v(u)}{\sum_v w_v(u)}
+
+    The sums are over windows, whose weight w falls to their edges, so that none shows. Without
+    windows s is 1, and without a view of the whole it is 0.
+
+    Args:
+        maps: the map of each view; of the whole picture on its cells, of a window of any size.
+        views: the views.
+        cells: rows and columns of cells of the picture.
+
+    Returns:
+        `(rows, columns)`.
+
+    >>> views = views_of((26, 52), "quick", panorama=True)
+    >>> joined([torch.ones(39, 52)] * 4, views, (26, 52)).unique()
+    tensor([1.])
+    """
+    whole: list[Tensor] = []
+    values = maps[0].new_zeros(cells)
+    weights = maps[0].new_zeros(cells)
+    for map, view in zip(maps, views, strict=True):
+        upright = map.flip(-1) if view.mirrored else map
+        if view.covers(cells):
+            whole.append(upright)
+            continue
+        on_cells = cell_saliency(upright[None], view.columns, view.rows).view(view.rows, view.columns)
+        weight = view.weight.to(map)
+        columns = (view.left + torch.arange(view.columns, device=map.device)) % cells[1]
+        values[view.top : view.top + view.rows].index_add_(1, columns, weight * on_cells)
+        weights[view.top : view.top + view.rows].index_add_(1, columns, weight)
+    of_whole = torch.stack(whole).mean(0) if whole else None
+    if len(whole) == len(maps):
+        assert of_whole is not None
+        return of_whole
+    of_windows = values / weights
+    return of_windows if of_whole is None else _WHOLE * of_whole + (1 - _WHOLE) * of_windows
