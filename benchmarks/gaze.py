@@ -69,7 +69,7 @@ class BareGaze:
         self._mix = model.mix.detach().numpy()
         self._mix_shift = model.mix_shift.detach().numpy()[..., None]
         self._out = model.out.detach().numpy()[:, None]
-        self._blur = float(model.blur.exp())
+        self._blur = float(model.blur.detach().exp())
         self._centre = model.centre_bias(size[::-1]).detach().numpy()
 
     def __call__(self, picture: Pixels) -> Map:

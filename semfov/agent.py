@@ -536,9 +536,8 @@ class ActivePerception(nn.Module):
         """
         opened = OpenedPicture.of(picture, color, white, bands)
         image = opened.whole(self.eye.sensor.like)[0]
-        panorama = opened.is_panorama
         return GazePrediction.of(
-            self.eye, image, model=model, source=opened.path, seen=seen, quality=quality, panorama=panorama
+            self.eye, image, model=model, source=opened.path, seen=seen, quality=quality, panorama=opened.is_panorama
         )
 
     @checked_keywords

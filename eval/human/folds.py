@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import product
 from typing import Literal, NamedTuple
 
 import torch
@@ -118,19 +117,29 @@ def others_of(group: Viewed, picture: int, centre: Tensor, smoothing: Smoothing)
     Returns:
         `(people, rows, columns)`.
     """
+    bias = _bias(centre, group)
+    counts = counted(group.paths[picture], group.size, cells_of(group.size))
+    density = (1 - smoothing.share) * _blurred_others(counts, bias, smoothing.blur) + smoothing.share * bias
+    return density.log()
+
+
+def _bias(centre: Tensor, group: Viewed) -> Tensor:
+    """Interpolate the centre bias at the cells of pictures, as probabilities `(rows, columns)`."""
     cells = cells_of(group.size)
-    bias = F.interpolate(centre[None, None], cells, mode="bilinear")[0, 0].flatten().softmax(0)
-    counts = counted(group.paths[picture], group.size, cells)
-    smooth = blurred(counts.sum(0) - counts, torch.tensor(smoothing.blur)).flatten(1)
-    total = smooth.sum(1, keepdim=True)
-    density = (1 - smoothing.share) * torch.where(total > 0, smooth / total, bias) + smoothing.share * bias
-    return density.log().unflatten(1, cells)
+    return F.interpolate(centre[None, None], cells, mode="bilinear")[0, 0].flatten().softmax(0).unflatten(0, cells)
+
+
+def _blurred_others(counts: Tensor, bias: Tensor, blur: float) -> Tensor:
+    """Blur the counts of all others than each person to densities `(people, rows, columns)`; the bias without any."""
+    smooth = blurred(counts.sum(0) - counts, torch.tensor(blur))
+    total = smooth.sum((1, 2), keepdim=True)
+    return torch.where(total > 0, smooth / total, bias)
 
 
 def likeliest_smoothing(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], centre: Tensor) -> Smoothing:
     """Choose the smoothing by which the fixations of each person are likeliest, given those of all others.
 
-    A fixed width would make people predict each other worse than they can, or the centre bias do part of it.
+    With a fixed one people would predict each other worse than they can.
 
     Args:
         groups: pictures of one size each.
@@ -141,15 +150,16 @@ def likeliest_smoothing(groups: Sequence[Viewed], pictures: Sequence[Sequence[in
         Blur and share with the largest mean over pictures of the log likelihood of a fixation.
     """
     chosen = [(group, number) for group, numbers in zip(groups, pictures, strict=True) for number in numbers]
-    judged = chosen[:: max(1, len(chosen) // _JUDGED)]
-
-    def likelihood(smoothing: Smoothing) -> float:
-        """Average the log likelihood of a fixation over pictures."""
-        total = 0.0
-        for group, number in judged:
-            counts = counted(group.paths[number], group.size, cells_of(group.size))
-            log_density = others_of(group, number, centre, smoothing)
-            total += float((counts * log_density).sum() / counts.sum().clamp(min=1))
-        return total
-
-    return max((Smoothing(blur, share) for blur, share in product(_BLURS, _SHARES)), key=likelihood)
+    likelihood = torch.zeros(len(_BLURS), len(_SHARES))
+    for group, number in chosen[:: max(1, len(chosen) // _JUDGED)]:
+        bias = _bias(centre, group)
+        counts = counted(group.paths[number], group.size, cells_of(group.size))
+        person, row, column = counts.nonzero(as_tuple=True)
+        weight = counts[person, row, column] / counts.sum()
+        share = torch.tensor(_SHARES)[:, None]
+        for place, blur in enumerate(_BLURS):
+            # Only where somebody looked.
+            smooth = _blurred_others(counts, bias, blur)[person, row, column]
+            likelihood[place] += (((1 - share) * smooth + share * bias[row, column]).log() * weight).sum(1)
+    best = int(likelihood.argmax())
+    return Smoothing(_BLURS[best // len(_SHARES)], _SHARES[best % len(_SHARES)])

@@ -21,9 +21,10 @@ from semfov.data.sources import picture_files
 from semfov.detection.load import load_detector
 from semfov.errors import check
 from semfov.fit.viewing import MapSource, features_of
+from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.likeness import PictureLikeness, pooled
 from semfov.io.files import write_text
-from semfov.io.ranges import Range, Seed
+from semfov.io.ranges import Count, Range, Seed
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.config import DetectorConfig
 from semfov.runs.settings import Settings
@@ -39,11 +40,13 @@ class UnlikeConfig(Settings):
     """Photographs and drawn pictures, and the detectors whose feature maps tell them apart.
 
     Args:
-        fitted: folders of the pictures of the fit; the distance is fitted to every second one, and measured on the
+        fitted: folders of the pictures of the fit (none: the distance is the one that is shipped, which is measured on
+            other photographs alone); the distance is fitted to every second one, and measured on the
             others.
         others: folder of other photographs, on which nothing was fitted or chosen.
         detectors: the detectors, each by name or by settings.
         count: number of drawn pictures of each kind.
+        limit: number of other photographs, spread over the folder (none: all).
         seed: seed of all drawn pictures.
         page: page with a place for the table (`<!-- table unlike -->` to `<!-- end -->`); none: it is left alone.
         out: folder for the table.
@@ -53,6 +56,7 @@ class UnlikeConfig(Settings):
     others: Path | None = None
     detectors: tuple[str | DetectorConfig, ...] = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
     count: Annotated[int, Range(2, 10_000)] = 40
+    limit: Count | None = None
     seed: Seed = 1
     page: Path | None = None
     out: Path = Path("runs/human_unlike")
@@ -60,12 +64,12 @@ class UnlikeConfig(Settings):
 
 def tell_apart(config: UnlikeConfig) -> None:
     """Fit the distance to half of the pictures, measure all others, and write the table."""
-    check(len(config.fitted) > 0, "fitted", "at least one folder of pictures", "none")
     check(config.others is not None, "others", "a folder of photographs", "none")
     assert config.others is not None
     prepare_worker()
     files = [path for folder in config.fitted for path in picture_files(folder)]
-    others = picture_files(config.others)
+    every_file = picture_files(config.others)
+    others = every_file[:: max(1, len(every_file) // (config.limit or len(every_file)))][: config.limit]
     detectors = [DetectorConfig(name=each) if isinstance(each, str) else each for each in config.detectors]
     columns = {each.name: _measured(each, files, others, config) for each in detectors}
     lines = unlike_table(columns)
@@ -84,17 +88,27 @@ def _measured(
     """Compute the distances of all pictures by their kind, with the feature maps of a detector."""
     name = detector.name
     source = features_of(load_detector(name, **detector_options(detector)))
-    likeness = PictureLikeness.fitted(_pooled(_read(files[::2]), source, f"{name}, fit", len(files[::2])))
-    made: dict[str, tuple[Iterable[Tensor], int]] = {
-        FITTED: (_read(files[1::2]), len(files[1::2])),
-        OTHERS: (_read(others), len(others)),
-    }
+    made: dict[str, tuple[Iterable[Tensor], int]] = {OTHERS: (_read(others), len(others))}
+    if files:
+        likeness = PictureLikeness.fitted(_pooled(_read(files[::2]), source, f"{name}, fit", len(files[::2])))
+        made = {FITTED: (_read(files[1::2]), len(files[1::2])), **made}
+    else:
+        likeness = _shipped(name)
     drawn = {**KINDS, **_changed(others)}
     for number, (kind, draw) in enumerate(drawn.items()):
         made[kind] = (_drawn(draw, config.seed, number, config.count), config.count)
     return {
         kind: likeness(_pooled(pictures, source, f"{name}, {kind}", count)) for kind, (pictures, count) in made.items()
     }
+
+
+def _shipped(name: str) -> PictureLikeness:
+    """Give the distance that is shipped for a detector."""
+    model = FixationDensity.if_shipped(name)
+    check(model is not None, "fitted", f"folders of pictures, as no model is shipped for {name}", "none")
+    assert model is not None
+    assert model.likeness is not None
+    return model.likeness
 
 
 FITTED = "photographs like those of the fit"
@@ -167,7 +181,7 @@ def _share_unlike(distances: Tensor) -> str:
 
 def _area(distances: dict[str, Tensor], kinds: Sequence[str]) -> float:
     """Compute the area under the ROC curve of telling kinds of pictures from all photographs."""
-    alike = torch.cat([distances[FITTED], distances[OTHERS]])
+    alike = torch.cat([distances[kind] for kind in (FITTED, OTHERS) if kind in distances])
     unlike = torch.cat([distances[kind] for kind in kinds])
     is_unlike = torch.cat([torch.zeros(len(alike), dtype=torch.bool), torch.ones(len(unlike), dtype=torch.bool)])
     return area_under_roc(torch.cat([alike, unlike]), is_unlike)

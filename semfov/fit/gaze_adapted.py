@@ -37,7 +37,7 @@ class Adaptation(nn.Module):
 
     >>> adaptation = Adaptation(FixationDensity({"backbone8": 3}))
     >>> flat = torch.zeros(1, 39, 52)
-    >>> round(float(adaptation(flat, flat, (39, 52)).exp().sum()), 4)
+    >>> round(adaptation(flat, flat, (39, 52)).exp().sum().item(), 4)
     1.0
     """
 

@@ -112,8 +112,11 @@ def test_drawn_pictures_are_told_from_photographs(tmp_path, capsys):
     assert set(KINDS) <= set(by_kind)
     assert by_kind["flat pictures"][1] == "100 %"
     assert float(by_kind["flat pictures"][0]) > 0.9
-    assert main(["unlike", "--others", str(tmp_path)]) != 0
-    assert "fitted: expected at least one folder" in capsys.readouterr().err
+    shipped = ["--others", str(tmp_path / "others"), "--detectors", "[yolox-nano]", "--limit", "2", *more]
+    assert main(["unlike", *shipped]) == 0, capsys.readouterr().err
+    assert "photographs like those of the fit" not in page.read_text()
+    assert main(["unlike"]) != 0
+    assert "others: expected a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", [*KINDS])
