@@ -138,6 +138,22 @@ def test_the_density_of_one_picture(run, photos, tmp_path, name):
         assert density.sum() == pytest.approx(1, abs=1e-4)
 
 
+def test_more_views_and_panoramas_are_asked_for(run, photos, tmp_path):
+    densities = {}
+    for quality in ("quick", "best"):
+        out = tmp_path / f"{quality}.npy"
+        assert run(photos / "0.png", "--quality", quality, "--people", 2, "--out", out)[0] == 0
+        densities[quality] = np.load(out)
+    assert not np.allclose(densities["quick"], densities["best"])
+    strip = Image.open(photos / "0.png", formats=("PNG",)).resize((200, 100))
+    strip.save(tmp_path / "strip.png")
+    assert "--panorama" in run(tmp_path / "strip.png", "--people", 2)[1]
+    code, out, err = run(tmp_path / "strip.png", "--panorama", "--people", 2)
+    assert (code, err) == (0, "")
+    assert "--panorama" not in out
+    assert "panorama: expected" in run(photos / "0.png", "--panorama", "--people", 2)[2]
+
+
 def test_a_folder_gets_scanpaths_and_heat_maps(run, photos, tmp_path):
     assert run(photos, "--out", tmp_path / "new")[0] == 0
     assert sorted(each.name for each in (tmp_path / "new").iterdir()) == [
@@ -174,6 +190,7 @@ def test_areas_are_told_drawn_and_in_the_table(run, photos, tmp_path):
     assert [(row["picture"], row["width"], row["unlike"]) for row in rows] == [
         ("0.png", "120", "False"), ("1.png", "80", "False")
     ]  # fmt: skip
+    assert [row["caution"] for row in rows] == ["", "the model learned from pictures that are wider than high"]
     assert run(photos / "0.png", "--people", 2, "--out", tmp_path / "density.npy")[0] == 0
     density = np.load(tmp_path / "density.npy")
     assert float(rows[0]["share of top"]) == pytest.approx(float(density[:45, :80].sum()), abs=1e-4)
