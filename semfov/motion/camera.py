@@ -4,42 +4,34 @@
     `_key`    ──────────────── estimated, from `_key_to_last` on ────►
 
 The step is the motion from the key frame to the present frame, with the motion to the last frame taken off. Where the
-present frame fits neither the key frame nor the last one, it becomes the key frame. The last frame before is then kept
+present frame fits neither the key frame nor the last one, it becomes the key frame. The key frame before is then kept
 as `_lost` for some frames, and each of them is compared with it, too: `CameraStep.recovered` says where it was found.
+Where only the last frame fits, that one becomes the key frame, and `_anchor` is the key frame before: it tells whether
+the scene has been exchanged little by little. Invariant: the key frame is not before the anchor.
 """
 
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import needing
+from semfov.motion.agreement import agreement, largest_change
+from semfov.motion.coarse import coarse_shift
+from semfov.motion.flow import LEAST_CORNERS, flow_between, rival_between
+from semfov.motion.frames import GreyFrame
 from semfov.motion.motion import Motion
-
-_LONGER = 480  # longer side in pixels of the reduced frames that are compared
-_CORNERS = 150  # most corners that are followed
-_QUALITY = 0.01  # least quality of a corner, as a share of the best one's
-_APART = 8  # least distance between two corners, in reduced pixels
-_WINDOW = (15, 15)  # window of the flow around a corner, in reduced pixels
-_PYRAMID = 3  # further levels of the flow's pyramid: it follows shifts of about 15 · 2³ reduced pixels
-_RESIDUAL = 1.5  # reduced pixels within which a corner agrees with a motion
 
 _STILL = np.eye(3)
 _STILL_SHIFT = 0.3  # pixels of the frame: a camera that moves less stands still
 _LEAST_IN_VIEW = 0.6  # share of a key frame in view below which there is a new one
 
-_LEAST_CORNERS = 12  # fewer that agree are no evidence
-_LEAST_SHARE = 0.4  # least share of the followed corners that agree
-_MOST_SCALE = 1.3  # largest change of scale between two frames
-_MOST_TURN = 25.0  # largest turn between two frames, in degrees
-
-_SAME = 6.0  # largest mean change of a block, in grey values, of a frame without texture that has not changed
-_BLOCKS = (8, 5)  # columns and rows of blocks in which two frames are compared
-_TEXTURE = 3.0  # least standard deviation of the grey values of a block that can be compared
-_ALIKE = 0.6  # correlation from which on a block agrees
-_LEAST_BLOCKS = 6  # fewer blocks that can be compared are no evidence
-_LEAST_AGREEING = 0.6  # least share of the compared blocks that agree
+_SAME = 6.0  # largest mean change of a block, in grey values, of a frame that has not changed
+_EQUAL = 2  # largest change of a pixel, in grey values, of a frame that has not changed though it has no texture
+_CLEAR = 0.93  # correlation of the blocks from which on the fine detail alone is enough
+_COARSE_SHIFT = 0.4  # reduced pixels by which what is coarse may move otherwise than the fine detail
+_AHEAD = 0.1  # by so much the blocks correlate better than after a shift by which the frame repeats itself
+_STEADY = 4.0  # reduced pixels by which a motion differs from the last one at most, where it has a rival
 
 
 class CameraStep(NamedTuple):
@@ -108,28 +100,23 @@ class KnownPoses:
         return CameraStep(None if last is None else last.inverse().then(self._last))
 
 
-class _GreyFrame:
-    """A frame reduced in size and to grey.
+class _Fit(NamedTuple):
+    """The motion between two reduced frames, `(3, 3)`, and the one that another part of them has in common, if any."""
 
-    Attributes:
-        grey: `(h, w)` bytes.
-        ratio: `(x, y)`, pixels of the frame for one of the reduced one.
+    similarity: NDArray[np.float64]
+    rival: NDArray[np.float64] | None
+
+
+class _LostFrame:
+    """The key frame before a disturbance, and the motion from it to the last frame before that.
+
+    `waited` is the number of frames since then.
     """
 
-    def __init__(self, cv2: Any, frame: NDArray[np.uint8]) -> None:
-        self._cv2 = cv2
-        height, width = frame.shape[:2]
-        factor = max(1.0, max(width, height) / _LONGER)
-        size = max(1, round(width / factor)), max(1, round(height / factor))
-        self.ratio = width / size[0], height / size[1]
-        # A third of the values is left to average where the frame is grey first.
-        self.grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-
-    @cached_property
-    def corners(self) -> NDArray[np.float32]:
-        """Corners that can be followed, `(n, 1, 2)`."""
-        corners = self._cv2.goodFeaturesToTrack(self.grey, _CORNERS, _QUALITY, _APART)
-        return np.zeros((0, 1, 2), np.float32) if corners is None else corners
+    def __init__(self, key: GreyFrame, key_to_last: NDArray[np.float64]) -> None:
+        self.key = key
+        self.key_to_last = key_to_last
+        self.waited = 0
 
 
 class CameraMotion:
@@ -140,14 +127,22 @@ class CameraMotion:
     Errors add up from key frame to key frame alone; a frame becomes one when too few corners are left in view.
 
     A motion is believed if enough corners agree with it, if it is no leap of scale or turn, and if the key frame, moved
-    by it, correlates with the present one in most blocks that have texture. Otherwise there is none: after a cut, in
-    the dark, or behind something that fills the view. The next frames are then compared with the last one before it,
-    too, for `patience` frames, so that a short disturbance loses nothing.
+    by it, correlates with the present one in most blocks that have texture. It is doubted
+
+    - if the key frame correlates nearly as well a period away, as bricks and rows of windows do;
+    - if a part of the frame moves otherwise, until the motion goes on as before: that may be a lorry before the camera,
+      or all that is left of the scene behind one;
+    - if what is coarse moves otherwise than its edges, as in a film that was compressed too much;
+    - if the picture of the key frame has gone little by little, as in a dissolve;
+    - if there is nothing to follow, unless the frame is the same: in the dark, or before a clear sky.
+
+    A doubted motion is none. The next frames are then compared with the key frame before it, too, for `patience`
+    frames, so that a short disturbance loses nothing.
 
     A similarity describes a scene that is flat or far away. Parallax of near objects counts as their own motion.
 
     Args:
-        patience: number of frames for which the last frame before a disturbance is kept.
+        patience: number of frames for which what was seen before a disturbance is kept.
 
     Raises:
         InputError: OpenCV is not installed.
@@ -164,11 +159,13 @@ class CameraMotion:
             import cv2
         self._cv2: Any = cv2
         self.patience = patience
-        self._key: _GreyFrame | None = None  # None before the first frame
+        self._key: GreyFrame | None = None  # None before the first frame
         self._key_to_last = _STILL  # `(3, 3)`, motion from the key frame to the last frame, in reduced pixels
-        self._last: _GreyFrame | None = None
-        self._lost: _GreyFrame | None = None  # the last frame before a disturbance, while it may still be found
-        self._waited = 0  # frames since that one
+        self._anchor: GreyFrame | None = None  # the first key frame of what has been in view since then
+        self._anchor_to_last = _STILL
+        self._last: GreyFrame | None = None
+        self._course: NDArray[np.float64] | None = None  # the last motion between two frames, in reduced pixels
+        self._lost: _LostFrame | None = None  # what was seen before a disturbance, while it may still be found
 
     def step(self, frame: NDArray[np.uint8]) -> CameraStep:
         """Take the next frame, and estimate its motion.
@@ -179,171 +176,123 @@ class CameraMotion:
         Returns:
             The motion since the last frame; none for the first frame, and where the two do not fit together.
         """
-        present = _GreyFrame(self._cv2, frame)
+        present = GreyFrame(self._cv2, frame)
         last = self._last
         self._last = present
         if last is None or self._key is None:
-            self._key = present
+            self._begin_at(present)
             return CameraStep(None)
+        before = _LostFrame(self._key, self._key_to_last)
         motion = self._since_last(self._key, last, present)
         if motion is None and self._lost is None:
-            self._lost = last
-            self._waited = 0
+            self._lost = before
         if self._lost is None:
             return CameraStep(motion)
         recovered = self._recover(self._lost, present)
         return CameraStep(motion, recovered, waits=self._lost is not None)
 
-    def _recover(self, lost: _GreyFrame, present: _GreyFrame) -> Motion | None:
-        """Compare the present frame with the last one before a disturbance, which is given up after a while."""
-        self._waited += 1
-        similarity = self._between(lost, present, _STILL)
-        if similarity is not None or self._waited >= self.patience:
+    def _recover(self, lost: _LostFrame, present: GreyFrame) -> Motion | None:
+        """Compare the present frame with what was seen before a disturbance, which is given up after a while."""
+        lost.waited += 1
+        fit = self._between(lost.key, present, lost.key_to_last)
+        found = fit is not None and self._is_certain(fit, None)
+        if found or lost.waited >= self.patience:
             self._lost = None
-        return None if similarity is None else _at_full_size(similarity, present.ratio)
+            if not found:
+                self._course = None
+        if fit is None or not found:
+            return None
+        return _at_full_size(fit.similarity @ np.linalg.inv(lost.key_to_last), present.ratio)
 
-    def _since_last(self, key: _GreyFrame, last: _GreyFrame, present: _GreyFrame) -> Motion | None:
+    def _since_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> Motion | None:
         """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
-        key_to_present = self._between(key, present, self._key_to_last)
-        if key_to_present is None and last is not key:
+        fit = self._between(key, present, self._key_to_last)
+        if fit is None and last is not key:
+            fit = self._between(last, present, _STILL)
+            if fit is not None and self._is_replaced(present, fit):
+                fit = None
             key = last
             self._key_to_last = _STILL
-            key_to_present = self._between(last, present, _STILL)
-        if key_to_present is None:
+        if fit is None:
             self._begin_at(present)
-            # Nothing can be followed where there is no texture, and nothing moves where two frames are the same.
-            return Motion.still() if _largest_change(last.grey, present.grey) < _SAME else None
-        last_to_present = key_to_present @ np.linalg.inv(self._key_to_last)
+            return Motion.still() if self._is_same(last, present) else None
+        last_to_present = fit.similarity @ np.linalg.inv(self._key_to_last)
+        rival = None if fit.rival is None else fit.rival @ np.linalg.inv(self._key_to_last)
+        if not self._is_certain(_Fit(last_to_present, rival), self._course):
+            self._begin_at(present)
+            if self._course is None:
+                self._course = last_to_present
+            return None
+        self._course = last_to_present
+        self._anchor_to_last = last_to_present @ self._anchor_to_last
         if _largest_shift(last_to_present, present.grey.shape) * max(present.ratio) < _STILL_SHIFT:
+            self._key = key
             return Motion.still()
-        if _share_in_view(key_to_present, present.grey.shape) < _LEAST_IN_VIEW:
+        if _share_in_view(self._anchor_to_last, present.grey.shape) < _LEAST_IN_VIEW:
             self._begin_at(present)
         else:
             self._key = key
-            self._key_to_last = key_to_present
+            self._key_to_last = fit.similarity
         return _at_full_size(last_to_present, present.ratio)
 
-    def _begin_at(self, frame: _GreyFrame) -> None:
+    def _is_certain(self, fit: _Fit, course: NDArray[np.float64] | None) -> bool:
+        """Tell whether no other motion is as good: there is no rival, or the motion is that of the frames before."""
+        if fit.rival is None:
+            return True
+        if course is None or self._key is None:
+            return False
+        shape = self._key.grey.shape
+        return _difference(fit.similarity, course, shape) < min(_STEADY, _difference(fit.rival, course, shape))
+
+    def _is_same(self, last: GreyFrame, present: GreyFrame) -> bool:
+        """Tell whether nothing has changed between two frames, of which too few corners can be followed."""
+        if last.grey.shape != present.grey.shape or largest_change(last.grey, present.grey) >= _SAME:
+            return False
+        # Noise hides a slow motion where there is no texture: a sky, or the dark.
+        if int(self._cv2.absdiff(last.grey, present.grey).max()) <= _EQUAL:
+            return True
+        if len(last.corners) >= LEAST_CORNERS:
+            return False
+        return agreement(self._cv2, last.contrast, present.contrast, _STILL[:2]).is_whole
+
+    def _is_replaced(self, present: GreyFrame, fit: _Fit) -> bool:
+        """Tell whether another scene has come little by little, as in a dissolve; `fit` is that of the last frame."""
+        if self._anchor is None:
+            return False
+        anchor_to_present = fit.similarity @ self._anchor_to_last
+        return not agreement(self._cv2, self._anchor.coarse, present.coarse, anchor_to_present[:2]).is_enough
+
+    def _begin_at(self, frame: GreyFrame) -> None:
         """Make a frame the key frame, from which nothing has moved."""
         self._key = frame
         self._key_to_last = _STILL
+        self._anchor = frame
+        self._anchor_to_last = _STILL
 
-    def _between(
-        self, first: _GreyFrame, present: _GreyFrame, guess: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
-        """Estimate the similarity `(3, 3)` between two reduced frames; None where they do not fit together."""
-        if first.grey.shape != present.grey.shape or len(first.corners) < _LEAST_CORNERS:
-            return None
+    def _between(self, first: GreyFrame, present: GreyFrame, guess: NDArray[np.float64]) -> _Fit | None:
+        """Estimate the motion between two reduced frames; None where they do not fit together."""
         cv2 = self._cv2
-        expected = cv2.transform(first.corners, guess[:2]).astype(np.float32)
-        corners, status, _ = cv2.calcOpticalFlowPyrLK(
-            first.grey,
-            present.grey,
-            first.corners,
-            expected,
-            winSize=_WINDOW,
-            maxLevel=_PYRAMID,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        followed = status[:, 0] == 1
-        if followed.sum() < _LEAST_CORNERS:
+        similarity = flow_between(cv2, first, present, guess)
+        if similarity is None:
             return None
-        similarity, agree = cv2.estimateAffinePartial2D(
-            first.corners[followed], corners[followed], ransacReprojThreshold=_RESIDUAL
-        )
-        if similarity is None or not _is_plausible(similarity, int(agree.sum()), int(followed.sum())):
+        found = agreement(cv2, first.contrast, present.contrast, similarity[:2])
+        if not found.is_enough:
             return None
-        if not self._correlates(first.grey, present.grey, similarity):
+        if found.median < _CLEAR and coarse_shift(cv2, first, present, similarity[:2]) > _COARSE_SHIFT:
             return None
-        return np.vstack([similarity, _STILL[2]])
-
-    def _correlates(
-        self, first: NDArray[np.uint8], present: NDArray[np.uint8], similarity: NDArray[np.float64]
-    ) -> bool:
-        """Tell whether a frame, moved, looks like the present one in most blocks with texture that both show."""
-        cv2 = self._cv2
-        height, width = present.shape
-        moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
-        blocks = _Blocks.of(height, width)
-        textured, correlation = _correlations(cv2, moved, present, blocks)
-        compared = textured & blocks.shown_by(similarity)
-        count = int(compared.sum())
-        agreeing = int((correlation[compared] >= _ALIKE).sum())
-        return count >= _LEAST_BLOCKS and agreeing >= _LEAST_AGREEING * count
+        for shift in first.repeats:
+            for sign in (-1, 1):
+                repeated = similarity.copy()
+                repeated[:2, 2] += sign * similarity[:2, :2] @ shift
+                if agreement(cv2, first.contrast, present.contrast, repeated[:2]).median > found.median - _AHEAD:
+                    return None
+        rival = rival_between(cv2, first, present, similarity, found.elsewhere) if found.is_partial else None
+        return _Fit(similarity, rival)
 
 
-class _Blocks(NamedTuple):
-    """Blocks of a frame `(height, width)`, by the edges between them."""
-
-    down: NDArray[np.intp]
-    across: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, height: int, width: int) -> "_Blocks":
-        """Divide a frame into blocks of nearly the same size."""
-        columns, rows = _BLOCKS
-        return cls(np.linspace(0, height, rows + 1).astype(np.intp), np.linspace(0, width, columns + 1).astype(np.intp))
-
-    @property
-    def pixels(self) -> NDArray[np.intp]:
-        """Number of pixels of each, `(rows, columns)`."""
-        return np.outer(np.diff(self.down), np.diff(self.across))
-
-    def sums(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum over each by a table of sums over all rectangles from the corner, `(height + 1, width + 1)`."""
-        corners = table[np.ix_(self.down, self.across)]
-        return np.diff(np.diff(corners, axis=0), axis=1)
-
-    def shown_by(self, similarity: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which of them another frame of this size shows as a whole, if a similarity `(2, 3)` moves it here."""
-        back = np.linalg.inv(np.vstack([similarity, _STILL[2]]))
-        sizes = self.across[-1], self.down[-1]
-        # A block is convex, so its corner pixels tell. They are taken from the nearest pixel of the other frame.
-        inside = []
-        for y in (self.down[:-1], self.down[1:] - 1):
-            for x in (self.across[:-1], self.across[1:] - 1):
-                columns, rows = np.meshgrid(x, y)
-                places = np.stack([columns, rows, np.ones_like(rows)])
-                origin = np.rint(np.einsum("ij,jkl->ikl", back[:2], places))
-                inside.append(((origin >= 0) & (origin < np.reshape(sizes, (2, 1, 1)))).all(0))
-        return np.logical_and.reduce(inside) & (self.pixels > 0)
-
-
-def _is_plausible(similarity: NDArray[np.float64], agreeing: int, followed: int) -> bool:
-    """Tell whether enough corners agree with a similarity `(2, 3)`, and it is no leap of scale or turn."""
-    scale = float(np.hypot(similarity[0, 0], similarity[1, 0]))
-    turn = float(np.degrees(np.arctan2(similarity[1, 0], similarity[0, 0])))
-    has_support = agreeing >= max(_LEAST_CORNERS, _LEAST_SHARE * followed)
-    return has_support and 1 / _MOST_SCALE <= scale <= _MOST_SCALE and abs(turn) <= _MOST_TURN
-
-
-def _correlations(
-    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], blocks: _Blocks
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Compute Pearson's correlation of each block of two frames.
-
-    Args:
-        cv2: OpenCV.
-        first: grey values `(h, w)`.
-        second: likewise.
-        blocks: the blocks.
-
-    Returns:
-        Whether either frame has texture in a block, and the correlation, 0 where one has none at all; both
-        `(rows, columns)`.
-    """
-    products = cv2.multiply(first, second, dtype=cv2.CV_32F)
-    (a, aa), (b, bb) = (map(blocks.sums, cv2.integral2(frame)) for frame in (first, second))
-    ab = blocks.sums(cv2.integral(products))
-    # n² times variances and covariance: whole numbers below 2⁵³, so that a block of one grey value has exactly 0.
-    count = blocks.pixels.astype(np.float64)
-    variance_a = count * aa - a.astype(np.float64) ** 2
-    variance_b = count * bb - b.astype(np.float64) ** 2
-    covariance = count * ab - a.astype(np.float64) * b
-    spread = np.sqrt(variance_a) * np.sqrt(variance_b)
-    correlation = np.divide(covariance, spread, out=np.zeros_like(spread), where=spread > 0)
-    has_texture = np.sqrt(np.maximum(variance_a, variance_b)) >= _TEXTURE * count
-    return has_texture, correlation
+def _difference(first: NDArray[np.float64], second: NDArray[np.float64], shape: tuple[int, ...]) -> float:
+    """Compute how far apart two motions take the corners of a frame, in the mean."""
+    return float(np.linalg.norm(((first - second) @ _corners_of(shape))[:2], axis=0).mean())
 
 
 def _at_full_size(similarity: NDArray[np.float64], ratio: tuple[float, float]) -> Motion:
@@ -351,19 +300,6 @@ def _at_full_size(similarity: NDArray[np.float64], ratio: tuple[float, float]) -
     x_ratio, y_ratio = ratio
     enlarge = np.array([[x_ratio, 0, (x_ratio - 1) / 2], [0, y_ratio, (y_ratio - 1) / 2], [0, 0, 1]])
     return Motion(enlarge @ similarity @ np.linalg.inv(enlarge))
-
-
-def _largest_change(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
-    """Find the largest mean difference of a block of two frames, in grey values; infinite for other sizes."""
-    if first.shape != second.shape:
-        return float("inf")
-    difference = np.abs(first.astype(np.int16) - second)
-    rows = np.array_split(difference, min(_BLOCKS[1], len(difference)))
-    means = []
-    for row in rows:
-        blocks = np.array_split(row, min(_BLOCKS[0], row.shape[1]), axis=1)
-        means += [float(block.mean()) for block in blocks]
-    return max(means)
 
 
 def _corners_of(shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -14,6 +14,8 @@ from semfov.errors import check
 
 _LEAST_AREA = 1e-6  # least factor by which a map may change areas: below it the frame is a line
 
+_BEYOND = -1e6  # pixels where there is no frame
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -122,6 +124,22 @@ class Motion:
         mapped = points.double() @ matrix[:, :2].T + matrix[:, 2]
         return (mapped[..., :2] / mapped[..., 2:]).to(points)
 
+    def is_ahead(self, points: Tensor) -> Tensor:
+        """Tell which points the camera can see at all: a homography maps what is behind the camera to pixels, too.
+
+        Args:
+            points: `(..., 2)`, `(x, y)` in pixels of the first frame.
+
+        Returns:
+            `(...)` boolean.
+
+        >>> quarter = Motion(np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.1]]))  # to the right
+        >>> quarter.is_ahead(torch.tensor([[3.0, 0.0], [-3.0, 0.0]]))
+        tensor([ True, False])
+        """
+        matrix = torch.from_numpy(self.matrix)
+        return _is_ahead(matrix, points.double() @ matrix[2, :2] + 1.0)
+
     def scale_at(self, points: Tensor) -> Tensor:
         """Compute the local scale: pixels of the second frame for one of the first, as the root of the areas' ratio.
 
@@ -152,12 +170,24 @@ def _local_scale(matrices: Tensor, weight: Tensor) -> Tensor:
     return (torch.linalg.det(matrices).abs() / weight.abs() ** 3).sqrt()
 
 
+def _is_ahead(matrices: Tensor, weight: Tensor) -> Tensor:
+    """Tell where the weight of a map has the sign of a place before the camera.
+
+    A homography has no sign, but that of a camera that turns, or moves above a plane, has a positive determinant.
+    Affine maps show all places.
+    """
+    is_affine = (matrices[..., 2, :2] == 0).all(-1)
+    return is_affine | (weight * torch.linalg.det(matrices).sign() > 0)
+
+
 def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     r"""Map boxes, each by a motion of its own: their centres move, and their sides are scaled; they stay upright.
 
     The local scale is the root of the ratio of areas at the centre c, the determinant of the map's derivative:
 
     .. math:: s(c) = \sqrt{|\det M| / |w(c)|^3}
+
+    What is behind the camera becomes an empty box far beyond the frame.
 
     Args:
         matrices: `(..., 3, 3)`, of motions (`Motion.matrix`).
@@ -177,8 +207,9 @@ def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     mapped = (matrices[..., :2] @ centre[..., None])[..., 0] + matrices[..., 2]
     weight = mapped[..., 2:]
     scale = _local_scale(matrices, weight[..., 0])
-    moved_centre = mapped[..., :2] / weight
-    half_size = (bottom_right - top_left) / 2 * scale[..., None]
+    is_ahead = _is_ahead(matrices, weight[..., 0])[..., None]
+    moved_centre = torch.where(is_ahead, mapped[..., :2] / weight, _BEYOND)
+    half_size = torch.where(is_ahead, (bottom_right - top_left) / 2 * scale[..., None], 0.0)
     moved = torch.cat([moved_centre - half_size, moved_centre + half_size], -1)
     return moved.to(boxes), scale.to(boxes)
 

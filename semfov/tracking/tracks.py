@@ -189,8 +189,7 @@ class Tracks:
             The objects in the pixels of the present frame.
         """
         # By a homography, what the camera has turned away from has no place in the frame.
-        is_ahead = self.kinematics.place @ motion.matrix[2, :2] + 1.0 > 0
-        ahead = self[is_ahead]
+        ahead = self[motion.is_ahead(torch.from_numpy(self.kinematics.place)).numpy()]
         scale = motion.scale_at(torch.from_numpy(ahead.kinematics.place)).numpy()
         return replace(
             ahead,

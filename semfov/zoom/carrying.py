@@ -104,6 +104,8 @@ def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
     if gist.level == 0:
         low = first
         counts = np.array([columns, rows])
+    elif not motion.is_ahead(torch.from_numpy(first * pitch)):
+        return None
     else:
         corner = motion.points(torch.from_numpy(first * pitch)[None])[0].numpy()
         moved = np.rint(corner / pitch).astype(int)
@@ -115,7 +117,8 @@ def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
     cells = np.stack(np.meshgrid(*(np.arange(count) for count in counts)), -1)
     centres = (low + (cells + 0.5) * gist.scale) * pitch
     # Where the centres of the new cells were in the frame of the look.
-    origins = motion.inverse().points(torch.from_numpy(centres)).numpy()
+    back = motion.inverse()
+    origins = back.points(torch.from_numpy(centres)).numpy()
     place = np.floor((origins / pitch - first) / gist.scale).astype(np.intp)
     nearest = place.clip(0, (columns - 1, rows - 1))
     column = nearest[..., 0]
@@ -124,7 +127,7 @@ def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
     size = gist.size[row, column]
     found = gist.found[row, column]
     if gist.level > 0:
-        shown = torch.from_numpy((place == nearest).all(-1))
+        shown = torch.from_numpy((place == nearest).all(-1)) & back.is_ahead(torch.from_numpy(centres))
         scores = scores * shown[..., None]
         size = size * shown
         found = found & shown[..., None]

@@ -73,19 +73,36 @@ def test_a_camera_that_stands_still_has_not_moved_at_all():
         assert camera.step(noisy).is_still
 
 
-def test_a_frame_without_texture_stands_still_until_it_changes():
-    """A wall, and the dark: nothing can be followed, and nothing has moved."""
+def test_a_frame_without_texture_stands_still_as_long_as_it_is_the_same():
+    """A wall, and the dark: nothing can be followed, and noise may hide a motion."""
     camera, random = CameraMotion(), np.random.default_rng(1)
     wall = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
     camera.step(wall)
     for _ in range(3):
-        noisy = np.clip(wall + random.normal(0, 3, wall.shape), 0, 255).astype(np.uint8)
-        assert camera.step(noisy).is_still
+        assert camera.step(wall).is_still
+    noisy = np.clip(wall + random.normal(0, 3, wall.shape), 0, 255).astype(np.uint8)
+    assert camera.step(noisy).motion is None
     assert camera.step(np.full_like(wall, 30)).motion is None
     passing = wall.copy()
     passing[100:250, 200:400] = 250
     camera.step(wall)
     assert camera.step(passing).motion is None
+    assert camera.step(passing).is_still
+
+
+def test_a_key_frame_that_no_longer_fits_is_replaced_also_while_the_camera_stands():
+    """Things in the scene are exchanged one after the other; then the camera moves on."""
+    picture, other = scene(), scene(9)
+    camera = CameraMotion()
+    for rows in range(0, 4):
+        mixed = picture.copy()
+        mixed[: 700 + 40 * rows] = other[: 700 + 40 * rows]
+        before = view(mixed, 800, 800)
+        camera.step(before[0])
+    after = view(mixed, 806, 804)
+    step = camera.step(after[0])
+    assert step.motion is not None
+    assert error(step.motion, before[1], after[1]) < 1.0
 
 
 def test_a_slow_drift_is_not_lost_to_rounding():

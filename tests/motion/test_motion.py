@@ -64,3 +64,22 @@ def test_matrices_of_opencv_are_taken_and_others_refused():
     for matrix in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.eye(4), np.diag([1.0, 1.0, 0.0])):
         with pytest.raises(InputError, match="motion: expected a 3 × 3 matrix"):
             Motion.of(matrix)
+
+
+@given(st.floats(-170, 170), st.floats(-60, 60))
+def test_what_is_behind_a_camera_that_turns_has_no_place_in_its_frame(pan, tilt):
+    """K R K⁻¹ of a camera of 640 × 480 px; the truth is the depth of a ray after the rotation."""
+    lens = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    turn = cv2.Rodrigues(np.array([0, np.radians(pan), 0]))[0] @ cv2.Rodrigues(np.array([np.radians(tilt), 0, 0]))[0]
+    matrix = lens @ turn @ np.linalg.inv(lens)
+    places = np.array([[10.0, 20.0], [320.0, 240.0], [600.0, 400.0], [30.0, 470.0]])
+    depth = np.linalg.solve(lens, np.c_[places, np.ones(4)].T).T @ turn.T
+    clear = np.abs(depth[:, 2]) > 0.05
+    if abs(matrix[2, 2]) < 0.01:
+        return
+    motion = Motion(matrix)
+    ahead = motion.is_ahead(torch.from_numpy(places)).numpy()
+    np.testing.assert_array_equal(ahead[clear], depth[clear, 2] > 0)
+    boxes = motion.boxes(torch.from_numpy(np.c_[places - 2, places + 2]))
+    hidden = boxes[torch.from_numpy(clear & (depth[:, 2] <= 0))]
+    assert bool((hidden < -1e5).all())
