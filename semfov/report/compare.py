@@ -12,6 +12,7 @@ from semfov.report.page import page_html
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_FIGURE = "AP50 over seconds; the numbers at the points are passes of the detector"
 _COLUMNS = (
     "Passes and seconds are means of a picture. AP50 counts all boxes by their scores; listed are those from the score "
     "on from which semfov lists objects, right are those of them that the reference has, and the last column counts "
@@ -33,7 +34,8 @@ def comparison_page(about: str, sentences: Sequence[str], table: Sequence[Sequen
     """
     result, *others = sentences
     sections = (
-        f"<p>{escape(about)}</p>{figure_html(result, figure)}"
+        f'<p class="outcome">{escape(result)}</p><p>{escape(about)}</p>'
+        f'<div class="curves">{figure_html(_FIGURE, figure)}</div>'
         f"{''.join(f'<p>{escape(sentence)}</p>' for sentence in others)}"
         f"{table_html(table, _COLUMNS)}"
     )

@@ -28,7 +28,7 @@ class ComparedPoint(Protocol):
 
 @styled
 def plot_comparison(points: Sequence[ComparedPoint]) -> Figure:
-    """Draw the average precision of each way of looking over its seconds, with the number of passes at each point.
+    """Draw the average precision of each way of looking over its seconds; numbers at the points are passes.
 
     Args:
         points: the points of all ways.
@@ -54,6 +54,5 @@ def plot_comparison(points: Sequence[ComparedPoint]) -> Figure:
                 fontsize=7,
             )
     axes.set(xlabel="seconds a picture", ylabel="AP50", xlim=(0, None), ylim=(0, 1.05))
-    axes.set_title("Numbers at the points are passes of the detector")
     axes.legend(loc="lower right")
     return figure
