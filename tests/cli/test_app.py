@@ -286,7 +286,7 @@ def test_a_picture_a_search_and_looks_of_ones_own_on_the_width_of_a_telephone(se
     assert "red" in press_look(served).inner_text()
     served.get_by_role("tab", name="Look yourself").click()
     canvas = served.locator("#own canvas")
-    for number, (x, y) in enumerate([(0.9, 0.9), (0.11, 0.15)]):
+    for number, (x, y) in enumerate([(0.9, 0.9), (0.11, 0.15)], 1):
         served.wait_for_timeout(500)
         box = canvas.bounding_box()
         canvas.click(position={"x": x * box["width"], "y": y * box["height"]})

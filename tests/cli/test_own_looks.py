@@ -49,7 +49,7 @@ def test_a_search_of_a_person_ends_as_that_of_the_agent_and_both_are_counted(age
     assert looks.agent.cells.tolist() == agents.cells.tolist()
     said = f"**You: found in {len(cells)} looks. The agent: found in {len(agents)} looks**"
     assert looks.describe().startswith(said)
-    assert f"**Look {len(cells) - 1}** shows" in looks.describe()  # numbered from 0, as on the page of a record
+    assert f"**Look {len(cells)}** shows" in looks.describe()  # numbered from 1, as on the page of a record
     assert json.loads(looks.marks())["next"] is None
 
 
