@@ -126,6 +126,18 @@ def pytest_runtest_protocol() -> Generator[None, object, object]:
         torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="module")
+def few_samples() -> Iterator[None]:
+    """Draw few samples for the errors of a study's tables; what many samples give is tested in `lab/test_tables`."""
+    from eval.bootstrap import Bootstrap
+    from eval.chance import errors_by_chance
+
+    with pytest.MonkeyPatch.context() as patch:
+        for draw in (Bootstrap.of, errors_by_chance):
+            patch.setitem(draw.__kwdefaults__, "samples", 20)
+        yield
+
+
 FRESH = """
 import json, os, sys
 import semfov, torch

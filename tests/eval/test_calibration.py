@@ -7,6 +7,8 @@ import pytest
 from tests.lab.commands.table import small_run
 from tests.small import cells_of
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
 FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")
 

@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 
+from eval.chance import errors_by_chance
 from eval.decide.plain import PLAIN, plain_rules
 from eval.decide.report import decision_summary
 from eval.presence import hits_at
@@ -13,6 +14,8 @@ from semfov.metrics.episodes import area_under_roc
 from semfov.runs.tables import mean_or_dash, share
 from tests.lab.commands.table import small_run
 from tests.small import cells_of
+
+pytestmark = pytest.mark.usefixtures("few_samples")
 
 POLICIES = ["target-evidence", "random gaze", "published belief", "published belief, a detection at the gaze"]
 SCORES = ["one unfoveated pass, highest score", "unfoveated pass and its quarters, highest score"]
@@ -111,8 +114,9 @@ def record(policy, present, outcome, probability, looks, **more):
     )
 
 
-def test_table_matches_hand_calculations():
+def test_table_matches_hand_calculations(monkeypatch):
     """Four searches for a present target, two for an absent one; the second policy decides nothing."""
+    monkeypatch.setitem(errors_by_chance.__kwdefaults__, "samples", 1000)  # whose mean is compared
     landed = {"landing_seen": True}
     first = [
         record("a", True, "found", 0.9, 3, right_place=True, place=0.9, overlap=0.75, landing=[0.2, 0.8], **landed),

@@ -8,6 +8,8 @@ from scipy.optimize import minimize
 
 from eval.prior import PAIR, _best_brier, prior_summary
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 
 def record(scene, question, present, without, half, given=None):
     def searched(probability, passes):

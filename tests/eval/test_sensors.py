@@ -14,6 +14,8 @@ from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, Protoco
 from tests.colours import write_home
 from tests.small import cells_of
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):

@@ -18,6 +18,8 @@ from semfov.detection.objects import Objects
 from semfov.zoom.lattice import Lattice
 from tests.small import Coloured, iou
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 PICTURE, FRAME = (1200, 900), (640, 480)
 SQUARE = (560, 430, 600, 470)
 

@@ -49,6 +49,8 @@ from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_netwo
 from tests.refusals import refused, unusable
 from tests.small import once
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):

@@ -21,6 +21,8 @@ from semfov.runs.scene_run import finish
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.setup import make_eye
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
 
 

@@ -22,6 +22,8 @@ from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, Protoco
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.runs.setup import make_eye
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 AT = Thresholds(0.5, 0.375)
 FUSED = ["calibrated belief", "calibrated belief, a detection at the gaze"]
 

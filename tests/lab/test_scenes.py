@@ -41,6 +41,8 @@ from semfov.zoom.looks import WindowLook
 from semfov.zoom.slices import ranked, slices
 from tests.small import Tiles, cells_of
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 
 class NoiseScenes:
     """Five pictures of coloured noise, each with one box."""

@@ -17,6 +17,8 @@ from safetensors import safe_open
 from tests.lab.commands.table import COMMANDS, MODEL, RUN, write_material
 from tests.small import once
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 ROOT = Path(__file__).parents[3]
 
 
