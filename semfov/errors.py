@@ -264,6 +264,7 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
     _, *parameters = form.parameters.values()  # without `self`
     known = [parameter.name for parameter in parameters]
     words = [p.name if p.default is p.empty else f"{p.name}=" for p in parameters]
+    most = sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in form.parameters.values())
 
     @wraps(function)
     def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
@@ -273,7 +274,9 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
             form.bind(*arguments, **options)
         except TypeError as error:
             maker = f"; {MAKERS[name]} makes one" if name in MAKERS else ""
-            raise InputError(f"{name}: {error}; expected {', '.join(words)}{maker}") from None
+            # What is given without a name, beside the picture, is what others look for.
+            elsewhere = other_method(name, "target", known) if len(arguments) > most else None
+            raise InputError(f"{name}: {error}; {elsewhere or 'expected ' + ', '.join(words)}{maker}") from None
         return function(*arguments, **options)
 
     return call

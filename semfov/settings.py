@@ -49,7 +49,7 @@ MOST_PASSES = 1_000_000
 FirstCell = Annotated[int | tuple[int, int], Form("a cell", "as column,row (5,5) or as its number (47)")]
 Passes = Annotated[int, Range(1, MOST_PASSES)]
 CloserLooks = Annotated[int, Range(0, 100)]
-PriorShare = Annotated[float, Range(above=0, below=1, noun="a share")]
+PriorShare = Annotated[float, Range(above=0, below=1, noun="a share, such as 0.15,")]
 Rate = Annotated[float, Range(0, 100)]
 
 _Function = TypeVar("_Function", bound=Callable[..., object])

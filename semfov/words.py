@@ -76,9 +76,8 @@ COMMANDS = _by_word(
 
 _LOOKING = ("search", "find_all", "explore")
 
-_OTHER_METHODS = {
-    ("explore", "target"): "find_all(picture, target) lists what is there of a class, search(picture, target) decides",
-}
+_OF_TARGETS = "find_all(picture, target) lists what is there of a class, search(picture, target) decides"
+_OTHER_METHODS = {("explore", "target"): _OF_TARGETS, ("gaze", "target"): _OF_TARGETS}
 """What to call in place of a method of an agent, by its name and the option that it has not."""
 
 _OF_DETECTORS = ("iou", "limit", "input_size", "device", "weights", "per_class", "classes", "half")
@@ -165,6 +164,7 @@ AGENT = _by_word(
             "detect find find_objects infer locate predict run track"
         ),
         "len(agent.find_all(picture, target).objects), and record.expected with what was not seen": "count count_all",
+        "the target of search or find_all: a class, or several": "set_classes set_target",
         "agent.gaze(picture)": "heatmap predict_gaze predict_saliency saliency saliency_map",
         "agent.live(target), whose step takes frames": "stream update video watch webcam",
         "agent.classes[1:]": "class_names names",
@@ -175,7 +175,7 @@ AGENT = _by_word(
 DECISION = _by_word(
     {
         "decision.outcome == 'found'": "found present result success",
-        "decision.probability": "conf confidence p score",
+        "decision.probability": "conf confidence p prob score",
         "decision.box": "bbox boxes xyxy",
         "record.found_at": "at location point x y",
     }
@@ -209,7 +209,7 @@ RECORD = _by_word(
     {
         "its objects, such as record.objects.boxes": "boxes labels scores xyxy",
         "record.decision.box, or its objects, record.objects.boxes": "box",
-        "record.decision.probability": "confidence probability score",
+        "record.decision.probability": "confidence prob probability score",
         "record.decision.outcome": "outcome result",
         "len(record.objects), or record.expected with what was not seen": "count counts number",
         "record.to_frame()": "dataframe df to_dataframe to_df to_pandas",

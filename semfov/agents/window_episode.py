@@ -334,7 +334,7 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
 
     @property
     def decision(self) -> Decision | None:
-        return self._concluded or self.session.decisions.decision
+        return self.session.decisions.decision if self._concluded is None else self._concluded
 
     @torch.inference_mode()
     def look(self) -> LookAtWindow | None:

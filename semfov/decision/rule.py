@@ -12,7 +12,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.episode import Step
-from semfov.errors import check, check_whole
+from semfov.errors import InputError, check, check_whole
 from semfov.io.schema import is_number
 from semfov.words import DECISION, OtherWords
 
@@ -45,6 +45,10 @@ class Decision(OtherWords):
     place: float | None = None
 
     _other_words = DECISION
+
+    def __bool__(self) -> bool:
+        """Refuse: a decision that nothing is there would be as true as any other."""
+        raise InputError("decision: expected its outcome where it is a condition: decision.outcome == 'found'")
 
 
 @dataclass(frozen=True)

@@ -184,7 +184,7 @@ class ByCloserLooks(StoppingCriterion):
     def decision(self) -> Decision | None:
         if not self._has_looked:
             return None
-        return self._concluded or self.verifier.decision()
+        return self.verifier.decision() if self._concluded is None else self._concluded
 
     def conclude(self, room: float = math.inf) -> None:
         self.outcome = self.verifier.outcome()

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,6 +34,12 @@ class NumberByClass(dict[str, float]):
         """Return the number of the class that a name means."""
         names = list(self)
         return self[names[class_index(name, names, "expected") - 1]]
+
+    if not TYPE_CHECKING:  # to which any name would be an attribute
+
+        def __getattr__(self, name: str) -> object:
+            remedy = f"use expected[{name!r}] for that of a class, and sum(expected.values()) for all"
+            raise AttributeError(f"expected has no attribute {name!r}; {remedy}")
 
 
 class _ConfirmedPlace(NamedTuple):

@@ -79,6 +79,7 @@ WRONG_USE = {
     "saliency a.jpg": "unknown command 'saliency'; did you mean 'gaze'?",
     "compare . --with slicing": "with: expected some of 'sahi', 'ranked', got 'slicing'",
     "serch a.jpg": "unknown command 'serch'; did you mean 'search'?",
+    "count a.jpg": "unknown command 'count'; did you mean 'find'?",
     "--target cup": "expected a command before --target: search, find",
     "FOLDER --target cup": "try `semfov search FOLDER --target CLASS`",
     "search --targt cup": "unknown option --targt; did you mean --target?",
