@@ -11,7 +11,7 @@ from typing import Self, cast, get_args
 from torch import Tensor
 
 from semfov.data.classes import class_index
-from semfov.data.images import MAX_PIXELS
+from semfov.data.images import MAX_PIXELS, SMALLER
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
@@ -128,7 +128,7 @@ class OpenedPicture:
             return as_image(source, like=like, argument="picture", color=self.color, white=self.white)[None]
         width, height = self.large.size
         expected = f"at most {MAX_PIXELS:,} pixels for a fovea"
-        check(width * height <= MAX_PIXELS, "picture", expected, f"{width} × {height}; use how='windows'")
+        check(width * height <= MAX_PIXELS, "picture", expected, f"{width} × {height}; {SMALLER}")
         return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
 
     @property

@@ -37,7 +37,9 @@ _FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "B
 Pillow knows others, of which some start programs (EPS) or are made of other files.
 """
 
-_SMALLER = "reduce it, or look at it by windows (how='windows'; the largest as a tiled TIFF)"
+SMALLER = "reduce it, or look at it by windows (search, find_all, explore; the largest as a tiled TIFF)"
+"""What to do with a picture that is too large to be read as a whole, in words that hold for every command."""
+
 _SMALL = 2**24  # pixels of a picture that may be blank
 _MOST_A_BYTE = 2**11  # pixels; the best of the common packers keeps about a thousand numbers in a byte
 _PAGES = 64  # of a TIFF that are looked through for one that is no thumbnail
@@ -307,7 +309,7 @@ def check_tile(size: int, stored: int, name: str) -> None:
 
 def check_area(size: tuple[int, int], name: str) -> None:
     """Raise `DataError` for a picture of `(width, height)` with more pixels than are decoded as a whole."""
-    got = f"{size[0]} × {size[1]}; {_SMALLER}"
+    got = f"{size[0]} × {size[1]}; {SMALLER}"
     check_data(0 < math.prod(size) <= MAX_PIXELS, name, f"1 to {MAX_PIXELS:,} pixels", got)
 
 
