@@ -393,7 +393,6 @@ def test_earlier_names_of_settings_are_taken_with_a_note(method, former, present
         (lambda agent: semfov.nothing, "semfov has no attribute 'nothing'$"),
         (lambda agent: semfov.foveat, r"semfov has no attribute 'foveat'; did you mean foveate\?"),
         (lambda agent: agent.find_al, r"an agent has no attribute 'find_al'; did you mean find_all\?"),
-        (lambda agent: agent.count, "an agent has no attribute 'count'; use len"),
         (lambda agent: agent.live("cup").update, r"LivePerception has no attribute 'update'; use live.step\(frame\)"),
         (lambda agent: agent.explore(PIXELS, shifts=1).score, "Scanpath has .*; use record.decision.probability$"),
         (lambda agent: agent.explore(PIXELS, shifts=1).outcome, "Scanpath has .*; use record.decision.outcome$"),

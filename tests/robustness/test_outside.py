@@ -1,18 +1,14 @@
 """Whatever a raster holds, or lies beside it: no other file is opened, and no request is sent."""
 
-import ctypes
-import os
-import socket
-import struct
 import sys
-import threading
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 import numpy as np
 import pytest
 import tifffile
 from PIL import Image
 
+from benchmarks.fuzz.watch import listener, opened_files
 from semfov import SemfovError, read_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.rasters import RasterPicture
@@ -26,43 +22,11 @@ SECRET = 201  # of all pixels of the other folder; no picture here has it
 SIDE = 64
 
 
-@contextmanager
-def opened_files(*folders):
-    """The names of files of some folders that the process opens, or reads, in the block (inotify)."""
-    libc, names = ctypes.CDLL(None), set()
-    watch = libc.inotify_init1(os.O_NONBLOCK)
-    for folder in folders:
-        assert libc.inotify_add_watch(watch, os.fsencode(folder), 0x20 | 0x1) > 0  # IN_OPEN, IN_ACCESS
-    yield names
-    events, at = b"", 0
-    with suppress(BlockingIOError):
-        while more := os.read(watch, 1 << 16):
-            events += more
-    os.close(watch)
-    while at < len(events):
-        length = struct.unpack_from("iIII", events, at)[3]
-        names.add(events[at + 16 : at + 16 + length].rstrip(b"\0").decode())
-        at += 16 + length
-    names.discard("")  # the folder itself
-
-
 @pytest.fixture
 def address():
     """Address of a server, and the requests that it got."""
-    requests = []
-    server = socket.create_server(("127.0.0.1", 0))
-
-    def serve():
-        with suppress(OSError):
-            while True:
-                client, _ = server.accept()
-                with client:
-                    requests.append(client.recv(1000))
-                    client.sendall(b"HTTP/1.0 404 Not Found\r\n\r\n")
-
-    threading.Thread(target=serve, daemon=True).start()
-    yield f"http://127.0.0.1:{server.getsockname()[1]}", requests
-    server.close()
+    with listener() as heard:
+        yield heard
 
 
 @pytest.fixture
