@@ -40,6 +40,7 @@ _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
 _MOST_MEMORY = 2**29  # bytes for the tensors of models whose sizes depend on values, all together
 _MOST_BESIDE = 2**28  # bytes that their process may need for onnxruntime itself, and a few copies of what is stored
 _COPIES = 4
+_A_THREAD = 2**24  # bytes that the system reserves for each thread
 _MOST_SECONDS = 10.0  # longest pass of such a model for one image, and longest time until it is loaded
 _MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 _MOST_BATCH = 1024  # largest fixed batch size of a model
@@ -143,7 +144,8 @@ class OnnxSession:
     def _opened_apart(self, opening: Opening, model: bytes | None) -> ModelApart:
         """Open the model in a process of its own, whose memory is limited where it uses no other device."""
         if [*opening["providers"]] == ["CPUExecutionProvider"]:  # drivers of GPUs map more than they use
-            opening["process"] = _MOST_MEMORY + _MOST_BESIDE + _COPIES * stored_bytes(self.path)
+            beside = _MOST_BESIDE + self.threads * _A_THREAD
+            opening["process"] = _MOST_MEMORY + beside + _COPIES * stored_bytes(self.path)
         return ModelApart(opening, model, _MOST_SECONDS)
 
     def _model_with_further_outputs(self) -> bytes:
