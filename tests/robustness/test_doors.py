@@ -398,7 +398,6 @@ def test_earlier_names_of_settings_are_taken_with_a_note(method, former, present
         (lambda agent: agent.explore(PIXELS, shifts=1).outcome, "Scanpath has .*; use record.decision.outcome$"),
         (lambda agent: agent.explore(PIXELS, shifts=1).plot("x.png"), "ax: .* 'x.png'; .* semfov.viz.save_figure"),
         (lambda agent: agent.explore(PIXELS, shifts=1).compare(None), "people: expected fixations, .*got a NoneType"),
-        (lambda agent: agent.gaze(semfov.Panorama(np.zeros((8, 16, 3), np.uint8))), "picture: .*got a Panorama; .*by"),
         (lambda agent: agent.explore(PIXELS, shifts=1).compare([3]), "people: expected fixations, records of an agent"),
         (lambda agent: semfov.Foveation("wide"), "sigma: expected a number, got wide"),
         (lambda agent: semfov.Foveation(None), "sigma: expected a number, got None"),
