@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.belief.grid import Grid
@@ -16,12 +18,13 @@ from semfov.detection.detections import Detections
 from semfov.errors import InputError, check, check_shape
 from semfov.paths import Record
 from semfov.viz.labels import LabelBox, place_labels
-from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours
+from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours, root
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
+    from matplotlib.typing import ColorType
 
 _LABEL = 6.5  # font size of the labels of boxes
 _SMALL = 5.0  # font size of the labels of many boxes
@@ -84,7 +87,7 @@ def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> 
     return drawn
 
 
-def picture_array(image: Tensor, *, grey: bool = False) -> Any:
+def picture_array(image: Tensor, *, grey: bool = False) -> NDArray[np.float32]:
     """Convert a picture `(3, h, w)` to an array `(h, w, 3)` for matplotlib; grey is the luma of Rec. 601."""
     check_shape(image, "image", 3, None, None)
     pixels = image.detach().cpu().clamp(0, 1)
@@ -108,8 +111,7 @@ def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
     first = axes[0] if isinstance(axes, list) else axes
-    figure: Any = first.figure
-    figure.colorbar(drawn, ax=axes, label=label, shrink=0.85, ticks=MaxNLocator(5, steps=[1, 2, 5, 10]))
+    root(first).colorbar(drawn, ax=axes, label=label, shrink=0.85, ticks=MaxNLocator(5, steps=[1, 2, 5, 10]))
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
@@ -127,10 +129,11 @@ def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: f
     """Draw the outlines of boxes `(M, 4)`."""
     from matplotlib.patches import Rectangle
 
-    style: dict[str, Any] = {"edgecolor": colour, "linestyle": line, "linewidth": width}
-    return [
-        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, **style)) for x1, y1, x2, y2 in boxes.tolist()
+    outlines = [
+        Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linestyle=line, linewidth=width)
+        for x1, y1, x2, y2 in boxes.tolist()
     ]
+    return [axes.add_patch(outline) for outline in outlines]
 
 
 def draw_cross(axes: Axes, point: Tensor | Sequence[float]) -> list[Artist]:
@@ -230,15 +233,14 @@ def _text_width(text: str) -> float:
 
 def per_point(axes: Axes) -> float:
     """Measure the number of units of the axes in a point, once the figure is laid out."""
-    figure: Any = axes.figure
     box = axes.get_window_extent()
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
     # A picture keeps its proportions, so one scale serves both directions.
-    return max(abs(right - left) / box.width, abs(top - bottom) / box.height) * figure.dpi / 72
+    return max(abs(right - left) / box.width, abs(top - bottom) / box.height) * root(axes).dpi / 72
 
 
-def lightness(colour: Any) -> float:
+def lightness(colour: ColorType) -> float:
     """Luma of a colour by Rec. 601, from 0 to 1."""
     from matplotlib.colors import to_rgb
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ from semfov.viz.style import FOUND, GAZE, TIME
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.text import Annotation
+    from matplotlib.lines import Line2D
+    from matplotlib.text import Annotation, Text
 
 _POINTS = 6.5
 
@@ -34,8 +35,8 @@ class LookPath:
     def __init__(self, axes: Axes, record: Record) -> None:
         self.gaze: GazePath | None = None
         self.number_boxes: list[LabelBox] = []
-        self._outlines: list[tuple[int, Any]] = []
-        self._numbers: list[tuple[int, Any]] = []
+        self._outlines: list[tuple[int, Line2D]] = []
+        self._numbers: list[tuple[int, Text]] = []
         width = record.around
         if record.kind.path:
             points = np.array([look.fixation for look in record]).reshape(-1, 2)
@@ -143,7 +144,9 @@ class GazePath:
         coloured = LineCollection(
             list(self.segments), colors=np.repeat(self.colours[1:], self.pieces, 0), linewidths=0.8
         )
-        self.lines: list[Any] = [axes.add_collection(lines, autolim=False) for lines in (light, coloured)]
+        self.lines = [light, coloured]
+        for lines in self.lines:
+            axes.add_collection(lines, autolim=False)
         x, y = self.path.T
         self.dots = axes.scatter(x, y, s=16, c=self.colours, edgecolors="white", linewidths=0.6, zorder=5)
         self.numbers = self._numbers(axes)
@@ -203,7 +206,8 @@ class GazePath:
                 continue
             is_last = number == last
             text.set_visible(number <= last)
-            frame: Any = text.get_bbox_patch()
+            frame = text.get_bbox_patch()
+            assert frame is not None  # all numbers are written with one
             frame.set(edgecolor=FOUND if is_last and found_here else "white", linewidth=1.6 if is_last else 0.7)
 
 

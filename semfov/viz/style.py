@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypedDict
 from weakref import WeakSet
 
 from semfov.errors import check
@@ -91,7 +91,7 @@ def _show_in_notebook(figure: Figure) -> None:
     from IPython.display import display
     from matplotlib.figure import Figure
 
-    def print_once(shown: Figure) -> Any:
+    def print_once(shown: Figure) -> object:
         """Print a figure that is the last value of the cell, which then need not wait for the end."""
         _waiting[:] = [waiting for waiting in _waiting if waiting is not shown]
         return print_figure(shown)
@@ -229,7 +229,14 @@ def share_colours() -> Colormap:
     return ListedColormap(colours, name="shares")
 
 
-def line_style(order: int, count: int) -> dict[str, Any]:
+class LineStyle(TypedDict):
+    """Colour and dashes of a line, as matplotlib names them."""
+
+    color: str
+    linestyle: str
+
+
+def line_style(order: int, count: int) -> LineStyle:
     """Choose colour and dashes of line `order` of `count`; no two are alike, and few lines differ in dashes too."""
     group = len(COLOURS) if count > len(COLOURS) else 2
     return {"color": COLOURS[order % len(COLOURS)], "linestyle": _LINES[order // group % len(_LINES)]}
