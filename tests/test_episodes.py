@@ -110,7 +110,7 @@ def checked(episode, count):
     assert episode.criterion is None or isinstance(episode.criterion, str)
     record = episode.record()
     assert episode.looks == record.looks
-    assert [(look.index, look.number) for look in record.looks] == [(at, at + 1) for at in range(count)]
+    assert [(look.index, look.number) for look in record.looks] == [(index, index + 1) for index in range(count)]
     assert len(record.rows()) == len(record) == record.passes == count
     assert [row["seconds"] is None for row in record.rows()] == [False] * count
     times = [look.seconds for look in record.looks]
