@@ -14,6 +14,7 @@ from semfov.tracking import Seen
 from semfov.zoom.carrying import inside_frame
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.episode import KeptLook
+from semfov.zoom.eye import BORDER
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import detected_boxes, merge, probable_objects
@@ -94,14 +95,18 @@ def seen_by(look: KeptLook, lattice: Lattice, sought: Sequence[int]) -> Seen:
     detected = detected_boxes([look.original], sought, shares=False)
     detected = detected.of((detected.scores >= FAINTEST) & detected.boxes.isfinite().all(-1))
     window = look.original.window
+    boxes = detected.boxes.double()
+    margin = BORDER / window.fixation[2]
+    entering = (boxes[:, :2] <= margin) | (boxes[:, 2:] >= boxes.new_tensor(lattice.size) - margin)
     return Seen(
-        boxes=detected.boxes.double().numpy(),
+        boxes=boxes.numpy(),
         scores=detected.scores.double().numpy(),
         labels=detected.labels.numpy(),
         cut=detected.cut.numpy(),
         region=window.region(lattice),
         magnification=window.fixation[2],
         number=look.number,
+        entering=entering.any(-1).numpy(),
     )
 
 

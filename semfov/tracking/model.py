@@ -32,6 +32,7 @@ class TrackingModel:
         place: standard deviation of each coordinate of a place at which a look shows an object, in sides.
         pixel: the same of the finest place that a detector tells, in pixels of its canvas.
         size: standard deviation of the logarithm of the width and height of a box.
+        entering: the same after a look at an object that the border of the frame cuts, so that the next look decides.
         growth: variance by which the logarithm of the size changes in a second.
         gate: largest squared distance of a detection from its object, in standard deviations.
         density: logarithm of the density of detections of other objects, for a square side.
@@ -54,6 +55,7 @@ class TrackingModel:
     place: float = 0.08
     pixel: float = 0.5
     size: float = 0.2
+    entering: float = 0.5
     growth: float = 0.01
     gate: float = 16.0
     density: float = -4.0

@@ -33,6 +33,8 @@ class Seen:
         region: `(x1, y1, x2, y2)`, the window in pixels of the frame.
         magnification: canvas pixels for a pixel of the frame.
         number: number of the look.
+        entering: `(M,)` boolean, whether the border of the frame cuts a box, which may show more of its object later;
+            None for no box.
 
     >>> box = np.array([[100.0, 100.0, 140.0, 180.0]])
     >>> seen = Seen(box, np.array([0.8]), np.array([1]), np.array([False]), (0.0, 0.0, 400.0, 400.0), 1.0)
@@ -47,6 +49,7 @@ class Seen:
     region: tuple[float, float, float, float]
     magnification: float
     number: int = 0
+    entering: NDArray[np.bool_] | None = None
 
 
 class Tracker:
@@ -145,6 +148,11 @@ class Tracker:
         sides = np.exp(_log_size(seen.boxes).mean(-1))
         return (self.model.place * sides) ** 2 + (self.model.pixel / seen.magnification) ** 2
 
+    def _least_size_variance(self, seen: Seen) -> Floats:
+        """Least variance of the logarithm of an object's size after each detection, `(M,)`."""
+        entering = np.zeros(len(seen.scores), bool) if seen.entering is None else seen.entering
+        return np.where(entering, self.model.entering**2, 0.0)
+
     def _costs(self, seen: Seen, noise: Floats) -> Floats:
         """Minus the log odds that a detection shows an object rather than another one, `(N, M)`."""
         model = self.model
@@ -184,7 +192,7 @@ class Tracker:
             tracks,
             kinematics=tracks.kinematics.measured(_centres(seen.boxes[columns]), noise[columns]),
             log_size=tracks.log_size + gain[:, None] * (log_size - tracks.log_size),
-            size_variance=tracks.size_variance * (1 - gain),
+            size_variance=np.maximum(tracks.size_variance * (1 - gain), self._least_size_variance(seen)[columns]),
             shown_odds=np.maximum(tracks.shown_odds, evidence),
             missed_odds=np.zeros(len(rows)),
             unseen=np.zeros(len(rows)),
@@ -207,7 +215,7 @@ class Tracker:
             kinematics=Kinematics.at(_centres(boxes), noise[fresh], speed),
             speed=speed,
             log_size=log_size,
-            size_variance=np.full(count, self.model.size**2),
+            size_variance=np.maximum(self.model.size**2, self._least_size_variance(seen)[fresh]),
             shown_odds=self.model.evidence(seen.scores[fresh]),
             missed_odds=np.zeros(count),
             unseen=np.zeros(count),

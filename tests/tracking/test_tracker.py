@@ -13,11 +13,11 @@ WHOLE = (0.0, 0.0, 1000.0, 800.0)
 FRAME = 0.04
 
 
-def look(*boxes, score=0.8, region=WHOLE, magnification=1.0, cut=False, label=1):
+def look(*boxes, score=0.8, region=WHOLE, magnification=1.0, cut=False, label=1, entering=False):
     count = len(boxes)
     return Seen(
         np.array(boxes, dtype=float).reshape(-1, 4), np.full(count, score), np.full(count, label),
-        np.full(count, cut), region, magnification,
+        np.full(count, cut), region, magnification, entering=np.full(count, entering),
     )  # fmt: skip
 
 
@@ -212,3 +212,16 @@ def test_a_fast_object_moves_for_certain_and_without_a_warning():
         tracker.follow(1 / 30)
         tracker.see(look(box_at(100 + 20 * frame, 300)))
     assert tracker.tracks.standing.max() < 1e-6
+
+
+def test_an_object_that_comes_into_the_frame_is_as_large_as_later_looks_show_it():
+    """The camera turns, and more of the object comes in at the right border of the frame in each look."""
+    tracker = Tracker()
+    for step, wide in enumerate((12, 24, 40, 40)):
+        if step:
+            tracker.follow(0.1, CameraStep(Motion.similarity(shift=(-14, 0))))
+        x = 988 - 14 * step
+        tracker.see(look(box_at(x, 300, wide=wide), entering=wide < 40))
+    (number,) = tracker.tracks.track_ids.tolist()
+    assert number == 1
+    assert tracker.tracks.boxes[0].tolist() == pytest.approx(box_at(x, 300), abs=3)
