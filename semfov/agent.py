@@ -548,6 +548,7 @@ class ActivePerception(nn.Module):
         *,
         how: How = "auto",
         rate: float | None = None,
+        passes: int | None = None,
         start: Start = None,
         seed: int = 0,
         confirm: float | None = None,
@@ -558,7 +559,7 @@ class ActivePerception(nn.Module):
         color: Color = "rgb",
         white: White | None = None,
     ) -> LivePerception:
-        """Look at a camera or a video: one pass of the detector for every frame, and evidence that fades between them.
+        """Look at a camera or a video: a pass of the detector for every frame, and evidence that fades between them.
 
         When a place seems to hold the target, the recommended agent spends a frame on a closer look (`search`).
 
@@ -575,6 +576,7 @@ class ActivePerception(nn.Module):
         settings = StreamSettings(
             how=how,
             rate=rate,
+            passes=passes,
             start=start,
             seed=seed,
             confirm=confirm,
@@ -585,11 +587,9 @@ class ActivePerception(nn.Module):
             color=color,
         )
         classes = class_numbers(target, self.classes[1:], "target")
-        if isinstance(target, list | tuple):
-            check(prior is None, "prior", "None without one class to search for", prior)
-            return LivePerception(self, targets=classes, settings=settings, white=white)
-        check(prior is None or target is not None, "prior", "None without one class to search for", prior)
-        return LivePerception(self, classes[0] if classes else None, settings=settings, white=white)
+        is_one = target is not None and not isinstance(target, list | tuple)
+        check(prior is None or is_one, "prior", "None without one class to search for", prior)
+        return LivePerception(self, classes[0] if is_one else None, () if is_one else classes, settings, white=white)
 
     def _look(
         self, opened: OpenedPicture, settings: LookSettings, *, every: bool = False, foveal: bool = False

@@ -8,7 +8,7 @@ the kind of look and the models of the agent.
     SearchSettings         x                x                 x            boxes
     FindSettings           x                                               min_gain, score_threshold, batch
     ExploreSettings        x                x                              min_gain, score_threshold, policy
-    StreamSettings                          x                 x            how, rate, score_threshold, color
+    StreamSettings                          x                 x            how, rate, passes, score_threshold, color
 """
 
 import re
@@ -242,6 +242,7 @@ class StreamSettings(DecisionSettings, StartSettings):
         how: kind of look: `fovea`, `windows`, or `auto`: windows, or a fovea where frames are small and the agent has
             no evidence for photographs or `start` is given.
         rate: rate at which evidence fades, per second; 0: never (None: 2.5 for a fovea, 0.75 for windows).
+        passes: passes of the detector at each frame, for windows (None: 1).
         confirm: the target is found from this probability on, with closer looks that of its place (None: that of the
             model).
         stop_below: chance of a new hit below which no closer look is made (None: that of the belief alone, as a belief
@@ -263,6 +264,7 @@ class StreamSettings(DecisionSettings, StartSettings):
 
     how: How = "auto"
     rate: Rate | None = None
+    passes: Passes | None = None
     score_threshold: Probability | None = None
     color: Color = "rgb"
 

@@ -206,7 +206,7 @@ class StreamEpisode(Episode[_Moment]):
 
     @property
     def passes(self) -> int:
-        """Number of passes of the detector so far, one for each frame."""
+        """Number of passes of the detector so far."""
         return self._passes
 
     @torch.inference_mode()

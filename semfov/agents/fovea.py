@@ -143,6 +143,7 @@ class FoveaAgent(GazeParts):
             "None for a fovea, or how='windows'",
             settings.score_threshold,
         )
+        check(settings.passes in (None, 1), "passes", "1 for a fovea, or how='windows'", settings.passes)
         rate = RATE if settings.rate is None else settings.rate
         plan = GazePlan(self, target, start=settings.start, seed=settings.seed, decisions=settings, rate=rate)
         return FoveaStream(plan, settings.color)

@@ -423,7 +423,7 @@ class GivenWindows(PictureEpisode[ZoomPath]):
 
 
 class WindowStream(StreamEpisode[WindowMoment]):
-    r"""Looks at windows of the frames of a stream, one for each frame.
+    r"""Looks at windows of the frames of a stream, one or more at each frame.
 
     A look counts for :math:`\ln 2 / r` seconds, with the rate r, or until the next look at the same window
     (`semfov.zoom.episode.look_by_look`), and what a later look has shown as closely replaces what earlier ones did.
@@ -434,14 +434,23 @@ class WindowStream(StreamEpisode[WindowMoment]):
         task: what is looked for.
         eye: resamples a window and detects in it.
         rate: rate at which looks are forgotten, per second.
+        passes: number of looks at each frame.
         color: order of the channels of frames that are arrays or tensors.
         follows: whether the camera's motion is estimated from the frames, where no poses are given.
     """
 
     def __init__(
-        self, task: WindowTask, eye: WindowEye, rate: float, *, color: Color = "rgb", follows: bool = False
+        self,
+        task: WindowTask,
+        eye: WindowEye,
+        rate: float,
+        *,
+        passes: int = 1,
+        color: Color = "rgb",
+        follows: bool = False,
     ) -> None:
         super().__init__(task.goal, rate)
+        self.passes_of_frame = passes
         self.task = task
         self.eye = eye
         self.color = color
@@ -449,6 +458,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
         self._camera = _Camera(follows=follows)
         self._session: WindowSession | None = None  # from the first frame on
         self._moment: WindowMoment | None = None
+        self._frames = 0  # number of frames so far
         self._is_lost = False  # whether the present frame fits none before it
 
     @property
@@ -479,8 +489,10 @@ class WindowStream(StreamEpisode[WindowMoment]):
             session = self._session = WindowSession(self.task, source, self._limits, self.forgetting)
         self._follow(session, view, passed, pose)
         session.decisions.wait(passed)
-        session.look()
-        self._passes += 1
+        for _ in range(self.passes_of_frame):
+            session.look()
+            self._passes += 1
+        self._frames += 1
         self._moment = self._made(session, view)
 
     def _follow(self, session: WindowSession, view: WindowView, passed: float, pose: Motion | ArrayLike | None) -> None:
@@ -509,7 +521,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
             **session.record_fields(looks),
             decision=session.decisions.decision,
             photograph=reduced_copy(view.picture),
-            number=self.passes - 1,
+            number=self._frames - 1,
             lost=self._is_lost,
             tracks=session.tracks,
             next_window=session.next_window,

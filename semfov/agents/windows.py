@@ -212,4 +212,4 @@ class ZoomAgent(nn.Module):
         settings = StreamSettings() if settings is None else settings
         rate = RATE if settings.rate is None else settings.rate
         task = self.task(target, targets, decisions=settings, score_threshold=settings.score_threshold)
-        return WindowStream(task, self.eye, rate, color=settings.color, follows=follows)
+        return WindowStream(task, self.eye, rate, passes=settings.passes or 1, color=settings.color, follows=follows)

@@ -87,6 +87,7 @@ class Tracker:
         self._aside: Tracks | None = None  # objects of a scene that the camera has lost and may find again
         self._waited = 0.0  # seconds since then
         self._last = 0  # the last number that was given
+        self._is_marked = False  # whether the trails have a place in the present frame
 
     def follow(self, seconds: float, camera: CameraStep | None = None) -> None:
         """Predict the objects at the next frame.
@@ -96,6 +97,7 @@ class Tracker:
             camera: how the camera moved since the last frame; None for one that stands still.
         """
         self._waited += seconds
+        self._is_marked = False
         if camera is not None and camera.motion is None:
             if self._aside is None:
                 self._aside = self.tracks
@@ -141,7 +143,8 @@ class Tracker:
         fresh[pairs[:, 1]] = False
         self._begin(seen, noise, fresh)
         self._merge_doubles()
-        self.tracks = self.tracks.marked()
+        self.tracks = self.tracks.marked(anew=self._is_marked)
+        self._is_marked = True
 
     def _noise(self, seen: Seen) -> Floats:
         """Variance of the places of detections, `(M,)`, in square pixels."""

@@ -200,13 +200,17 @@ class Tracks:
             trail=motion.points(torch.from_numpy(ahead.trail)).numpy(),
         )
 
-    def marked(self) -> "Tracks":
+    def marked(self, *, anew: bool = False) -> "Tracks":
         """Write the present places to the trails.
+
+        Args:
+            anew: whether the trails have places of the present frame already, which are replaced.
 
         Returns:
             The objects with their trails up to the present frame.
         """
-        return replace(self, trail=np.concatenate([self.trail[:, 1:], self.place[:, None]], 1))
+        before = self.trail[:, :-1] if anew else self.trail[:, 1:]
+        return replace(self, trail=np.concatenate([before, self.place[:, None]], 1))
 
     def of_ids(self, track_ids: Tensor) -> "Tracks":
         """Select objects by their numbers.

@@ -89,3 +89,21 @@ def test_the_way_of_an_object_is_drawn_where_it_was(moments):
     x, y = way[len(way) // 2]
     around = slice(int(y) - 2, int(y) + 3), slice(int(x) - 2, int(x) + 3)
     assert abs(drawn[around] - frame[around]).max() > 20
+
+
+def test_several_passes_at_a_frame_are_looks_without_time_between_them():
+    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2, 8)).eval()
+    twice, once = (agent.stream(None, (RED,), StreamSettings(passes=passes)) for passes in (2, 1))
+    for frame, _ in frames(6):
+        moment = twice.step(frame)
+        first = once.step(frame)
+        second = once.step(frame, passed=0.0)
+        for mine, its in ((moment.looks[-2], first.looks[-1]), (moment.looks[-1], second.looks[-1])):
+            assert mine.shown.window == its.shown.window
+        assert moment.tracks.track_ids.tolist() == second.tracks.track_ids.tolist()
+        torch.testing.assert_close(moment.tracks.boxes, second.tracks.boxes)
+        torch.testing.assert_close(moment.candidates.scores, second.candidates.scores)
+    assert (moment.number, twice.passes) == (5, 12)
+    # A trail has one place of each frame.
+    known = (~torch.from_numpy(moment.tracks.trail[..., 0]).isnan()).sum(-1)
+    assert int(known.max()) <= 6
