@@ -16,7 +16,7 @@ __all__ = ["LivePerception"]
 
 
 class LivePerception(OtherWords):
-    """Looks at the frames of a stream with one pass of the detector each, by a fovea or at windows.
+    """Looks at the frames of a stream with a pass of the detector each, by a fovea or at windows.
 
     With `how="auto"` windows are looked at. A fovea looks at frames that are less than four times as long as the
     detector's input where the agent has no evidence for photographs, or where a first cell is given.

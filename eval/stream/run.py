@@ -3,7 +3,6 @@
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Annotated, Literal, NamedTuple
@@ -14,7 +13,7 @@ from eval.stream.drift import Drift
 from eval.stream.flights import COURSES, CourseName, Frame, film, flight, mot_film, within
 from eval.stream.identity import Identities, IdentityCounts
 from eval.stream.plain import PlainRule
-from eval.stream.ways import AllSlices, Live, RoundRobin, TrackedSlices, Way, WholeFrame
+from eval.stream.ways import AllSlices, Live, Oracle, RoundRobin, TrackedSlices, Way, WholeFrame
 from semfov.agents.window_episode import LIKELY
 from semfov.agents.windows import ZoomAgent
 from semfov.data.classes import class_index
@@ -32,7 +31,7 @@ from semfov.settings import StreamSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 
-WayName = Literal["whole", "slices", "bytetrack", "in-turn", "in-turn-carried", "plain", "live", "live-known"]
+WayName = Literal["whole", "slices", "bytetrack", "in-turn", "in-turn-carried", "plain", "live", "live-known", "oracle"]
 _Length = Annotated[int, Range(64, 16_384)]
 FILM = "film"
 """The course of a film in tables."""
@@ -59,6 +58,7 @@ class StreamConfig(Settings):
         every: each of so many frames is judged.
         after: the figures of all judged frames leave out those up to this one.
         rate: rate at which the agent forgets looks, per second of 25 frames.
+        passes: passes of the agent at each frame; each of several numbers is a row.
         seed: random seed of the flights.
         out: folder for tables and records.
     """
@@ -77,6 +77,7 @@ class StreamConfig(Settings):
     every: Count = 8
     after: Whole = 8
     rate: Positive = 0.75
+    passes: tuple[Count, ...] = (1,)
     seed: Seed = 0
     out: Path = Path("runs/stream")
 
@@ -139,18 +140,26 @@ class StreamRun:
     def _ways(self) -> list[Way]:
         """Return the ways of looking, each with an empty memory."""
         eye, target, config = self.eye, self.target, self.config
-        episode = partial(self.agent.stream, None, (target,), StreamSettings(rate=config.rate))
-        makers: dict[WayName, Callable[[], Way]] = {
-            "whole": lambda: WholeFrame(eye, target),
-            "slices": lambda: AllSlices(eye, target),
-            "bytetrack": lambda: TrackedSlices(eye, target),
-            "in-turn": lambda: RoundRobin(eye, target, carries=False),
-            "in-turn-carried": lambda: RoundRobin(eye, target, carries=True),
-            "plain": lambda: PlainRule(eye, target),
-            "live": lambda: Live(eye, target, episode()),
-            "live-known": lambda: Live(eye, target, episode(), poses=True),
+
+        def agents(*, poses: bool) -> list[Way]:
+            ways: list[Way] = []
+            for passes in config.passes:
+                episode = self.agent.stream(None, (target,), StreamSettings(rate=config.rate, passes=passes))
+                ways.append(Live(eye, target, episode, poses=poses))
+            return ways
+
+        makers: dict[WayName, Callable[[], list[Way]]] = {
+            "whole": lambda: [WholeFrame(eye, target)],
+            "slices": lambda: [AllSlices(eye, target)],
+            "bytetrack": lambda: [TrackedSlices(eye, target)],
+            "in-turn": lambda: [RoundRobin(eye, target, carries=False)],
+            "in-turn-carried": lambda: [RoundRobin(eye, target, carries=True)],
+            "plain": lambda: [PlainRule(eye, target)],
+            "live": lambda: agents(poses=False),
+            "live-known": lambda: agents(poses=True),
+            "oracle": lambda: [Oracle(eye, target)],
         }
-        return [makers[name]() for name in config.ways]
+        return [way for name in config.ways for way in makers[name]()]
 
     @torch.inference_mode()
     def _look(self, course: str, name: str, frames: Iterator[Frame]) -> StreamOutcome:

@@ -1,5 +1,7 @@
 """Flights over pictures, ways of looking at their frames, and the tables about them."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from eval.stream.flights import COURSES, Course, Frame, flight, mot_film, poses
 from eval.stream.plain import PlainRule
 from eval.stream.report import by_way, listed_cell, precision_figures
 from eval.stream.run import judged_objects
-from eval.stream.ways import AllSlices, RoundRobin, WholeFrame, whole_and_slices
+from eval.stream.ways import AllSlices, Oracle, RoundRobin, WholeFrame, whole_and_slices
 from semfov import WindowEye
 from semfov.data.scene import Annotation, Scene
 from semfov.detection.objects import Objects
@@ -123,12 +125,15 @@ def test_the_frame_and_its_slices_cover_it_at_native_size():
     assert shown.all()
 
 
-@pytest.mark.parametrize("make", [AllSlices, WholeFrame, PlainRule, lambda *given: RoundRobin(*given, carries=True)])
+CARRIED = partial(RoundRobin, carries=True)
+
+
+@pytest.mark.parametrize("make", [AllSlices, WholeFrame, PlainRule, Oracle, CARRIED])
 def test_ways_know_where_the_square_is_while_the_camera_moves(make):
     """After one round, in each frame that shows it."""
     way, right, shown = make(eye(), 1), 0, 0
     for number, frame in enumerate(flight(scene(), Course(speed=5), FRAME, 40, 4)):
-        (objects,) = way.step(frame).values()
+        *_, objects = way.step(frame).values()
         assert way.remembers or way.passes in (1, 21)
         if number > 24 and len(frame.annotation.boxes):
             shown += 1
@@ -178,13 +183,14 @@ def test_average_precision_of_all_frames_leaves_out_the_first_ones():
 def test_a_small_run_writes_its_tables(tmp_path, capsys):
     """As a user runs it: on an embedded photograph, with the real detector."""
     small = ["--width", "416", "--height", "320", "--frames", "4", "--every", "2", "--after", "0"]
+    small += ["--passes", "[1,2]"]
     assert main(["--data.limit", "1", "--courses", "[usual]", *small, "--out", str(tmp_path)]) == 0
     text = (tmp_path / "stream.md").read_text()
     assert text in capsys.readouterr().out
-    for row in ("whole frame ", "slices in turn, carried along", "plain rule", "live ", "live, all candidates"):
+    for row in ("whole frame ", "slices in turn, carried along", "plain rule", "live ", "live, all candidates, 2"):
         assert f"| {row}" in text
     assert "nan" not in text
-    assert len((tmp_path / "records.jsonl").read_text().splitlines()) == 2 * 7
+    assert len((tmp_path / "records.jsonl").read_text().splitlines()) == 2 * 9
 
 
 def test_a_film_that_ends_before_a_judged_frame_is_refused(tmp_path, capsys):
