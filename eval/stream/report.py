@@ -1,6 +1,7 @@
 """Runs the study to its end, and writes its tables."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -9,10 +10,13 @@ from eval.bootstrap import Bootstrap
 from eval.comparison.summary import announce, write_summary
 from eval.stream.identity import IdentityCounts
 from eval.stream.run import FILM, StreamConfig, StreamOutcome, StreamRun
+from eval.stream.ways import CANDIDATES
 from eval.zoom.objects import average_precision
 from semfov.errors import check_data
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import plus_minus, table
+
+_PROBABILITIES = 0.1, 0.3, 0.5, 0.7, 0.9, 1.0  # borders of the ranges of a table of reliability
 
 _By = dict[str, dict[int, list[ResultRecord]]]
 """Records by way of looking and frame."""
@@ -66,8 +70,33 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         "",
         *table(listed),
         "",
+        *reliability_table(by, config.after),
         *identity_table(outcomes),
     ]
+
+
+def reliability_table(by: _By, after: int) -> list[str]:
+    """Table of how much of what has a probability is right, of the candidates of the agent; empty without it."""
+    rows = [["", *(f"{low:g} to {high:g}" for low, high in pairwise(_PROBABILITIES))]]
+    for way, frames in by.items():
+        if way.startswith(CANDIDATES):
+            records = [record for frame, group in frames.items() if frame > after for record in group]
+            rows.append([way, *reliability_cells(records)])
+    if len(rows) == 1:
+        return []
+    return ["Share that is right of what has a probability in a range, and how many have it.", "", *table(rows), ""]
+
+
+def reliability_cells(records: Sequence[ResultRecord]) -> list[str]:
+    """Share of right objects and number of objects, by ranges of the probability."""
+    scores = torch.tensor([score for record in records for score in record["scores"]])
+    right = torch.tensor([value for record in records for value in record["right"]], dtype=torch.bool)
+    cells = []
+    for low, high in pairwise(_PROBABILITIES):
+        inside = (scores >= low) & ((scores < high) | (high == 1))
+        count = int(inside.sum())
+        cells.append(f"{float(right[inside].float().mean()):.2f} ({count})" if count else "-")
+    return cells
 
 
 def identity_table(outcomes: Sequence[StreamOutcome]) -> list[str]:

@@ -11,7 +11,7 @@ from eval.stream import main
 from eval.stream.drift import Drift
 from eval.stream.flights import COURSES, Course, Frame, flight, mot_film, poses
 from eval.stream.plain import PlainRule
-from eval.stream.report import by_way, listed_cell, precision_figures
+from eval.stream.report import by_way, listed_cell, precision_figures, reliability_cells
 from eval.stream.run import judged_objects
 from eval.stream.ways import AllSlices, Oracle, RoundRobin, WholeFrame, whole_and_slices
 from semfov import WindowEye
@@ -164,6 +164,13 @@ def test_objects_of_a_frame_are_judged_as_by_hand():
     assert (record["objects"], record["listed"], record["listed right"]) == (2, 2, 1)
     assert listed_cell([record]) == "0.50 / 0.50"
     assert listed_cell([{**record, "listed": 0, "listed right": 0}]) == "- / 0.00"
+
+
+def test_reliability_counts_what_is_right_by_ranges_of_the_probability():
+    """By hand; a probability of one belongs to the last range."""
+    first = {"scores": [1.0, 0.95, 0.5, 0.05], "right": [True, False, True, True]}
+    second = {"scores": [0.69, 0.3], "right": [False, False]}
+    assert reliability_cells([first, second]) == ["-", "0.00 (1)", "0.50 (2)", "-", "0.50 (2)"]
 
 
 def test_average_precision_of_all_frames_leaves_out_the_first_ones():
