@@ -20,7 +20,7 @@ from semfov.data.fixations import Fixations
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
-from semfov.io.files import check_writable, plain_name, write_text
+from semfov.io.files import check_apart, check_writable, plain_name, write_text
 from semfov.io.tables import csv_text, digits
 from semfov.paths.areas import boxes_of, percent
 from semfov.paths.drafts import Drafts
@@ -75,6 +75,7 @@ class _GazeJob:
         if options.compare:
             check(len(self.sources) == 2, "compare", "two pictures", len(self.sources))
         self.kind = _kind_of_output(options.out, several=self.several, compared=options.compare)
+        check_apart(options.out, "out", [source.file for source in self.sources])
         self.table = _table_of(options.out, self.kind)
         self.areas = None if options.areas is None else boxes_of(options.areas)
         self.report = (

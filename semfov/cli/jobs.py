@@ -29,7 +29,7 @@ from semfov.data.examples import example_with
 from semfov.data.large import picture_size
 from semfov.errors import InputError, SemfovError, check
 from semfov.head.scenes import World
-from semfov.io.files import check_writable, sha256
+from semfov.io.files import check_apart, check_writable, sha256
 from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.io.ranges import CheckedSettings
@@ -78,6 +78,7 @@ class PictureJob(ABC, Generic[_Options]):
             first = "none for find, which begins with the whole picture"
             check(options.start is None, "start", first, repr(options.start))
         _check_outputs(options)
+        check_apart(options.figure, "out", [source.file for source in self.sources])
         expected = f"a folder for the figures of {len(self.sources):,} pictures"
         check(options.figure is None or not self.several, "out", expected, options.figure)
         # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.

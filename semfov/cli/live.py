@@ -14,7 +14,7 @@ from semfov.cli.results import held_outputs
 from semfov.data.classes import class_index
 from semfov.data.sources import Picture, Stream, open_stream
 from semfov.errors import InputError, check
-from semfov.io.files import check_writable, write_text
+from semfov.io.files import check_apart, check_writable, write_text
 from semfov.live import LivePerception
 from semfov.paths import Moment, WindowMoment
 from semfov.paths.look import detections_in_words
@@ -56,6 +56,7 @@ def look_live(options: LiveOptions) -> int:
     path = out
     if out is not None and (out.is_dir() or not out.suffix):
         path = out / f"live{video_suffix()}"
+    check_apart(path, "out", [Path(source)] if isinstance(source, str) else [])
     with held_outputs(options):
         _watch(live, stream, path, tracks)
     written = [str(file) for file in (path, tracks) if file is not None]

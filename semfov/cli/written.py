@@ -7,7 +7,7 @@ from semfov.cli.jobs import PictureJob
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import STDOUT, ResultsFile, kind_of, results_format, tell_written, unfinished
 from semfov.errors import SemfovError
-from semfov.io.files import plain_name, write_bytes
+from semfov.io.files import check_apart, plain_name, write_bytes
 from semfov.report import write_page
 from semfov.runs.results import SceneResults
 
@@ -74,6 +74,7 @@ class PictureFiles:
                 name = plain_name(Path(source.name).name)
                 folder = self._folder / f"{number:03d}-{name}" if self.job.several else self._folder
                 for file, content in outcome.figures.items():
+                    check_apart(folder / file, "out", [source.file])
                     write_bytes(folder / file, content)
                 self._written += [folder / file for file in outcome.names]
         except Exception as error:

@@ -17,7 +17,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from semfov.errors import DataError, check_data
+from semfov.errors import DataError, check, check_data
 
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part")
 _ABANDONED = 24 * 3600.0  # seconds after which a part of a file is taken for one whose writer was killed
@@ -237,6 +237,20 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
         raise DataError(f"cannot write {path}: {place} is not a folder")
     if not os.access(place, os.W_OK | os.X_OK):
         raise DataError(f"cannot write {path}: no permission to write in {place}")
+
+
+def check_apart(path: Path | None, argument: str, files: Iterable[Path | None]) -> None:
+    """Raise `InputError` where what is written would take the place of a file that is read.
+
+    Args:
+        path: what is written; None for nothing.
+        argument: name of the option, for the message.
+        files: the files that are read; None is left out.
+    """
+    if path is None or not path.is_file():
+        return
+    same = any(file is not None and file.is_file() and file.samefile(path) for file in files)
+    check(not same, argument, "a file other than the one that is looked at", path)
 
 
 @contextmanager

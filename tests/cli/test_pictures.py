@@ -95,6 +95,18 @@ def test_a_name_of_a_picture_gets_the_figure_of_one(run, photo, folder, tmp_path
     assert "out: expected a folder for the figures of 3 pictures, got" in printed.err
 
 
+@pytest.mark.parametrize("words", [("find",), ("gaze",), ("explore", "--how", "fovea")])
+def test_no_figure_takes_the_place_of_the_picture_that_is_looked_at(run, tmp_path, photo, words, monkeypatch):
+    picture = photo.rename(tmp_path / "scanpath.png")
+    before = picture.read_bytes()
+    monkeypatch.chdir(tmp_path)
+    out = "." if words[0] == "explore" else f"./{picture.name}"
+    code, printed = run(*words, picture, "--out", out)
+    assert code == 1
+    assert "out: expected a file other than the one that is looked at" in printed.err
+    assert picture.read_bytes() == before
+
+
 @pytest.mark.parametrize("task", ["search", "explore"])
 def test_only_the_named_figures_are_drawn(run, photo, tmp_path, task):
     more, draw = ("--shifts", 1), "belief"
