@@ -264,7 +264,7 @@ class HeadPath(Record):
         """Pose of the head in a look.
 
         Args:
-            look: number of the look; negative numbers count from the end.
+            look: index of the look, from 0 (`look.index`); negative ones count from the end.
 
         Returns:
             `(3,)`, pan to the right, tilt up, and field of view, in degrees.
@@ -275,7 +275,7 @@ class HeadPath(Record):
         """Point of the scene that the eye fixated in a look.
 
         Args:
-            look: number of the look; negative numbers count from the end.
+            look: index of the look, from 0 (`look.index`); negative ones count from the end.
 
         Returns:
             `(D,)`, a unit direction in a panorama, or pixels of a flat scene.
@@ -286,7 +286,7 @@ class HeadPath(Record):
         """Direction in which the eye looked, as a head would turn to it.
 
         Args:
-            look: number of the look; negative numbers count from the end.
+            look: index of the look, from 0 (`look.index`); negative ones count from the end.
 
         Returns:
             Pan to the right and tilt up, in degrees.
@@ -298,7 +298,7 @@ class HeadPath(Record):
         """Objects detected in a look, in coordinates of the scene.
 
         Args:
-            look: number of the look; negative numbers count from the end.
+            look: index of the look, from 0 (`look.index`); negative ones count from the end.
             score: least score of an object. For a search, only objects of the target class are returned.
 
         Returns:
