@@ -239,7 +239,7 @@ usage: semfov compare [PICTURE ...] [--with sahi,ranked] [options]
   --passes N           most passes of the detector for a picture (default 24)
   --slice N            side of a slice in pixels (default: of the detector's input); --overlap S (default 0.2)
   --out FOLDER         compare.html, compare.csv and compare.png (default: the folder semfov-compare)
-  --quiet              no bar; --device cuda; --white auto and --bands 4,3,2 as for semfov find
+  --quiet              errors alone; --device cuda; --white auto and --bands 4,3,2 as for semfov find
 
 SAHI itself is not needed: semfov cuts the slices by its rule, looks at them, and merges what they show. Seconds are
 those of this machine. --help-all: all options.

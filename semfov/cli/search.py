@@ -21,6 +21,7 @@ from semfov.cli.options import AgentKind, ExploreOptions, FindOptions, PictureOp
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import held_outputs
 from semfov.cli.written import PictureFiles
+from semfov.data.classes import counted
 from semfov.errors import InputError, SemfovError, check, check_options, lookup
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
@@ -218,8 +219,16 @@ def _look_and_write(job: PictureJob[Any], stream: TextIO) -> list[dict[str, Any]
     if job.several:
         counts = ", ".join(f"{times} {name}" for name, times in endings.items())
         skipped = f"{len(faults)} skipped" if faults else ""
-        print(f"{count} pictures: {'; '.join(filter(None, [counts, skipped]))}")
+        print(f"{count} pictures: {'; '.join(filter(None, [counts, _found_in_all(files), skipped]))}")
     return [files.rows[number] for number in range(count)]
+
+
+def _found_in_all(files: PictureFiles) -> str:
+    """Count the objects of each class in all pictures of a find; empty for other tasks, and where none was found."""
+    if not files.job.every:
+        return ""
+    counts = Counter(line["class"] for row in files.rows.values() for line in row.get("objects", ()))
+    return f"{', '.join(counted(number, name) for name, number in counts.most_common())} found" if counts else ""
 
 
 def _skip(job: PictureJob[Any], files: PictureFiles, number: int, fault: SemfovError) -> None:

@@ -207,7 +207,7 @@ class Words(ABC):
             return ""
         share = f"{min(100 * record.assumed, 99.9):.3g} % of your {self._pictures} hold it"
         given = f" ({option})" if record.prior is None else ""
-        return f"This assumes that {share}; if half of them did, it would be {at_half:.2f}{given}."
+        return f"This assumes that {share}; if half of them did, it would be {at_half:.2f} after these looks{given}."
 
     def summary(self, option: str = "prior=0.5") -> str:
         """Describe the outcome, explain why it ended, name the best place of doubt, and say what is assumed.
