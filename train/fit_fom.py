@@ -65,7 +65,7 @@ class FitFomConfig(FitConfig):
             and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
             `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
             calibration is about. `search` starts from it, and learns through the belief where the target of a search
-            is (`semfov.fit.through_belief`): exponents, odds of a miss and refutation.
+            is (`semfov.fit.through_belief`): the odds of a miss.
         steps: number of steps of the fit through the belief.
         looks: most looks in a search of this fit.
         max_target_area: classes that cover a larger share of the image are not searched for in this fit.

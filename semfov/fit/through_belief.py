@@ -19,10 +19,10 @@ from semfov.fit.samples import Samples
 from semfov.fit.training import descend
 from semfov.observation.foveal import FovealObservationModel
 
-_EXPONENT = 0.75  # value from which the exponents are learned
+_EXPONENT = 0.75  # of the likelihood at every level, set by hand
+_REFUTATION = 0.9  # set by hand
 _MISS = 1e-4  # value from which the odds of a miss are learned
-_REFUTATION = 0.9  # value from which the refutation is learned
-_DEGREE = 2  # of the curves over the levels: few photographs show what each level alone is like
+_DEGREE = 2  # of the curve over the levels: few photographs show what each level alone is like
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def mean_landing_loss(model: FovealObservationModel, searches: Sequence[Searched
 
 @torch.no_grad()
 def starting_model(model: FovealObservationModel) -> FovealObservationModel:
-    """Copy a model for `fit_through_belief`, with exponents, odds of a miss and refutation to start from."""
+    """Copy a model for `fit_through_belief`, with its exponents and refutation, and odds of a miss to start from."""
     start = deepcopy(model)
     start.log_exponents.fill_(math.log(_EXPONENT))
     log_miss = torch.full_like(start.log_prior, math.log(_MISS))
@@ -175,9 +175,9 @@ def fit_through_belief(
 ) -> FovealObservationModel:
     """Train a model by the loss of searches (`landing_loss`), through the belief that runs in a search.
 
-    The logarithms of the exponents, of the prior of objects against background and of the odds of a miss change by a
-    parabola over the levels each, the same for all classes. With one refutation for all levels these are 10 numbers. α
-    stays as it was fitted.
+    The odds of a miss are learned: their logarithm is a parabola over the levels, the same for all classes, so these
+    are 3 numbers. The exponent of the likelihood is 0.75 at all levels, and the refutation 0.9. α and the prior stay as
+    they were fitted. (Learning the other numbers, too, lands no sooner: docs/decisions/association.md.)
 
     Args:
         model: the model to start from, as `fit` or `fit_discriminative` leaves it.
@@ -199,11 +199,10 @@ def fit_through_belief(
     check(min(looks, steps, batch) > 0 and rate > 0, "looks, steps, batch, rate", "positive numbers", (looks, steps))
     if not searches:
         raise DataError("data: expected a photograph with a class to search for, got none; raise max_target_area")
-    # Models are usually loaded frozen, and a frozen table would keep the value that the fit starts from.
-    trained = starting_model(model).eval().requires_grad_(True)
-    trained.log_alpha.requires_grad_(False)  # stays as it was fitted to single detections
-    for name in _CURVED:
-        parametrize.register_parametrization(trained, name, _Curve(getattr(trained, name)))
+    trained = starting_model(model).eval().requires_grad_(False)
+    assert trained.log_miss is not None
+    trained.log_miss.requires_grad_(True)
+    parametrize.register_parametrization(trained, "log_miss", _Curve(trained.log_miss))
     observer = Semantic.searching(trained)
     generator = torch.Generator().manual_seed(seed)
 
@@ -219,23 +218,16 @@ def fit_through_belief(
 
     parameters = [parameter for parameter in trained.parameters() if parameter.requires_grad]
     descend(parameters, loss_of, steps, rate, decay=0.0, clip=None, title="fitting through the belief")
-    for name in _CURVED:
-        parametrize.remove_parametrizations(trained, name)
-    with torch.no_grad():
-        trained.refutation.clamp_(0, 1)  # a share, which the steps do not know
+    parametrize.remove_parametrizations(trained, "log_miss")
     trained.metadata |= {"method": "search", **metadata}
     return trained.requires_grad_(True)
-
-
-_CURVED = ("log_exponents", "log_prior", "log_miss")
-"""Tables of an observation model that change by a curve over its levels."""
 
 
 class _Curve(nn.Module):
     """A table of a model plus a curve over its levels, the same for all classes; background stays.
 
     Args:
-        table: the table to start from, `(N,)` or `(K+1, N)`.
+        table: the table to start from, `(K+1, N)`.
     """
 
     start: Tensor
@@ -251,8 +243,6 @@ class _Curve(nn.Module):
     def forward(self, coefficients: Tensor) -> Tensor:
         """Compute the table from the coefficients `(D+1,)` of the curve."""
         curve = coefficients @ self.powers
-        if self.start.ndim == 1:
-            return self.start + curve
         return torch.cat([self.start[:1], self.start[1:] + curve])
 
     def right_inverse(self, table: Tensor) -> Tensor:

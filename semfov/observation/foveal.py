@@ -38,7 +38,7 @@ class FovealObservationModel(Pretrained):
     are overconfident: the density treats its K+1 components as independent evidence, while most scores of a detection
     are near zero together. A class prior and τ < 1 help, and each level may have an exponent that multiplies τ. The
     recommended models use `fit_discriminative`, which trains α and π for the posterior itself; `fit_through_belief`
-    trains all parameters for searches. The paper gives neither the number of levels nor their borders, nor its
+    learns the odds of a miss from searches. The paper gives neither the number of levels nor their borders, nor its
     treatment of scores of 0: `edges` and `epsilon` are our choice.
 
     The logit of a class is linear in the log scores, with weights `τ (α - 1)`. The model with `α_k = 1 + e_k`, τ = 1
