@@ -24,7 +24,6 @@ from semfov.io.files import replacing
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.hints import Gist
-from semfov.zoom.pooling import pool_spans
 from semfov.zoom.survey import STEPS
 
 _LOOK_METADATA_KEY = "semfov.look"
@@ -46,9 +45,7 @@ def export_look(
     - `cut` `(L,)`, true where the border of the window cuts the box;
     - `window` `(4,)`, the part of the picture that was seen;
     - with evidence: `rates` `(K+1, 3, c, c)`, logarithms of the number of further objects of any class (0) and of each
-      class that looks one, two and three octaves closer are expected to find in each cell of the window;
-    - with evidence: `odds_1`, `odds_2` and `odds_3`, `(K, p, p)`, log odds that windows one, two and three octaves
-      closer show each class, for the windows that start at each of the first p cells down a column and along a row.
+      class that looks one, two and three octaves closer are expected to find in each cell of the window.
 
     Windows are rounded to whole pixels, resampled as bytes with antialiasing, and cut to the picture, as by the eye.
     (The eye reads very large windows that are reduced more than four times as means of squares of pixels. The graph
@@ -100,13 +97,8 @@ def export_look(
         faint, values = graph.hints(boxes, confidence, vectors)
         hints = graph.placed(faint, frame, "picture")[0], values
         gist = graph.gist(hints, (placed, scores), start, cells, kinds)
-        predictions = graph.append(
-            _exported(_Predicting(evidence, cells), *_examples(cells, kinds)), "evidence/", _named(gist)
-        )
-        sides = [cells - (cells >> step) + 1 for step in range(1, STEPS + 1)]
-        shapes = [[kinds + 1, STEPS, cells, cells], *([kinds, side, side] for side in sides)]
-        names = ["rates", *(f"odds_{step}" for step in range(1, STEPS + 1))]
-        outputs |= dict(zip(names, zip(predictions, shapes, strict=True), strict=True))
+        (rates,) = graph.append(_exported(_Predicting(evidence), *_examples(cells, kinds)), "evidence/", _named(gist))
+        outputs["rates"] = rates, [kinds + 1, STEPS, cells, cells]
     for name, (value, _) in outputs.items():
         graph.add("Identity", value, output=name)
     described = [
@@ -154,23 +146,16 @@ class _Decoding(nn.Module):
 
 
 class _Predicting(nn.Module):
-    """Module that returns the predictions of evidence for a gist."""
+    """Module that returns the rates that evidence predicts for a gist."""
 
-    def __init__(self, evidence: GlimpseEvidence, cells: int) -> None:
+    def __init__(self, evidence: GlimpseEvidence) -> None:
         super().__init__()
-        self.evidence, self.cells = evidence, cells
+        self.evidence = evidence
 
-    def forward(self, strongest: Tensor, size: Tensor, found: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, strongest: Tensor, size: Tensor, found: Tensor) -> tuple[Tensor]:
         look = Gist(0, (0, 0), 1, strongest, size, found > 0)
         classes = torch.arange(1, self.evidence.classes + 1)
-        predictions = [torch.cat([self.evidence.survey.rates(look), self.evidence.rates(look, classes)])]
-        for step in range(1, STEPS + 1):
-            span = self.cells >> step
-            scores, summary = (each.flatten(0, 1) for each in pool_spans(strongest, [span])[0])
-            odds = self.evidence.presence(scores, summary, torch.full((len(scores),), step))
-            side = self.cells - span + 1
-            predictions.append(odds.mT.unflatten(-1, (side, side)))
-        return tuple(predictions)
+        return (torch.cat([self.evidence.survey.rates(look), self.evidence.rates(look, classes)]),)
 
 
 def _columns(candidates: Candidates, detector: Detector) -> tuple[Tensor, Tensor, Tensor]:

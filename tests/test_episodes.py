@@ -61,7 +61,7 @@ def of_windows(model, target, picture=LARGE, **settings):
 def given_windows():
     agent = windows(None)
     goal = Goal.of(agent.classes, 1)
-    return GivenWindows(goal, GlimpseEvidence(3, 8).eval(), LiveWindowLooks(agent.eye, agent.eye.open(LARGE)))
+    return GivenWindows(goal, GlimpseEvidence(3).eval(), LiveWindowLooks(agent.eye, agent.eye.open(LARGE)))
 
 
 def of_head():
@@ -83,9 +83,9 @@ STILL = {
     "fovea, goal": lambda: on_photograph(1, lambda grid: AtGoal(torch.arange(12) == 11)),
     "fovea, explores": lambda: on_photograph(None, lambda grid: StoppingCriterion()),
     "windows, closer looks": lambda: of_windows(evidence(), 1),
-    "windows, presence": lambda: of_windows(GlimpseEvidence(3, 8).eval(), 1),
+    "windows, presence": lambda: of_windows(GlimpseEvidence(3).eval(), 1),
     "windows, scores": lambda: of_windows(None, 1),
-    "windows, finds": lambda: of_windows(GlimpseEvidence(3, 8).eval(), None, batch=2),
+    "windows, finds": lambda: of_windows(GlimpseEvidence(3).eval(), None, batch=2),
     "windows, slices": lambda: of_windows(None, None),
     "windows, photograph": lambda: of_windows(own_evidence(), 1, torch.nn.functional.pad(PHOTOGRAPH, (16, 16))),
     "windows, given": given_windows,
@@ -98,7 +98,7 @@ STREAMS = {
     "fovea, explores": (lambda: fovea().stream(None, StreamSettings()), PHOTOGRAPH),
     "windows, closer looks": (lambda: windows(evidence()).stream(1, follows=False), LARGE),
     "windows, scores": (lambda: windows(None).stream(1, follows=False), LARGE),
-    "windows, finds": (lambda: windows(GlimpseEvidence(3, 8).eval()).stream(follows=False), LARGE),
+    "windows, finds": (lambda: windows(GlimpseEvidence(3).eval()).stream(follows=False), LARGE),
 }
 
 

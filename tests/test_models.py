@@ -17,6 +17,7 @@ from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import CASE
 from semfov.zoom.hint_maps import features
+from semfov.zoom.hints import Gist
 
 KINDS = (
     FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, GlimpseEvidence,
@@ -123,14 +124,16 @@ def test_shipped_models_of_map_evidence(path):
 def test_shipped_models_of_glimpse_evidence(path):
     model = GlimpseEvidence.from_pretrained(path.stem)
     assert model.metadata["detector"]["name"] == path.stem
-    # The higher the score of a class, the more probable it is that a closer look shows the class.
-    scores = torch.zeros(5, model.classes)
-    scores[:, 6] = torch.tensor([0.0, 0.01, 0.05, 0.2, 0.7])
-    summary = torch.stack([scores.sum(1), torch.full((5,), 0.01), (scores > 0.02).sum(1).float()], 1)
+    # The higher the score of a faint candidate, the more objects of its class closer looks are expected to find.
+    scores = torch.zeros(4, 16, 16, model.classes)
+    scores[:, 8, 8, 6] = torch.tensor([0.0, 0.005, 0.02, 0.08])
+    size = torch.zeros(16, 16)
+    size[8, 8] = 4.0
+    looks = [Gist(0, (0, 0), 1, hints, size * (hints.amax(-1) > 0), hints > 1) for hints in scores]
     with torch.no_grad():
-        odds = model.presence(scores, summary, torch.ones(5), target=7)
+        found = torch.stack([model.rates(look, torch.tensor([7])).exp()[0, 0, 7:10, 7:10].sum() for look in looks])
         taper = model.taper(16)
-    assert bool((odds.diff() > 0).all())
+    assert bool((found.diff() > 0).all())
     # The higher and the more frequent the scores of a class, the more probable is its presence in the image.
     assert model.thresholds is not None
     case = torch.zeros(3, CASE)

@@ -18,21 +18,12 @@ from dataclasses import dataclass, field
 from typing import get_args
 
 import torch
-from torch import Tensor
 
 from semfov.errors import check
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.training import training_of
 from semfov.fit.windows_certainty import explorations_of_kinds, spread_again
-from semfov.fit.windows_evidence import (
-    SurveyExample,
-    Windows,
-    ZoomExample,
-    fit_presence,
-    judge_windows,
-    pair_windows,
-    presence_loss,
-)
+from semfov.fit.windows_evidence import SurveyExample, ZoomExample, judge_windows
 from semfov.io.files import inside
 from semfov.runs.command import command
 from semfov.runs.setup import make_scenes
@@ -41,11 +32,8 @@ from semfov.runs.workers import prepare_worker
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.survey import Survey
 from train.outputs import write_outputs
-from train.zoom_choice import choose_foresight, choose_patience
-from train.zoom_pictures import PICTURE_KINDS, FitZoomConfig, PicturesFit, RefitPart
-
-_FURTHER = 1e-3
-"""Highest learning rate of a prediction that is fitted further."""
+from train.zoom_choice import choose_foresight
+from train.zoom_pictures import FitZoomConfig, PicturesFit, RefitPart
 
 _JUDGED = ("judged", "judged far", "judged crowded")
 """Mosaics of held-out photographs on which foresight is chosen."""
@@ -58,7 +46,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     parts: set[RefitPart] = set(config.refit) if config.evidence else {*get_args(RefitPart)}
     examples = fit.look(_looked_at(config, parts))
     report = _Report()
-    model = _start(config, fit, parts, examples, report)
+    model = _start(config, fit, examples, report)
     if "survey" in parts:
         _fit_survey(fit, model, examples, report)
     if "decision" in parts:
@@ -103,35 +91,29 @@ class _Report:
 def _looked_at(config: FitZoomConfig, parts: Collection[RefitPart]) -> list[str]:
     """List the kinds of pictures that must be looked at to fit some parts."""
     kinds: list[str] = []
-    if "presence" in parts or "survey" in parts:
+    if config.evidence is None or "survey" in parts:
         kinds += ["near", "far", "judged"]
     if "survey" in parts:
         kinds += ["crowded", "judged crowded"]
-    if "presence" in parts:
+    if config.evidence is None:
         kinds += config.kinds
-    if "presence" in parts and config.evidence is not None:
-        kinds += [f"judged {kind}" for kind in PICTURE_KINDS]
     return kinds
 
 
 def _start(
     config: FitZoomConfig,
     fit: PicturesFit,
-    parts: Collection[RefitPart],
     examples: Mapping[str, list[ZoomExample]],
     report: _Report,
 ) -> GlimpseEvidence:
-    """Fit the prediction of closer looks, or read a model that was fitted before and fit it further."""
+    """Fit the prediction of closer looks, or read a model that was fitted before."""
     if config.evidence is None:
         model = fit.fit_prediction(examples)
         text, report.figures = judge_windows(model, examples["judged"])
-        tried = choose_patience(model, fit)
-        report.lines += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
+        report.lines += [text]
         return model
     model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
     model.check_compatible(fit.eye.settings())
-    if "presence" in parts:
-        report.lines += _fit_further(config, model, examples)
     return model
 
 
@@ -178,37 +160,6 @@ def judge_survey(survey: Survey, examples: Sequence[ZoomExample], where: str = "
     if of_closer_looks:
         figures[f"{name}, closer looks{where}"] = float(torch.stack(of_closer_looks).mean())
     return figures
-
-
-def _fit_further(config: FitZoomConfig, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
-    """Fit the prediction whether a closer look shows a class further from where it is, more slowly."""
-    torch.manual_seed(config.seed)
-    judged = {
-        kind: pair_windows(of_kind) for kind, of_kind in examples.items() if of_kind and kind.startswith("judged")
-    }
-    before = {kind: _cross_entropies(model, windows) for kind, windows in judged.items()}
-    training = [example for kind in ("near", "far", *config.kinds) for example in examples[kind]]
-    fit_presence(model.requires_grad_(True), pair_windows(training), config.steps, rate=_FURTHER)
-    model.requires_grad_(False)
-    rows = [["", "overview, before", "after", "closer looks, before", "after"]]
-    for kind, windows in judged.items():
-        overview_before, closer_before = before[kind]
-        overview, closer = _cross_entropies(model, windows)
-        values = (overview_before, overview, closer_before, closer)
-        rows.append([kind, *(f"{value:.4f}" for value in values)])
-    return ["Cross-entropy of whether a closer look shows a class, by kind of picture:", "", *table(rows), ""]
-
-
-@torch.no_grad()
-def _cross_entropies(model: GlimpseEvidence, windows: Windows) -> tuple[float, float]:
-    """Compute the cross-entropy of whether a closer look shows a class, by overviews and by closer looks, or NaN."""
-    overview = _mean_loss(model, windows, windows.of_overviews)
-    return overview, _mean_loss(model, windows, windows.of_closer_looks)
-
-
-def _mean_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> float:
-    """Average the loss over some pairs, by number `(n,)`; NaN without any."""
-    return float(presence_loss(model, windows, rows)) if len(rows) else float("nan")
 
 
 main = command(fit_zoom, FitZoomConfig, __doc__)

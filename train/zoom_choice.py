@@ -1,7 +1,7 @@
-"""Choose `foresight` and `patience`, the settings of a search by magnification, on mosaics of held-out photographs."""
+"""Choose `foresight`, a setting of the choice of windows, on mosaics of held-out photographs."""
 
 from collections.abc import Sequence
-from itertools import chain, islice
+from itertools import chain
 
 import torch
 
@@ -11,11 +11,9 @@ from semfov.fit.windows import MosaicFit
 from semfov.runs.progress import track
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.looks import Window, WindowLook, WindowLooks
-from train.zoom_slices import look_for_slice
+from semfov.zoom.looks import WindowLook, WindowLooks
 
 _FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
-_PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 
 @torch.inference_mode()
@@ -52,35 +50,6 @@ def choose_foresight(model: GlimpseEvidence, fit: MosaicFit, kinds: Sequence[str
     return rows
 
 
-@torch.inference_mode()
-def choose_patience(model: GlimpseEvidence, fit: MosaicFit) -> list[list[str]]:
-    """Set `patience` to the value with which a class is found soonest.
-
-    The measure is the mean number of passes until a look at a photograph that shows the class.
-
-    Args:
-        model: evidence by magnification.
-        fit: the mosaics and their looks.
-
-    Returns:
-        Rows of a table of the numbers of passes.
-    """
-    mosaics = fit.mosaics["judged"]
-    opened = fit.opened("judged")
-    slots = [
-        [Window.around(looks.lattice, tile.slot) for tile in mosaics.tiles(index)] for index, looks in enumerate(opened)
-    ]
-    passes: dict[float, float] = {}
-    for value in track(_PATIENCES, "choosing patience", "value"):
-        model.patience = value
-        passes[value] = _mean_passes(model, opened, slots, fit.eye.detector.score_threshold)
-        for looks in opened:
-            looks.save()
-    model.patience = min(passes, key=passes.__getitem__)
-    rows = [[f"{value:g}", f"{number:.3f}"] for value, number in passes.items()]
-    return [["patience", "passes to the first hit"], *rows]
-
-
 def _mean_recall(model: GlimpseEvidence, opened: Sequence[WindowLooks], mosaics: Mosaics) -> float:
     """Compute the mean recall over passes of an exploration that looks for all objects."""
     passes = len(mosaics.tiles(0)) + 1
@@ -100,16 +69,3 @@ def _mean_recall(model: GlimpseEvidence, opened: Sequence[WindowLooks], mosaics:
             # When no window is left, the number of found objects stays the same for the remaining passes.
             found += count
     return found / max(passes * objects, 1)
-
-
-def _mean_passes(
-    model: GlimpseEvidence, opened: Sequence[WindowLooks], slots: Sequence[Sequence[Window]], least: float
-) -> float:
-    """Compute the mean number of passes until a look at a photograph that shows the target."""
-    counts = []
-    for looks, photographs in zip(opened, slots, strict=True):
-        shows = torch.stack([look.show for look in looks.see(photographs)]) >= least
-        for target in (shows.any(0).nonzero()[:, 0] + 1).tolist():
-            steps = look_for_slice(looks, model, target, photographs, least)
-            counts.append(sum(1 for _ in islice(steps, len(photographs) + 1)))
-    return sum(counts) / max(len(counts), 1)

@@ -11,7 +11,7 @@ from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.ranges import Count
 from train.scattered import Scattered
 
-RefitPart = Literal["presence", "decision", "survey", "verification", "certainty", "spread", "photograph"]
+RefitPart = Literal["decision", "survey", "verification", "certainty", "spread", "photograph"]
 
 PictureKind = Literal["few", "many", "one class", "photographs", "objects"]
 """Mosaics of 3 × 3 photographs; of 12 × 12 of half the size; of 8 × 6 that share a class; photographs, and single
@@ -31,12 +31,11 @@ class FitZoomConfig(FitMosaicsConfig):
         each: number of training pictures of each of these kinds.
         judged_each: number of pictures of held-out photographs of each of these kinds, to choose thresholds.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
-        refit: parts of that model to fit again: `presence`, whether a closer look shows a class, which is fitted
-            further from where it is, `decision`, the decisions of searches, `verification`, the probabilities after
-            closer looks at places that seem to hold the target, `survey`, the number of objects of any class that
-            closer looks find, `certainty`, the probability that an object is there, with the spread of expected
-            numbers, `spread`, that alone, and `photograph`, the evidence for photographs. The verification has to
-            follow new decisions; without it they are made without closer looks.
+        refit: parts of that model to fit again: `decision`, the decisions of searches, `verification`, the
+            probabilities after closer looks at places that seem to hold the target, `survey`, the number of objects of
+            any class that closer looks find, `certainty`, the probability that an object is there, with the spread of
+            expected numbers, `spread`, that alone, and `photograph`, the evidence for photographs. The verification
+            has to follow new decisions; without it they are made without closer looks.
     """
 
     judged_far: Count = 4

@@ -38,13 +38,12 @@ from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun
 from semfov.zoom.decision import CLOSER
-from semfov.zoom.episode import WindowStep, find_everything, look_by_look
+from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks, half_steps
 from semfov.zoom.objects import merge
 from semfov.zoom.slices import ranked, slices, usual_slices
-from train.zoom_slices import look_for_slice
 
 _Measure = Literal["objects", "recall", "hit", "decision"]
 
@@ -265,8 +264,7 @@ class ZoomRun(WindowLooking, SceneRun):
             }
             ways: dict[str, Iterator[WindowStep[Any]]] = {
                 **{name: look_by_look(source, order, None) for name, order in orders.items()},
-                "semfov": look_for_slice(source, self.evidence, target, cut),
-                "semfov, free windows": look_for_slice(source, self.evidence, target, None),
+                SEMFOV: look_for(source, self.evidence, target),
             }
             for name, steps in ways.items():
                 passes, hit = 0, False

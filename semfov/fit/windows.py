@@ -14,7 +14,7 @@ from semfov.errors import check
 from semfov.fit.training import training_of
 from semfov.fit.windows_certainty import certainty_again
 from semfov.fit.windows_decisions import WindowSearches, fit_closer_looks, fit_judge, judge_searches
-from semfov.fit.windows_evidence import SurveyExample, ZoomExample, fit_presence, fit_rates, fit_survey, pair_windows
+from semfov.fit.windows_evidence import SurveyExample, ZoomExample, fit_rates, fit_survey
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.files import json_sha256
@@ -24,6 +24,7 @@ from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.workers import prepare_worker, run_tasks
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
+from semfov.zoom.looks import half_steps
 from semfov.zoom.survey import Survey
 
 _CROWDED = 1 / 3  # share of the photographs that the crowded mosaics show, those with the most objects
@@ -45,7 +46,7 @@ def _look(fit: "MosaicFit", task: tuple[str, int]) -> bytes:
     kind, index = task
     pictures = fit.pictures[kind]
     source = StoredWindowLooks(fit.eye, pictures, index, fit.store)
-    source.see(ZoomExample.windows(pictures, index, source.lattice))
+    source.see([*half_steps(source.lattice)])
     source.save()
     tensors = fit.store.read(pictures.digest(index))
     return b"" if tensors is None else pack_tensors(tensors)
@@ -150,12 +151,11 @@ class MosaicFit:
         random.seed(self.config.seed)
 
     def fit_prediction(self, examples: Mapping[str, list[ZoomExample]]) -> GlimpseEvidence:
-        """Fit the prediction of closer looks, class by class; examples by kind."""
+        """Fit the numbers of objects of each class that closer looks find; examples by kind."""
         self._seed()
         metadata = {**self.eye.settings(), **training_of(self.config, self.mosaics["near"], "judged")}
         model = GlimpseEvidence(len(self.eye.detector.classes), metadata=metadata)
         training = [example for kind in ("near", "far", *self.kinds) for example in examples[kind]]
-        fit_presence(model, pair_windows(training), self.config.steps)
         fit_rates(model, training, self.config.steps)
         return model.eval().requires_grad_(False)
 

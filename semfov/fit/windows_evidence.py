@@ -1,4 +1,4 @@
-"""Fit evidence by magnification: what closer looks will show, and how many objects, of a class or of any, they find.
+"""Fit evidence by magnification: how many objects, of a class or of any, closer looks find.
 
 A picture is looked at in windows of all magnifications. Each look is paired with the closer windows inside it, whose
 results it should predict:
@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
 from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.fit.training import descend
@@ -30,7 +29,6 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLooks, half_steps
-from semfov.zoom.pooling import pool
 from semfov.zoom.survey import STEPS, Survey
 
 _SHOWN_CLASSES = 8  # largest number of classes of a mosaic, shown clearly, whose rates are fitted in one step
@@ -72,24 +70,14 @@ class ZoomExample(NamedTuple):
     looks: tuple[_WindowResult, ...]
     score_threshold: float = SCORE_THRESHOLD
 
-    @staticmethod
-    def windows(pictures: Scenes, index: int, lattice: Lattice) -> list[Window]:
-        """List the windows of a picture at steps of half a window, and one for each photograph of a mosaic."""
-        windows = [*half_steps(lattice)]
-        if isinstance(pictures, Mosaics):
-            for tile in pictures.tiles(index):
-                x1, y1, x2, y2 = map(float, tile.slot)
-                windows.append(Window.around(lattice, (x1, y1, x2, y2)))
-        return windows
-
     @classmethod
     def of(
         cls, pictures: Scenes, index: int, source: WindowLooks, score_threshold: float = SCORE_THRESHOLD
     ) -> "ZoomExample":
-        """Look at all windows of a picture, and collect which objects are shown with a detection of their class."""
+        """Look at windows at steps of half a window, and collect which objects a detection of their class shows."""
         annotation = pictures.annotation(index)
         looks = []
-        for look in source.see(cls.windows(pictures, index, source.lattice)):
+        for look in source.see([*half_steps(source.lattice)]):
             detections = look.detections
             is_sure = detections.scores[0, :, 1:].amax(-1) >= DETECTION_SCORE
             boxes = detections.boxes[0, is_sure]
@@ -108,13 +96,11 @@ class _CloserWindow(NamedTuple):
     """A closer look inside a look.
 
     Attributes:
-        number: its number among the looks of the picture.
         result: the look.
         steps: octaves by which it is closer.
         cells: first column and row of the outer look's cells that it shows, and those after the last.
     """
 
-    number: int
     result: _WindowResult
     steps: int
     cells: tuple[int, int, int, int]
@@ -126,7 +112,7 @@ def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[_CloserWindow]
     height = rows * look.scale
     width = columns * look.scale
     left, top = look.first
-    for number, result in enumerate(example.looks):
+    for result in example.looks:
         steps = result.window.level - look.level
         # In cells of the lattice, from the corner of the look.
         x1, y1, x2, y2 = result.window.cells
@@ -139,119 +125,7 @@ def _closer_windows(example: ZoomExample, look: Gist) -> Iterator[_CloserWindow]
             # Cells that a window shows in part count.
             first = (from_left // look.scale, from_top // look.scale)
             last = (-(-to_right // look.scale), -(-to_bottom // look.scale))
-            yield _CloserWindow(number, result, steps, (*first, *last))
-
-
-class Windows(NamedTuple):
-    """N pairs of a look and a closer window inside it.
-
-    Attributes:
-        scores: `(N, K)`, scores of the look in the cells of the window, pooled.
-        summary: `(N, 3)`, what these cells hold of any class.
-        steps: `(N,)`, octaves by which the window is closer.
-        presence: `(N, K)` boolean, whether the closer look shows each class.
-        before: `(N,)`, number of the pair of the overview and this window; -1 for the pairs of overviews.
-        slot: `(N,)` boolean, whether the window is that of a photograph of a mosaic.
-        mosaic: `(N,)`, number of the picture.
-    """
-
-    scores: Tensor
-    summary: Tensor
-    steps: Tensor
-    presence: Tensor
-    before: Tensor
-    slot: Tensor
-    mosaic: Tensor
-
-    @property
-    def of_overviews(self) -> Tensor:
-        """Numbers of the pairs whose look is an overview."""
-        return (self.before < 0).nonzero()[:, 0]
-
-    @property
-    def of_closer_looks(self) -> Tensor:
-        """Numbers of the other pairs."""
-        return (self.before >= 0).nonzero()[:, 0]
-
-
-def pair_windows(examples: Sequence[ZoomExample]) -> Windows:
-    """Pair every look with every closer window inside it.
-
-    Args:
-        examples: pictures with looks at many windows.
-
-    Returns:
-        The pairs.
-    """
-    pairs: list[Windows] = []
-    for number, example in enumerate(examples):
-        by_overview: dict[int, int] = {}  # number of the overview's pair by that of the closer look
-        for look in example.predicting:
-            assert look.gist is not None
-            is_overview = look.gist.level == 0
-            for closer in _closer_windows(example, look.gist):
-                if is_overview:
-                    by_overview[closer.number] = len(pairs)
-                elif closer.number not in by_overview:
-                    continue
-                scores, summary = pool(look.gist.scores, closer.cells)
-                pairs.append(
-                    Windows(
-                        scores,
-                        summary,
-                        steps=torch.tensor(closer.steps),
-                        presence=closer.result.show >= example.score_threshold,
-                        before=torch.tensor(-1 if is_overview else by_overview[closer.number]),
-                        slot=torch.tensor(closer.result.window.within is not None),
-                        mosaic=torch.tensor(number),
-                    )
-                )
-    return Windows(*(torch.stack(column) for column in zip(*pairs, strict=True)))
-
-
-def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024, rate: float = 8e-3) -> None:
-    """Fit the probability that a closer look shows a class, by the mean cross-entropy over windows and classes.
-
-    Args:
-        model: evidence by magnification.
-        windows: pairs of a look and a closer window.
-        steps: number of training steps.
-        batch: number of pairs of overviews in a step; half as many of closer looks are added.
-        rate: highest learning rate.
-    """
-    first = windows.of_overviews
-    later = windows.of_closer_looks
-
-    def loss_of(_: int) -> Tensor:
-        loss = presence_loss(model, windows, first[torch.randint(len(first), (batch,))])
-        if len(later):
-            loss = loss + presence_loss(model, windows, later[torch.randint(len(later), (batch // 2,))])
-        return loss
-
-    # The rates of objects have parameters of their own.
-    parameters = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
-    model.train()
-    descend(parameters, loss_of, steps, rate, clip=None, decay=1.0, title="learning what closer looks show")
-    model.eval()
-
-
-def presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Compute the mean cross-entropy of whether closer looks show each class, over some pairs, by number `(n,)`."""
-    log_odds = _presence_log_odds(model, windows, rows)
-    return F.binary_cross_entropy_with_logits(log_odds, windows.presence[rows].to(log_odds))
-
-
-def _presence_log_odds(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Compute the log odds that closer looks show each class, `(n, K)`; those of closer looks build on the overview."""
-    # Pairs of overviews and of closer looks are not mixed in a call.
-    before = None
-    if bool((windows.before[rows] >= 0).all()):
-        is_training = model.training
-        model.eval()
-        with torch.no_grad():
-            before = _presence_log_odds(model, windows, windows.before[rows])
-        model.train(is_training)
-    return model.presence(windows.scores[rows], windows.summary[rows], windows.steps[rows], None, before)
+            yield _CloserWindow(result, steps, (*first, *last))
 
 
 def fit_rates(model: GlimpseEvidence, examples: Sequence[ZoomExample], steps: int, batch: int = 4) -> None:
@@ -328,8 +202,6 @@ def _likelihood_loss(
     rates = log_rates.exp()
     terms = []
     for closer in _closer_windows(example, look):
-        if closer.result.window.within is not None:  # only windows of the lattice
-            continue
         x1, y1, x2, y2 = closer.cells
         weight = model.taper(x2 - x1)
         inside = rates[:, closer.steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
@@ -376,10 +248,9 @@ class _LookCounts(NamedTuple):
         assert look.gist is not None
         by_size: dict[tuple[int, int], list[tuple[int, int, int]]] = defaultdict(list)
         for closer in _closer_windows(example, look.gist):
-            if closer.result.window.within is None:
-                x1, y1, x2, _ = closer.cells
-                new = int((closer.result.found & ~earlier).sum())
-                by_size[closer.steps, x2 - x1].append((y1, x1, new))
+            x1, y1, x2, _ = closer.cells
+            new = int((closer.result.found & ~earlier).sum())
+            by_size[closer.steps, x2 - x1].append((y1, x1, new))
         return cls(look.gist, {size: _Counts(*torch.tensor(rows).unbind(-1)) for size, rows in by_size.items()})
 
     def loss(self, survey: Survey, log_rates: Tensor) -> Tensor:
@@ -462,7 +333,7 @@ def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, ba
 
 @torch.no_grad()
 def judge_windows(model: GlimpseEvidence, examples: Sequence[ZoomExample]) -> tuple[str, str]:
-    """Evaluate the prediction of closer looks on held-out pictures.
+    """Evaluate the expected number of objects of a class that closer looks find, on held-out pictures.
 
     Args:
         model: evidence by magnification.
@@ -471,37 +342,8 @@ def judge_windows(model: GlimpseEvidence, examples: Sequence[ZoomExample]) -> tu
     Returns:
         The report in Markdown, and its measures as JSON.
     """
-    windows = pair_windows(examples)
-    later = windows.of_closer_looks
-    figures = {"cross-entropy, overview": float(presence_loss(model, windows, windows.of_overviews))}
-    if len(later):
-        figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
-        figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
-    for name, passes in _passes_to_first_hit(model, windows).items():
-        figures[f"passes to the first hit, {name}"] = sum(passes) / len(passes)
     losses = torch.stack([_rate_loss(model, example) for example in examples])
-    figures["rates, mean negative log likelihood"] = float(losses.mean())
+    figures = {"objects of a class, mean negative log likelihood": float(losses.mean())}
     rows = [["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())]
     report = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", "", *table(rows), ""]
     return "\n".join(report), json.dumps(figures, indent=1)
-
-
-def _passes_to_first_hit(model: GlimpseEvidence, windows: Windows) -> dict[str, list[int]]:
-    """Count passes until a look at a photograph of a mosaic shows a class, by evidence and by scores of the overview.
-
-    One number for each class that a photograph of a mosaic shows; none without mosaics.
-    """
-    first = windows.of_overviews
-    slots = first[windows.slot[first]]
-    values = {"evidence": _presence_log_odds(model, windows, slots), "raw score": windows.scores[slots]}
-    presence = windows.presence[slots]
-    passes: dict[str, list[int]] = defaultdict(list)
-    for mosaic in windows.mosaic[slots].unique():
-        in_mosaic = windows.mosaic[slots] == mosaic
-        for target in presence[in_mosaic].any(0).nonzero()[:, 0].tolist():
-            hits = presence[in_mosaic, target]
-            for name, value in values.items():
-                order = value[in_mosaic, target].argsort(descending=True, stable=True)
-                # The overview is a pass, too.
-                passes[name].append(2 + int(hits[order].int().argmax()))
-    return passes

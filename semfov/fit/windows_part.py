@@ -114,7 +114,6 @@ def _tasks(config: FitMosaicsConfig) -> dict[str, float]:
     looked = config.mosaics + config.crowded + config.judged + 4 * config.far
     return {
         "looking": 60 * _LOOK * looked,
-        "learning what closer looks show": 0.1 * config.steps,
         "learning the expected number of objects": 0.2 * config.steps,
         "learning the survey": 0.4 * config.survey_steps,
         **{f"searching, {kind}": 4 * count for kind, count in searched.items()},

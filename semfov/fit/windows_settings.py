@@ -37,8 +37,8 @@ class FitMosaicsConfig(FitConfig):
         stop_below: chance of a new hit below which no closer look is made in a photograph.
         window: the window of a closer look in a photograph: its least side, in longer sides of the photograph, and its
             side in longer sides of the place.
-        steps: number of training steps for predicting the results of closer looks.
-        survey_steps: number of training steps for the number of objects of any class.
+        steps: number of training steps for the number of objects of a class.
+        survey_steps: the same for objects of any class.
         judging: number of training steps for the decisions of searches.
     """
 

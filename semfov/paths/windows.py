@@ -164,7 +164,7 @@ class WindowWords(Words):
         if by_score or (self.record.lattice.levels == 1 and not searched):
             return "the sum of the scores that the first look has in it"
         if searched:
-            return "the probability that it shows the target, of a wide window at least a share of those in it"
+            return "the probability that it finds the target, also of what closer looks in it would find"
         return "the expected number of new objects in it, with a share of those that closer looks would then show"
 
     @property

@@ -3,17 +3,15 @@ r"""The belief about a large picture: what the looks so far predict that closer 
 Looks come in as gists, the strongest hints by cell. For each cell the belief keeps which level it was looked at from,
 what is left to explore there, and what closer looks are expected to find there. Windows are valued by sums over cells:
 
-    gists of looks ──► rates of each cell, by level ──┐ × `unexplored`           `value`    objects that a look finds
-                  │                                   ├──► sums over windows ──► `unseen`   share that is new
-    explored ─────┼──► `unexplored`, `closest_level` ─┘ (`window_sums`)
-    windows       │
-                  └──► log odds of windows (`window_odds`) ────────────────────► `chances`  that a look shows the class
+    gists of looks ────► rates of each cell, by level ──┐
+                                                        ├──► sums over windows ──► `value`    objects that a look finds
+    explored windows ──► `unexplored` ──────────────────┘    (`window_sums`)
 
 Nothing is computed until it is asked for, and then only what has changed:
 
 - `_gists_rated` is the number of gists whose rates are written to the cells; `_predict` writes those of the others.
-- `_sums` and `_odds` remember in which cells they have fallen behind (`mark`), and catch up in `update`. Whoever
-  changes `unexplored`, `closest_level` or a gist marks the cells.
+- `_sums` remember in which cells they have fallen behind (`mark`), and catch up in `update`. Whoever changes
+  `unexplored`, `closest_level` or a gist marks the cells.
 """
 
 from collections.abc import Callable
@@ -30,11 +28,7 @@ from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.survey import STEPS
-from semfov.zoom.window_odds import WindowOdds
 from semfov.zoom.window_sums import CellBox, Cells, Place, WindowSums, extent
-
-_SLIVER = 0.25
-"""Share of a window: where less is not blank, little counts as little, and the edge of a scan takes no look."""
 
 _CLEAR = 0.1  # expected number of objects from which on a cell clearly promises one
 
@@ -87,7 +81,6 @@ class ZoomBelief:
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self.foresight = self._rates.foresight
         self._targets = torch.tensor([target])
-        self._visible_sums: dict[int, Cells] = {}  # by level, sums of `visible` over its windows
         self.clear()
 
     def clear(self) -> None:
@@ -100,7 +93,6 @@ class ZoomBelief:
         self.__dict__.pop("unexplored", None)
         self.gists: list[Gist] = []
         self._sums: dict[tuple[_CellQuantity, int], WindowSums] = {}
-        self._odds: WindowOdds | None = None
 
     @cached_property
     def visible(self) -> Tensor:
@@ -156,7 +148,7 @@ class ZoomBelief:
         unexplored = self.unexplored.numpy()[y1:y2, x1:x2]
         if unexplored.any():
             unexplored[:] = 0
-            self._mark_explored((x1, y1, x2, y2))
+            self._mark_sums((x1, y1, x2, y2))
 
     def restore(self, unexplored: Tensor) -> None:
         """Set back what is left to explore, to undo `discount`.
@@ -169,18 +161,12 @@ class ZoomBelief:
         differs = earlier != present
         if differs.any():
             np.copyto(present, earlier)
-            self._mark_explored(extent(differs))
+            self._mark_sums(extent(differs))
 
     def _mark_sums(self, box: CellBox) -> None:
-        """Mark sums over windows as outdated in cells with a new look; the odds see new looks by themselves."""
+        """Mark sums over windows as outdated in cells with a new look, or of which another share is left to explore."""
         for sums in self._sums.values():
             sums.mark(box)
-
-    def _mark_explored(self, box: CellBox) -> None:
-        """Mark sums and odds of windows as outdated in cells of which another share is left to explore."""
-        self._mark_sums(box)
-        if self._odds is not None:
-            self._odds.mark(box)
 
     def _box(self, gist: Gist) -> CellBox:
         """Find the cells that a look shows."""
@@ -249,10 +235,6 @@ class ZoomBelief:
         """Compute what looks one level closer are expected to find, in cells that no look of this level has shown."""
         return self.expected(level + 1, place) * (self.closest_level.numpy()[place] < level)
 
-    def _unseen_cells(self, level: int, place: Place) -> Cells:
-        """Share of each cell that is left to explore and that no look has shown at a level or closer."""
-        return self.unexplored.numpy()[place] * (self.closest_level.numpy()[place] < level)
-
     def value(self, level: int, foresight: float) -> Cells:
         """Value the windows of a level for finding objects (`semfov.zoom.policy.best_find`).
 
@@ -268,34 +250,6 @@ class ZoomBelief:
             return values
         return values + np.float32(foresight) * self._sum_over_windows(self._expected_closer, level)
 
-    def unseen(self, level: int) -> Cells:
-        """Compute the share of each window of a level that no look has shown at that level or closer.
-
-        Args:
-            level: of the windows.
-
-        Returns:
-            `(down, across)`, shares of what is visible in the window.
-        """
-        if level not in self._visible_sums:
-            visible = self.visible.numpy()
-            span = self.lattice.span(level)
-            sums = WindowSums(_equal_weight(span), visible.shape, visible.__getitem__).update()
-            cells = min(span, self.lattice.rows) * min(span, self.lattice.columns)
-            self._visible_sums[level] = sums.clip(_SLIVER * cells)
-        return self._sum_over_windows(self._unseen_cells, level) / self._visible_sums[level]
-
-    def chances(self, level: int) -> Cells:
-        """Compute the probability that a look at each window shows the class, and that it shows anything new.
-
-        Args:
-            level: of the windows.
-
-        Returns:
-            `(down, across)`, probability times the share of the window that no closer look has shown.
-        """
-        return torch.from_numpy(self._level_odds(level)).sigmoid().numpy() * self.unseen(level)
-
     def _border_weight(self, span: int) -> Cells:
         """Weights `(span,)` of the cells along a side of a window, whose border cuts objects."""
         return self._rates.taper(span).detach().numpy()
@@ -309,12 +263,6 @@ class ZoomBelief:
             shape = self.lattice.rows, self.lattice.columns
             self._sums[quantity, level] = WindowSums(weights, shape, partial(quantity, level))
         return self._sums[quantity, level].update()
-
-    def _level_odds(self, level: int) -> Cells:
-        """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
-        if self._odds is None:
-            self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.gists, self.unexplored.numpy())
-        return self._odds.update()[level]
 
 
 def _equal_weight(span: int) -> Cells:

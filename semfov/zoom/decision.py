@@ -102,18 +102,18 @@ class SearchFacts:
         named = max(look.named for look in looks)
         scores = torch.tensor([best, second, closest, looks[0].score, named, hit_chance], dtype=torch.float32)
         unexplored = float(self.belief.unexplored.sum() / self.belief.visible.sum().clamp(1))
-        remaining = [math.log(self._expected_shows() + 1e-3) / 4, unexplored]
+        remaining = [math.log(self._expected_finds() + 1e-3) / 4, unexplored]
         detected = sum(look.score >= DETECTION_SCORE for look in looks)
         counts = [math.log1p(detected) / 2, math.log(len(looks)) / 2]
         return torch.cat([features(scores), torch.tensor([*remaining, *counts])])
 
-    def _expected_shows(self) -> float:
-        """Estimate how many looks of the last level, side by side, would show the target."""
+    def _expected_finds(self) -> float:
+        """Estimate how many new objects of the target looks of the last level, side by side, would find."""
         last = self.belief.lattice.levels - 1
         if not last:
             return 0.0
         # Windows start at every cell: this is the mean over all ways to lay them side by side.
-        return float(self.belief.chances(last).sum()) / CELLS**2
+        return float(self.belief.value(last, 0.0).sum()) / CELLS**2
 
     @torch.no_grad()
     def presence(self, hit_chance: float) -> float:

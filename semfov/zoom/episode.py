@@ -1,5 +1,6 @@
 """Episodes over the windows of a picture: look, update the belief and choose, for one object of a class, or for all."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from typing import Generic, TypeVar
@@ -11,7 +12,7 @@ from semfov.zoom.carrying import carried, share_shown
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
-from semfov.zoom.policy import WindowChoice, best_find, best_hit, jointly
+from semfov.zoom.policy import WindowChoice, best_find, jointly
 from semfov.zoom.window_sums import Cells
 
 _Belief = TypeVar("_Belief", ZoomBelief, None)
@@ -267,14 +268,16 @@ def look_for(
 def search_windows(
     source: WindowLooks, belief: ZoomBelief, *, forgetting: Forgetting | None = None
 ) -> Iterator[WindowStep[ZoomBelief]]:
-    """Look for one object of the class of a belief (`look_for`)."""
-    return look_by_look(
-        source,
-        lambda _, done: jointly(partial(best_hit, belief), belief, done, 1),
-        belief,
-        forgetting=forgetting,
-        guess=lambda _, done, beside: best_hit(belief, done, beside=beside),
-    )
+    r"""Look for one object of the class of a belief (`look_for`), where most objects of it are expected.
+
+    The value of a look is the chance of a hit, :math:`1 - e^{-v}` for a Poisson number of objects with the mean v.
+    """
+
+    def best(looks: Sequence[WindowLook], done: set[Window]) -> Sequence[WindowChoice]:
+        choice = best_find(belief, done, belief.foresight)
+        return [] if choice is None else [(choice[0], -math.expm1(-choice[1]))]
+
+    return look_by_look(source, best, belief, forgetting=forgetting, guess=_likely_find(belief))
 
 
 def find_everything(
@@ -303,5 +306,10 @@ def find_everything(
         belief,
         hints=False,
         forgetting=forgetting,
-        guess=lambda _, done, beside: best_find(belief, done, belief.foresight, beside=beside),
+        guess=_likely_find(belief),
     )
+
+
+def _likely_find(belief: ZoomBelief) -> _Guess:
+    """Guess that the window follows in which most objects are expected."""
+    return lambda _, done, beside: best_find(belief, done, belief.foresight, beside=beside)

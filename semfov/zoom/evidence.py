@@ -1,13 +1,7 @@
-r"""Learned evidence by magnification: predictions from a look at a window of what closer looks at its parts show.
+r"""Learned evidence by magnification: predictions from a look at a window of what closer looks at its parts find.
 
-    a look ─ hints by cell ─┬─ pooled in a window w ──► `hint_facts` ──┐
-                            │                       earlier odds ──────┴──► `odds`     P(t shown in w), log odds
-                            └─ maps around a cell x ─────────────────────► `rates`    λ(x), logarithms
-    a search ─ highest score and facts ──────────────────────────────────► `anywhere` P(t in the picture), log odds
-
-What a look adds to the odds of an earlier one is separate from what it reads in its hints (`hint_facts`): hints change
-where cells are explored, odds where coarser looks come in, and only what has changed is computed again
-(`semfov.zoom.window_odds`).
+- `rates` gives λ(x), the expected number of new objects of a class in each cell x, from maps of the hints around it.
+- `anywhere` gives the log odds that the picture holds a class, from the highest score and facts about the search.
 """
 
 from collections.abc import Mapping
@@ -36,11 +30,8 @@ CASE = 10
 """Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.decision`)."""
 
 _LARGEST = 1e6
-_SUMMARY = 3  # numbers that summarise the hints in a window (`semfov.zoom.pooling`)
 
-# Inputs and hidden units of the networks g, λ and j.
-_SHAPE = 7
-_SHAPE_WIDTH = 24
+# Inputs and hidden units of the networks λ and j.
 _RATE = 14
 _RATE_WIDTH = 32
 _JUDGE_WIDTH = 16
@@ -121,19 +112,13 @@ _PHOTOGRAPH = Object(
 
 
 class GlimpseEvidence(Pretrained):
-    r"""Predicts from a look at a window what looks at its parts show that are one to three octaves closer.
+    r"""Predicts from a look at a window what looks at its parts find that are one to three octaves closer.
 
-    It answers two questions about a part w of the window and a class t, and one about the whole picture. Small
-    networks answer them. They are fitted on mosaics of photographs with annotated boxes.
+    It answers one question about a part w of the window and a class t, and one about the whole picture. Small networks
+    answer them. They are fitted on mosaics of photographs with annotated boxes.
 
-    - Does a closer look at w show t with a score of 0.3 or more (`detector.score_threshold`)? The log odds depend on
-      the strongest hint of t in w, and on that of every other class, because some classes occur together:
-
-      .. math:: \operatorname{logit} P(t \in w) = a_t \phi_t(w) + b_t + f_t(\phi(w)) + g(\phi_t(w), \ldots), \qquad
-                \phi_k(w) = \ln(\max_{x \in w} s_k(x) + \epsilon)
-
-    - How many objects of t does it find that were not found before? The expected number is a sum over cells. Its
-      weights fall off towards the border of w, which cuts objects that lie there:
+    - How many objects of t does a closer look at w find that were not found before? The expected number is a sum over
+      cells. Its weights fall off towards the border of w, which cuts objects that lie there:
 
       .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
 
@@ -142,14 +127,11 @@ class GlimpseEvidence(Pretrained):
 
       .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
 
-    Here f, g, λ and j are networks. Another network predicts how many objects of any class a look finds (`survey`). Two
+    Here λ and j are networks. Another network predicts how many objects of any class a look finds (`survey`). Two
     logistic regressions give the probabilities after a closer look at a place that seems to hold t (`verification`).
 
     Args:
         classes: number of classes of the detector, without background.
-        width: number of hidden units of f.
-        patience: a coarse window is looked at before the best closer one when the closer windows in it promise this
-            many times as many hits together.
         foresight: share of what still closer looks would find in a window that counts towards its value.
         thresholds: thresholds at which searches decide; None where none were chosen.
         verification: probabilities after closer looks; None decides searches without them.
@@ -160,9 +142,9 @@ class GlimpseEvidence(Pretrained):
     Raises:
         InputError: a setting is outside its range.
 
-    >>> evidence = GlimpseEvidence(classes=3, width=8)
-    >>> evidence.presence(torch.rand(5, 3), torch.rand(5, 3), torch.ones(5)).shape
-    torch.Size([5, 3])
+    >>> evidence = GlimpseEvidence(classes=3)
+    >>> evidence.anywhere(torch.rand(5), torch.rand(5, 10)).shape
+    torch.Size([5])
     >>> evidence.taper(8).shape
     torch.Size([8])
     """
@@ -172,13 +154,6 @@ class GlimpseEvidence(Pretrained):
     shipped: ClassVar[Path] = Path(__file__).parent / "models"
     schema: ClassVar[Schema] = Schema(
         {
-            "slope": Field(("K",), low=-_LARGEST, high=_LARGEST),
-            "offset": Field(("K",), low=-_LARGEST, high=_LARGEST),
-            "company.0.weight": Field(("W", f"K+{_SUMMARY + 1}"), low=-_LARGEST, high=_LARGEST),
-            "company.0.bias": Field(("W",), low=-_LARGEST, high=_LARGEST),
-            "company.3.weight": Field(("K", "W"), low=-_LARGEST, high=_LARGEST),
-            "company.3.bias": Field(("K",), low=-_LARGEST, high=_LARGEST),
-            **perceptron("shape", _SHAPE, _SHAPE_WIDTH),
             **perceptron("rate", _RATE, _RATE_WIDTH, STEPS),
             **perceptron("judge", CASE, _JUDGE_WIDTH),
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
@@ -190,8 +165,6 @@ class GlimpseEvidence(Pretrained):
         },
         {
             "classes": Number(size="K"),
-            "width": Number(size="W"),
-            "patience": Number(above=0, high=_LARGEST),
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
             "survey": Object({"foresight": Number(0, 1)}),
@@ -204,9 +177,7 @@ class GlimpseEvidence(Pretrained):
     def __init__(
         self,
         classes: int = 80,
-        width: int = 64,
         *,
-        patience: float = 2.3,
         foresight: float = 0.35,
         thresholds: Thresholds | None = None,
         verification: Verification | None = None,
@@ -216,21 +187,11 @@ class GlimpseEvidence(Pretrained):
     ) -> None:
         super().__init__()
         check_whole(classes, "classes", 1, 100_000)
-        check_whole(width, "width", 1, 100_000)
-        check(patience > 0, "patience", "a number above 0", patience)
         check_number(foresight, "foresight", 0, 1)
         self.classes = classes
-        self.width = width
-        self.patience = patience
         self.foresight = foresight
         self.thresholds = thresholds
         self.metadata = dict(metadata or {})
-        self.slope = nn.Parameter(torch.full((classes,), 2.0))
-        self.offset = nn.Parameter(torch.full((classes,), -2.0))
-        self.company = nn.Sequential(
-            nn.Linear(classes + _SUMMARY + 1, width), nn.GELU(), nn.Dropout(0.4), nn.Linear(width, classes)
-        )
-        self.shape = network(_SHAPE, _SHAPE_WIDTH)
         self.rate = network(_RATE, _RATE_WIDTH, STEPS)
         self.judge = network(CASE, _JUDGE_WIDTH)
         with torch.no_grad():
@@ -243,73 +204,6 @@ class GlimpseEvidence(Pretrained):
         self.verification = verification
         self.certainty = certainty
         self.photograph = photograph
-
-    def presence(
-        self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None, before: Tensor | None = None
-    ) -> Tensor:
-        """Predict whether a closer look at a window shows a class with a score of 0.3 or more.
-
-        Args:
-            scores: `(N, K)`, strongest hint of each class in each window (`pool`).
-            summary: `(N, 3)`, summary of all hints in each window (`pool`).
-            steps: `(N,)`, octaves between the look and the closer one.
-            target: class 1..K; None for all.
-            before: log odds that an earlier, coarser look gave for the same windows, in the shape of the result; None
-                for a first look.
-
-        Returns:
-            Log odds, `(N,)`, or `(N, K)` for all classes.
-        """
-        odds = self.odds(self.hint_facts(scores, summary, steps, target), before)
-        return odds if target is None else odds[:, 0]
-
-    def hint_facts(self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None) -> Tensor:
-        """Compute the part of `presence` that does not depend on earlier looks.
-
-        Args:
-            scores: `(N, K)`, as for `presence`.
-            summary: `(N, 3)`, as for `presence`.
-            steps: `(N,)`, as for `presence`.
-            target: class 1..K; None for all.
-
-        Returns:
-            `(N, 1, 6)`, or `(N, K, 6)` for all classes: five inputs of the network g, and the sum of all terms of the
-            log odds but g.
-        """
-        hints = features(scores)
-        octaves = (steps[:, None] - 1.5).to(hints)
-        crowd = (summary + 0.01).log() / 3
-        inputs = torch.cat([hints, crowd, octaves], -1)
-        columns = None if target is None else slice(target - 1, target)
-        hint = hints
-        slope = torch.as_tensor(self.slope)
-        offset = torch.as_tensor(self.offset)
-        if columns is not None:
-            hint = hints[:, columns]
-            slope = slope[columns]
-            offset = offset[columns]
-        value = slope * hint + offset + through(self.company, inputs, columns)
-        top = hints.amax(-1, keepdim=True).expand_as(hint)
-        facts = [hint, top, hint - top, octaves.expand_as(hint), crowd[:, 2:].expand_as(hint), value]
-        return torch.stack(facts, -1)
-
-    def odds(self, facts: Tensor, before: Tensor | None = None) -> Tensor:
-        """Complete `presence` by the log odds of an earlier look.
-
-        Args:
-            facts: `(..., 6)`, from `hint_facts`.
-            before: `(...)`, log odds that an earlier, coarser look gave for the same windows; None for a first look.
-
-        Returns:
-            `(...)`, log odds.
-        """
-        hint = facts[..., :1]
-        offset = facts[..., 5]
-        # A first look has no log odds before it: 0, which a flag tells from even odds.
-        earlier = torch.zeros_like(hint) if before is None else before.view_as(hint) / 3
-        has_earlier = torch.full_like(hint, float(before is not None))
-        inputs = torch.cat([facts[..., :5], earlier, has_earlier], -1)
-        return offset + through(self.shape, inputs)[..., 0]
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
         """Predict how many objects centred in each cell closer looks find that this look did not.
@@ -390,8 +284,6 @@ class GlimpseEvidence(Pretrained):
     def _record(self) -> dict[str, Any]:
         return {
             "classes": self.classes,
-            "width": self.width,
-            "patience": self.patience,
             "foresight": self.foresight,
             "thresholds": thresholds_record(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
@@ -406,8 +298,6 @@ class GlimpseEvidence(Pretrained):
         photograph = record.get("photograph")
         model = cls(
             classes=record["classes"],
-            width=record["width"],
-            patience=record["patience"],
             foresight=record["foresight"],
             metadata=record["metadata"],
             thresholds=thresholds_of(record["thresholds"]),

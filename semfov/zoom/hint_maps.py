@@ -112,30 +112,18 @@ def tapered(border: Tensor, span: int) -> Tensor:
     return border.sigmoid()[ring.clamp(max=3)]
 
 
-def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:
-    """Compute selected outputs of a network without calls of modules, which cost most of the time in one so small.
+def through(network: nn.Sequential, values: Tensor) -> Tensor:
+    """Apply a network without calls of modules, which cost most of the time in one so small.
 
     Args:
-        network: of linear layers, GELU and dropout.
+        network: of linear layers and GELU.
         values: `(..., inputs)`.
-        outputs: the outputs of the last layer that are computed; None for all.
 
     Returns:
         `(..., outputs)`.
     """
-    last = len(network) - 1
-    for place, layer in enumerate(network):
-        if isinstance(layer, nn.Linear):
-            weight: Tensor = layer.weight
-            bias: Tensor = layer.bias
-            if place == last and outputs is not None:
-                weight = weight[outputs]
-                bias = bias[outputs]
-            values = F.linear(values, weight, bias)
-        elif isinstance(layer, nn.GELU):
-            values = _gelu(values)
-        elif layer.training:  # dropout
-            values = layer(values)
+    for layer in network:
+        values = F.linear(values, layer.weight, layer.bias) if isinstance(layer, nn.Linear) else _gelu(values)
     return values
 
 

@@ -1,7 +1,6 @@
 """Policies of where to look next, and how closely: the value of a look at each window."""
 
-from collections.abc import Callable, Mapping
-from functools import reduce
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,69 +44,6 @@ def best_find(
             values = values + known(level)
         best = _better(best, values, level, lattice, done, beside)
     return best
-
-
-def best_hit(
-    belief: ZoomBelief, done: set[Window], *, closest: bool = False, beside: Window | None = None
-) -> WindowChoice | None:
-    """Choose the window that most probably shows the target.
-
-    A coarse window is also worth the hits that the closer windows in it promise together, divided by `patience`.
-
-    Args:
-        belief: the belief about the picture.
-        done: windows that were looked at.
-        closest: whether only windows of the last level can show the target.
-        beside: a window that is being looked at, as for `best_find`.
-
-    Returns:
-        The window and its value; None if no window has a value above 0.
-    """
-    lattice = belief.lattice
-    patience = np.float32(belief.evidence.patience)
-    last = lattice.levels - 1
-    chances = {level: belief.chances(level) for level in range(1, lattice.levels)}
-    best: WindowChoice | None = None
-    for level, values in chances.items():
-        if level < last:
-            own_hits = np.zeros_like(values) if closest else values
-            values = np.maximum(own_hits, _closer_hits(belief, chances, level) / patience)
-        best = _better(best, values, level, lattice, done, beside)
-    return best
-
-
-def _closer_hits(belief: ZoomBelief, chances: Mapping[int, Cells], level: int) -> Cells:
-    """Sum the chances of closer windows, side by side, in each window of a level, and take the level that has most.
-
-    Args:
-        belief: the belief about the picture.
-        chances: by level, the chance of each window `(down, across)`.
-        level: of the windows whose parts are summed.
-
-    Returns:
-        `(down, across)`.
-    """
-    lattice = belief.lattice
-    closest_level = belief.closest_level.numpy()
-    across, down = lattice.places(level)
-    most = np.zeros((down, across), np.float32)
-    for deeper in range(level + 1, lattice.levels):
-        closer = chances[deeper]
-        span = lattice.span(deeper)
-        count = 1 << (deeper - level)  # closer windows along a side
-        # A closer window counts if no look of this level has shown its middle.
-        half = span // 2
-        middle = closest_level[half : half + closer.shape[0], half : half + closer.shape[1]]
-        rows, columns = middle.shape
-        # Windows of the level can reach beyond the picture, where there are no closer windows: zeros.
-        height = max((count - 1) * span + down, rows)
-        width = max((count - 1) * span + across, columns)
-        hits = np.zeros([height, width], np.float32)
-        np.multiply(closer[:rows, :columns], middle < level, out=hits[:rows, :columns])
-        lines = reduce(np.add, (hits[span * n : span * n + down] for n in range(count)))
-        sums = reduce(np.add, (lines[:, span * n : span * n + across] for n in range(count)))
-        most = np.maximum(most, sums)
-    return most
 
 
 def _better(

@@ -67,4 +67,4 @@ def evidence():
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return GlimpseEvidence(2, 8)
+        return GlimpseEvidence(2)

@@ -11,7 +11,7 @@ from semfov.fit.protocols import Trial
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.seeds import noise_for
 from semfov.zoom.looks import Window
-from semfov.zoom.policy import best_find, best_hit
+from semfov.zoom.policy import best_find
 
 
 class MaskedRandom:
@@ -60,8 +60,7 @@ class WindowAgent:
 
     def __call__(self):
         gaze, belief, lattice = self.gaze, self.gaze.looking.session.belief, self.gaze.source.lattice
-        searching = gaze.task == "search"
-        choice = best_hit(belief, gaze.done) if searching else best_find(belief, gaze.done, belief.foresight)
+        choice = best_find(belief, gaze.done, belief.foresight)
         return _action_of(lattice, Window.overview(lattice) if choice is None else choice[0])
 
 

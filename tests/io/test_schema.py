@@ -34,7 +34,7 @@ def everything():
 
 
 def glimpses():
-    return GlimpseEvidence(3, 2, patience=1.5, foresight=0.25)
+    return GlimpseEvidence(3, foresight=0.25)
 
 
 def verification():

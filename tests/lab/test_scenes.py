@@ -161,7 +161,7 @@ def test_means_and_paired_differences_match_hand_calculations():
 def zooming(tmp_path, monkeypatch):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles())
     torch.manual_seed(0)
-    GlimpseEvidence(3, 8).save(tmp_path / "model.safetensors")
+    GlimpseEvidence(3).save(tmp_path / "model.safetensors")
     return ZoomConfig(
         data=DataConfig(limit=5, min_instances=0, max_target_area=None),
         mosaics=2,

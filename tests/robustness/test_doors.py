@@ -53,7 +53,7 @@ def agent():
 def zooming():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return ZoomAgent(WindowEye(CUP), GlimpseEvidence(2, 8)).eval()
+        return ZoomAgent(WindowEye(CUP), GlimpseEvidence(2)).eval()
 
 
 @pytest.fixture(scope="module")

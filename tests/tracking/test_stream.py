@@ -29,7 +29,7 @@ def frames(count=40):
 
 @pytest.fixture(scope="module")
 def moments():
-    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2, 8)).eval()
+    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2)).eval()
     episode = agent.stream(None, (RED,), StreamSettings(rate=0.75, score_threshold=0.1))
     return [(episode.step(frame), frame, box) for frame, box in frames()]
 

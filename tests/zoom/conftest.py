@@ -23,7 +23,7 @@ def detector():
 @pytest.fixture
 def agent(detector):
     torch.manual_seed(0)
-    return ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
+    return ZoomAgent(WindowEye(detector), GlimpseEvidence(3)).eval()
 
 
 @pytest.fixture

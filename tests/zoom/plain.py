@@ -8,7 +8,6 @@ import torch
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.hints import Gist
 from semfov.zoom.looks import WindowLook
-from semfov.zoom.pooling import pool
 from semfov.zoom.survey import STEPS
 
 
@@ -82,48 +81,4 @@ def sums(lattice: Lattice, cells: np.ndarray, level: int, weight: np.ndarray) ->
     for row, column in np.ndindex(down, across):
         part = cells[row : row + span, column : column + span]
         found[row, column] = weight[: part.shape[0]] @ part @ weight[: part.shape[1]]
-    return found
-
-
-def odds(
-    lattice: Lattice, evidence: GlimpseEvidence, target: int, window_looks: Sequence[WindowLook], level: int
-) -> np.ndarray:
-    """Log odds that a look at each window of a level shows the class, `(down, across)`.
-
-    From the coarsest look to the closest: a look that holds a window replaces what coarser ones predicted for it, and
-    takes this as an input. Hints count for the share of their cell that is left to see.
-    """
-    (across, down), span, share = lattice.places(level), lattice.span(level), left(lattice, window_looks)
-    found = np.full((down, across), -np.inf)
-    looks = sorted(
-        (window_look.gist for window_look in window_looks if window_look.gist is not None), key=lambda look: look.level
-    )
-    for look in looks:
-        side = span // look.scale
-        if not 1 <= level - look.level <= STEPS or not side:
-            continue
-        scores = look.scores.clone()
-        for row, column in np.ndindex(*scores.shape[:2]):
-            x, y = look.first[0] + column * look.scale, look.first[1] + row * look.scale
-            cells = np.ones((look.scale, look.scale))
-            inside = share[y : y + look.scale, x : x + look.scale]
-            cells[: inside.shape[0], : inside.shape[1]] = inside
-            scores[row, column] *= float(cells.mean())
-        places = list(np.ndindex(*(max(n - side, 0) + 1 for n in scores.shape[:2])))
-        corners = [
-            (min(look.first[1] + row * look.scale, down - 1), min(look.first[0] + column * look.scale, across - 1))
-            for row, column in places
-        ]
-        known = [found[corner] if np.isfinite(found[corner]) else -4.0 for corner in corners]
-        for (row, column), before in zip(places, known, strict=True):
-            pooled, summary = pool(scores, (column, row, column + side, row + side))
-            value = evidence.presence(
-                pooled[None],
-                summary[None],
-                torch.tensor([level - look.level]),
-                target,
-                torch.tensor([before], dtype=torch.float32) if look.level else None,
-            )
-            y, x = look.first[1] + row * look.scale, look.first[0] + column * look.scale
-            found[y : y + look.scale, x : x + look.scale] = float(value)
     return found

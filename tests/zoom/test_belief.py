@@ -9,13 +9,10 @@ from semfov.settings import FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import look_for
-from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window
-from semfov.zoom.policy import best_find, best_hit, jointly
-from semfov.zoom.pooling import pool, pool_spans
+from semfov.zoom.policy import best_find, jointly
 from semfov.zoom.window_sums import WindowSums
 from tests.zoom import plain
-from train.zoom_slices import odds_of
 
 
 @pytest.fixture
@@ -27,7 +24,7 @@ def source(detector, picture):
 @pytest.fixture
 def evidence():
     torch.manual_seed(3)
-    return GlimpseEvidence(3, 8).eval().requires_grad_(False)
+    return GlimpseEvidence(3).eval().requires_grad_(False)
 
 
 @pytest.fixture
@@ -62,20 +59,6 @@ def test_long_pictures_are_searched(detector, evidence, size):
     assert path.lattice.levels > 4
 
 
-def test_pooling_of_several_sizes_at_once_equals_pooling_of_each_window():
-    """Also of windows that are longer than a side of the map."""
-    scores = torch.rand(9, 20, 4, generator=torch.Generator().manual_seed(1)) ** 8
-    scores[torch.rand(9, 20, generator=torch.Generator().manual_seed(2)) < 0.6] = 0
-    spans = [16, 5, 8]
-    for span, (top, summary) in zip(spans, pool_spans(scores, spans), strict=True):
-        assert top.shape[:2] == summary.shape[:2] == (max(9 - span, 0) + 1, 20 - span + 1)
-        for row in range(top.shape[0]):
-            for column in range(top.shape[1]):
-                one, one_summary = pool(scores, (column, row, column + span, row + span))
-                torch.testing.assert_close(top[row, column], one)
-                torch.testing.assert_close(summary[row, column], one_summary)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence, seed):
     """After every look of an episode of looks of all levels in any order, with plans that were dropped in between."""
@@ -89,7 +72,6 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
         seen += source.see([Window.on(lattice, tuple(action))])
         belief.add(seen[-1])
         jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 1 + step % 3)
-        jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + step % 2)
         left, closest = plain.left(lattice, seen), plain.closest(lattice, seen)
         expected = plain.expected(lattice, evidence, target, seen)
         np.testing.assert_array_equal(belief.unexplored, left)
@@ -102,47 +84,9 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
             if level + 1 < lattice.levels:
                 finds += 0.5 * plain.sums(lattice, expected[level + 1] * (closest < level), level, ones)
             np.testing.assert_allclose(belief.value(level, 0.5), finds, rtol=1e-3, atol=1e-6)
-            whole = min(lattice.span(level), lattice.rows) * min(lattice.span(level), lattice.columns)
-            unseen = plain.sums(lattice, left * (closest < level), level, ones) / whole
-            np.testing.assert_allclose(belief.unseen(level), unseen, atol=1e-6)
-            odds = plain.odds(lattice, evidence, target, seen, level)
-            np.testing.assert_allclose(belief._level_odds(level), odds, rtol=1e-3, atol=1e-4)
-            np.testing.assert_allclose(belief.chances(level), unseen / (1 + np.exp(-odds)), atol=1e-4)
         most = np.max([expected[level] for level in range(1, lattice.levels)], 0)
         remaining = most[most >= 0.1].sum(), most[most < 0.1].sum()
         np.testing.assert_allclose(belief.remaining(), remaining, rtol=1e-3, atol=1e-4)
-
-
-def test_changes_in_cells_without_hints_change_no_odds(belief):
-    """They are not computed anew there, and elsewhere they are."""
-    lattice, look = belief.lattice, belief.gists[0]
-    finest = lattice.levels - 1
-    before = {level: belief._level_odds(level).copy() for level in range(1, lattice.levels)}
-    shown = look.scores.amax(-1) > 0
-    empty = [
-        (row, column)
-        for row in range(lattice.rows - CELLS)
-        for column in range(lattice.columns - CELLS)
-        if not shown[
-            row // look.scale : -(-(row + CELLS) // look.scale),
-            column // look.scale : -(-(column + CELLS) // look.scale),
-        ].any()
-    ]
-    row, column = empty[len(empty) // 2]
-    belief.discount(Window.on(lattice, (finest, column, row)))
-    assert all(np.array_equal(belief._level_odds(level), odds) for level, odds in before.items())
-    row, column = (int(n) * look.scale for n in shown.nonzero()[0])
-    belief.discount(Window.on(lattice, (finest, min(column, lattice.columns - CELLS), min(row, lattice.rows - CELLS))))
-    assert not all(np.array_equal(belief._level_odds(level), odds) for level, odds in before.items())
-
-
-def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):
-    lattice = belief.lattice
-    table = torch.from_numpy(belief._level_odds(lattice.levels - 1).copy())
-    # The picture ends inside a cell of the overview, so only windows on whole cells are compared.
-    for row, column in ((0, 0), (6, 8), (12, 4)):
-        window = Window.on(lattice, (lattice.levels - 1, column, row))
-        assert odds_of(belief, window) == pytest.approx(float(table[row, column]), abs=1e-4)
 
 
 @pytest.mark.parametrize("target", [1, 2, 3])
@@ -165,7 +109,7 @@ def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(so
 def test_no_window_is_chosen_twice(belief):
     done = set()
     for _ in range(20):
-        window, _ = best_hit(belief, done, closest=True)
+        window, _ = best_find(belief, done)
         assert window not in done
         done.add(window)
 
@@ -197,12 +141,11 @@ def test_rates_are_the_same_whenever_they_are_asked_for(source, evidence):
         np.testing.assert_allclose(waiting.value(level, 0.0), asked.value(level, 0.0), rtol=1e-6)
 
 
-def test_a_search_for_one_object_predicts_no_rates(detector, picture, evidence, monkeypatch):
-    def rates(*_):
-        raise AssertionError("rates are predicted")
-
-    monkeypatch.setattr(GlimpseEvidence, "rates", rates)
+def test_a_search_looks_where_most_objects_are_expected(detector, picture, evidence):
+    """At the windows that finding all objects of the class looks at, whose values are expected numbers of objects."""
     agent = ZoomAgent(WindowEye(detector), evidence)
-    assert agent.search(picture, "green", SearchSettings(passes=4, stop_below=0.0)).passes == 4
-    with pytest.raises(AssertionError, match="rates are predicted"):
-        agent.find_all(picture, "green", FindSettings(passes=4))
+    search = agent.search(picture, "green", SearchSettings(passes=6, confirm=1.0, stop_below=0.0))
+    finding = agent.find_all(picture, "green", FindSettings(passes=6, min_gain=0.0))
+    assert [look.window for look in search.window_looks] == [look.window for look in finding.window_looks]
+    expected = np.array([look.value for look in finding.looks[1:]])
+    np.testing.assert_allclose([look.value for look in search.looks[1:]], 1 - np.exp(-expected), rtol=1e-6)

@@ -62,7 +62,7 @@ def eye(detector):
 def steps(eye, picture, target, most=6):
     torch.manual_seed(0)
     source = LiveWindowLooks(eye, eye.open(picture))
-    steps = look_for(source, GlimpseEvidence(3, 8).eval(), target)
+    steps = look_for(source, GlimpseEvidence(3).eval(), target)
     with torch.inference_mode():
         return [step for step, _ in zip(steps, range(most), strict=False)]
 
@@ -86,8 +86,8 @@ def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     raw = torch.tensor([ordered[0], ordered[1], max([0.0, *closest]), scores[0], max([0.0, *named]), 0.25])
     torch.testing.assert_close(case[:6], features(raw))
     belief = seen[0].belief
-    chances = belief.chances(belief.lattice.levels - 1)
-    laid = [chances[row::CELLS, column::CELLS].sum() for row in range(CELLS) for column in range(CELLS)]
+    finds = belief.value(belief.lattice.levels - 1, 0.0)
+    laid = [finds[row::CELLS, column::CELLS].sum() for row in range(CELLS) for column in range(CELLS)]
     assert case[6] == pytest.approx(math.log(sum(laid) / len(laid) + 1e-3) / 4)
     assert case[7] == pytest.approx(float(belief.unexplored.mean()))
     assert case[8] == pytest.approx(math.log(1 + sum(score >= 0.1 for score in scores)) / 2)
@@ -108,7 +108,7 @@ def test_before_fitting_the_probability_is_the_best_score(eye, picture):
 
 def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
     torch.manual_seed(0)
-    evidence = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.02))
+    evidence = GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.02))
     evidence.save(tmp_path / "own.safetensors")
     evidence = GlimpseEvidence.from_pretrained(tmp_path / "own.safetensors")
     assert evidence.thresholds == Thresholds(0.3, 0.02)
@@ -138,7 +138,7 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
     """A search computes the probability only where it can matter; here it is computed after every look."""
     most, thresholds = 6, Thresholds(confirm, stop_below)
     torch.manual_seed(0)
-    evidence, source = GlimpseEvidence(3, 8).eval(), LiveWindowLooks(eye, eye.open(picture))
+    evidence, source = GlimpseEvidence(3).eval(), LiveWindowLooks(eye, eye.open(picture))
     facts, passes, ended = None, 0, 0
     with torch.inference_mode():
         for step in look_for(source, evidence, target):
@@ -159,7 +159,7 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
 
 def test_a_fitted_probability_is_calibrated():
     torch.manual_seed(0)
-    model = GlimpseEvidence(3, 8)
+    model = GlimpseEvidence(3)
     known, _ = synthetic(4000, 1)
     fit_judge(model, known, steps=250)
     new, odds = synthetic(4000, 2)
@@ -344,7 +344,7 @@ def test_the_spread_is_fitted_on_the_numbers_of_records():
     mosaics = Mosaics(EmbeddedScenes(("person", "dog", "boat"), count=3), 4, 4, tile=(96, 72), count=1)
     certainty = Certainty(2.0, (1.0, *[0.0] * (len(FACTS) - 1)), scale=0.5, strength=2.0)
     torch.manual_seed(0)
-    evidence = GlimpseEvidence(3, 8, certainty=certainty).eval()
+    evidence = GlimpseEvidence(3, certainty=certainty).eval()
     source = StoredWindowLooks(eye, mosaics, 0, None)
     _, sought = explorations_of_kinds(evidence, {"mosaics": (mosaics, [source])}, 4)["mosaics"]
     looked = [step.look for step in islice(find_everything(source, evidence, sought.target), 8)]
@@ -406,7 +406,7 @@ def test_boxes_are_right_once_and_crowds_are_neither():
 def path(detector, picture):
     torch.manual_seed(0)
     weights = (1.0, *[0.0] * (len(FACTS) - 1))
-    evidence = GlimpseEvidence(3, 8, certainty=Certainty(3.0, weights, scale=0.5, strength=2.0))
+    evidence = GlimpseEvidence(3, certainty=Certainty(3.0, weights, scale=0.5, strength=2.0))
     return ZoomAgent(WindowEye(detector), evidence).eval().find_all(picture, None, FindSettings(passes=4))
 
 
@@ -420,7 +420,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
     variance += sum((SPREAD * each) ** 2 for each in path.expected.values())
     assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
-    assert path.describe() == "1 object found. 4 looks"
+    assert path.describe() == f"{len(path.objects)} objects found. 4 looks"
     path.save(tmp_path / "a.safetensors")
     loaded = ZoomPath.load(tmp_path / "a.safetensors")
     assert (loaded.expected, loaded.expected_error) == (path.expected, path.expected_error)
@@ -429,7 +429,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
 
 
 def test_evidence_of_earlier_versions_has_probabilities_by_the_score_alone():
-    old = GlimpseEvidence(3, 8)
+    old = GlimpseEvidence(3)
     record = json.loads(json.dumps({**old._record(), "certainty": [-0.9, 1.1], "metadata": {}}))
     certainty = GlimpseEvidence._restore(record, dict(old.state_dict())).certainty
     facts = torch.randn(7, len(FACTS))
@@ -438,7 +438,7 @@ def test_evidence_of_earlier_versions_has_probabilities_by_the_score_alone():
 
 
 def test_the_least_probability_can_be_chosen(detector, picture):
-    agent = ZoomAgent(WindowEye(detector), GlimpseEvidence(3, 8)).eval()
+    agent = ZoomAgent(WindowEye(detector), GlimpseEvidence(3)).eval()
     assert agent.find_all(picture, "red", FindSettings(passes=2)).score_threshold == 0.3  # scores, without a certainty
     assert agent.find_all(picture, "red", FindSettings(passes=2, score_threshold=0.7)).score_threshold == 0.7
     assert agent.explore(picture, ExploreSettings(passes=2, score_threshold=0.6)).score_threshold == 0.6

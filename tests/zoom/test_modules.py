@@ -5,24 +5,25 @@ import torch
 from semfov.agents import ZoomAgent
 from semfov.settings import ExploreSettings
 from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom.evidence import CASE
 from tests.base_tester import BaseTester, TensorTester
 from tests.small import Blobs, rand
 
 
 class TestGlimpseEvidence(TensorTester):
-    """Evidence about looks one octave closer."""
+    """Evidence about the presence of a class after a search."""
 
     batched = (0, 1)
 
     def make(self):
-        return GlimpseEvidence(3, 8).eval()
+        return GlimpseEvidence(3).eval()
 
     def inputs(self):
-        return rand(5, 3), rand(5, 3)
+        return rand(5), rand(5, CASE)
 
     @staticmethod
-    def call(module, scores, summary):
-        return module.presence(scores, summary, torch.ones(len(scores), dtype=torch.long, device=scores.device))
+    def call(module, best, case):
+        return module.anywhere(best, case)
 
 
 class TestWindowEye(BaseTester):
@@ -45,7 +46,7 @@ class TestZoomAgent(BaseTester):
     on_cpu = True
 
     def make(self):
-        return ZoomAgent(WindowEye(Blobs()), GlimpseEvidence(3, 8)).eval()
+        return ZoomAgent(WindowEye(Blobs()), GlimpseEvidence(3)).eval()
 
     def inputs(self):
         return ((rand(3, 300, 400) * 255).byte(),)

@@ -62,7 +62,7 @@ def test_the_records_of_each_look_have_the_picture(agent, picture):
 
 
 def test_find_all_finds_one_class_and_explore_finds_all(agent, picture):
-    path = agent.find_all(picture, "blue", FindSettings(passes=12, min_gain=0.0))
+    path = agent.find_all(picture, "blue", FindSettings(passes=30, min_gain=0.0))
     assert path.target == 3
     assert (path.objects.labels == 3).all()
     assert len(path.objects.above(0.3))
@@ -121,8 +121,8 @@ def test_invalid_arguments_are_refused(agent, picture, detector):
     ):
         refused(message, agent.explore, image)
     with pytest.raises(InputError, match="evidence: expected one for the detector's 3 classes, got 5"):
-        ZoomAgent(WindowEye(detector), GlimpseEvidence(5, 8))
-    for wrong, message in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
+        ZoomAgent(WindowEye(detector), GlimpseEvidence(5))
+    for wrong, message in (({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
         refused(message, GlimpseEvidence, **wrong)
 
 
@@ -249,7 +249,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, p
 @pytest.mark.parametrize("kind", ["closely", "plain", "slices"])
 def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, picture, kind, one_thread):
     """With closer looks, each of which takes a frame, without them, and without learned evidence."""
-    model = {"closely": evidence(), "plain": GlimpseEvidence(3, 8), "slices": None}[kind]
+    model = {"closely": evidence(), "plain": GlimpseEvidence(3), "slices": None}[kind]
     agent = ZoomAgent(WindowEye(detector), model).eval()
     path = agent.search(picture, "red")
     live = agent.stream(1, (), StreamSettings(rate=0), follows=False)
@@ -270,12 +270,12 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
     image[1, 320:344, 640:664] = 1
     image[:, [0, 0, -1, -1], [0, -1, 0, -1]] = 0.02  # no blank ground
     agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
-    path = agent.search(image, "red", SearchSettings(closer=2))
-    live = agent.stream(1, (), StreamSettings(rate=0, closer=2), follows=False)
+    path = agent.search(image, "red", SearchSettings(closer=1))
+    live = agent.stream(1, (), StreamSettings(rate=0, closer=1), follows=False)
     moments = [live.step(image) for _ in path.window_looks]
     same_looks(moments, path)
     assert (path.decision.outcome, moments[-1].decision.outcome) == ("absent", "absent")
-    assert len(path.closer) == len(moments[-1].closer) == 2
+    assert len(path.closer) == len(moments[-1].closer) == 1
 
 
 def test_looks_are_forgotten_by_the_seconds_that_passed(agent, picture):

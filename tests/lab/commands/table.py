@@ -64,7 +64,7 @@ def write_material(folder: Path) -> None:
         thresholds = Thresholds(0.6, 0.3)
         TargetEvidence(4, 4, components=4, thresholds=thresholds, metadata=settings).save(folder / "target.safetensors")
         MapEvidence(4, 4, components=4, metadata=settings).save(folder / "map.safetensors")
-        GlimpseEvidence(3, 8).save(folder / "zoom.safetensors")
+        GlimpseEvidence(3).save(folder / "zoom.safetensors")
         alpha, rates = 0.5 + torch.rand(4, 3, 4), torch.full((4, 3), 0.3)
         model = FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=rates, metadata=settings)
         model.save(folder / "observation.safetensors")
