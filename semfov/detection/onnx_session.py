@@ -90,11 +90,11 @@ class OnnxSession:
         open_ended: bool | None = None,
         further: Sequence[str] = (),
     ) -> None:
-        self.path = Path(path)
+        self.path = Path(path).absolute()  # is read again, maybe after a change of folder
         self.threads = torch.get_num_threads() if threads is None else threads
         check(self.threads > 0, "threads", "at least one", self.threads)
         self.providers = None if providers is None else tuple(providers)
-        self.open_ended = check_file(self.path) if open_ended is None else open_ended
+        self.open_ended = check_file(Path(path)) if open_ended is None else open_ended
         self._again = partial(
             OnnxSession,
             self.path,

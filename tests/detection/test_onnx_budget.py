@@ -1,9 +1,12 @@
 """Small ONNX files that ask for much are refused before, or stopped while; what is counted is what a pass takes."""
 
 import json
+import os
 import pickle
+import signal
 import subprocess
 import sys
+import threading
 from contextlib import suppress
 
 import numpy as np
@@ -169,9 +172,8 @@ def test_only_models_whose_work_is_known_are_folded(make_onnx, monkeypatch, tens
     assert asked == [tensors and ["ConstantFolding"]]
 
 
-def test_a_model_whose_work_is_unknown_runs_in_a_process_that_ends(tmp_path, monkeypatch):
-    """One product of whole numbers, of a size that the picture gives, takes far longer than a pass may."""
-    monkeypatch.setattr(onnx_session, "_MOST_SECONDS", 1.0)
+def slow_where_white(path, batch=1):
+    """Write a model with one product of whole numbers, which takes far longer for white pictures than a pass may."""
     nodes = [
         node("ReduceMax", "images", "most", keepdims=0),
         node("Mul", "most largest", "side"),
@@ -185,17 +187,64 @@ def test_a_model_whose_work_is_unknown_runs_in_a_process_that_ends(tmp_path, mon
         node("Div", "number number", "unit"),
         node("Mul", "unit rows", "out"),
     ]
-    stored = {"largest": np.float32(4000), "one": [1], "rows": np.full((1, 10, 6), 0.5, np.float32)}
-    path = write_network(tmp_path / "model.onnx", nodes, {"images": [1, 3, 64, 64]}, {"out": [1, 10, 6]}, stored)
-    session = OnnxSession(path)
+    stored = {"largest": np.float32(4000), "one": [1], "rows": np.full((batch, 10, 6), 0.5, np.float32)}
+    return write_network(path, nodes, {"images": [batch, 3, 64, 64]}, {"out": [batch, 10, 6]}, stored)
+
+
+def test_a_model_whose_work_is_unknown_runs_in_a_process_that_ends(tmp_path, monkeypatch):
+    """Its file is found again from another folder."""
+    monkeypatch.setattr(onnx_session, "_MOST_SECONDS", 1.0)
+    slow_where_white(tmp_path / "model.onnx")
+    monkeypatch.chdir(tmp_path)
+    session = OnnxSession("model.onnx")
     assert session.open_ended
     black, white = torch.zeros(1, 3, 64, 64), torch.ones(1, 3, 64, 64)
     assert session(black)["out"].eq(0.5).all()
     first = session._session._process
+    monkeypatch.chdir("/")
     unusable("not done after 1 s", session, white)
     assert first.poll() is not None
     assert session(black)["out"].eq(0.5).all()
+    assert session.steps((64, 64))
     assert pickle.loads(pickle.dumps(session))(black)["out"].eq(0.5).all()
+
+
+def test_a_pass_has_time_for_each_image_of_a_fixed_batch(tmp_path):
+    session = OnnxSession(slow_where_white(tmp_path / "model.onnx", batch=4))
+    session._session._seconds = 0.25
+    unusable("not done after 1 s", session, torch.ones(1, 3, 64, 64))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no forks")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_fork_has_a_process_and_turns_of_its_own(tmp_path):
+    """It is made while a thread waits for a pass, which goes on."""
+    session = OnnxSession(slow_where_white(tmp_path / "model.onnx"))
+    model = session._session
+    feeds = [{"images": np.full((1, 3, 64, 64), value, np.float32)} for value in (0, 1)]
+    model._seconds = 1.5
+    told = []
+
+    def wait():
+        with pytest.raises(DataError) as caught:
+            model.run(["out"], feeds[1])
+        told.append(str(caught.value))
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    while not model._turn.locked():
+        thread.join(0.01)
+    child = os.fork()
+    if not child:
+        signal.alarm(30)  # ends what waits for ever
+        code = 1
+        with suppress(BaseException):
+            model._seconds = 10.0
+            code = int(not (model.run(["out"], feeds[0])[0] == 0.5).all())
+        os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
+    thread.join()
+    assert told == ["not done after 2 s, as with a loop that does not end"]
 
 
 @pytest.mark.parametrize(
