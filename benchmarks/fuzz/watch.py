@@ -20,6 +20,7 @@ MOST_SECONDS = 20  # of the processor, for any picture
 _OPENED = 0x20 | 0x1  # inotify: IN_OPEN, IN_ACCESS
 _PROCESSES = ("subprocess.Popen", "os.fork", "os.forkpty", "os.exec", "os.posix_spawn", "os.system")
 _RESERVED = 1 << 28  # bytes that may be reserved and never used, as by allocators of threads
+_MOST_WAIT = 10  # seconds for a request of one that has connected
 _EVENT = struct.Struct("iIII")
 
 
@@ -117,15 +118,17 @@ def opened_files(*folders: Path) -> Iterator[set[str]]:
     """
     libc = ctypes.CDLL(None)
     names: set[str] = set()
-    watch = libc.inotify_init1(os.O_NONBLOCK)
-    for folder in folders:
-        assert libc.inotify_add_watch(watch, os.fsencode(folder), _OPENED) > 0
-    yield names
     events = b""
-    with contextlib.suppress(BlockingIOError):
-        while more := os.read(watch, 1 << 16):
-            events += more
-    os.close(watch)
+    watch = libc.inotify_init1(os.O_NONBLOCK)
+    try:
+        for folder in folders:
+            assert libc.inotify_add_watch(watch, os.fsencode(folder), _OPENED) > 0
+        yield names
+        with contextlib.suppress(BlockingIOError):
+            while more := os.read(watch, 1 << 16):
+                events += more
+    finally:
+        os.close(watch)
     place = 0
     while place < len(events):
         *_, length = _EVENT.unpack_from(events, place)
@@ -149,10 +152,16 @@ def listener() -> Iterator[tuple[str, list[bytes]]]:
         with contextlib.suppress(OSError):
             while True:
                 client, _ = server.accept()
-                with client:
+                client.settimeout(_MOST_WAIT)
+                with client, contextlib.suppress(OSError):
                     requests.append(client.recv(1000))
                     client.sendall(b"HTTP/1.0 404 Not Found\r\n\r\n")
 
-    threading.Thread(target=serve, daemon=True).start()
-    yield f"http://127.0.0.1:{server.getsockname()[1]}", requests
-    server.close()
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}", requests
+    finally:
+        server.shutdown(socket.SHUT_RDWR)  # wakes the thread, as closing does not
+        server.close()
+        thread.join()

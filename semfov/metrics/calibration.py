@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_shape, check_whole
+from semfov.errors import check, check_whole
 from semfov.metrics.labels import as_numbers, as_outcomes
 
 _ROUNDING = 1e-3
@@ -50,7 +50,7 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
         InputError: a row is no distribution, a label is no class, or the shapes do not fit together.
     """
     p = _probabilities(probabilities, "probabilities")
-    check_shape(p, "probabilities", None, None)
+    check(p.ndim == 2, "probabilities", "a tensor of shape (M, K+1)", f"shape {(*p.shape,)}")
     check_whole(bins, "bins", 1, _MOST_BINS)
     classes = _class_numbers(labels, p)
     if not len(classes):
@@ -103,6 +103,13 @@ def _probabilities(values: Tensor, argument: str) -> Tensor:
     return p
 
 
+def _check_row(tensor: Tensor, argument: str, count: int | None = None) -> None:
+    """Raise `InputError` unless a tensor has one dimension, and so many numbers; None stands for any."""
+    expected = "numbers in a row" if count is None else f"{count} in a row"
+    is_row = tensor.ndim == 1 and count in (None, len(tensor))
+    check(is_row, argument, expected, f"shape {(*tensor.shape,)}")
+
+
 def surprisal(probability: Tensor) -> Tensor:
     """Compute the negative logarithm of probabilities.
 
@@ -149,14 +156,16 @@ def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) ->
         `(3, bins)`: numbers of predictions, sums of their probabilities, and numbers that came true.
     """
     if isinstance(bins, Tensor):
-        edges = bins
+        edges = as_numbers(bins, "bins").detach().cpu()
+        _check_row(edges, "bins")
         check(bool((edges.diff() > 0).all()), "bins", "edges that ascend", edges.tolist())
     else:
         check_whole(bins, "bins", 1, _MOST_BINS)
         edges = torch.arange(1, bins, dtype=torch.float64) / bins
     p = _probabilities(confidence, "confidence").detach().cpu().contiguous()
+    _check_row(p, "confidence")
     came_true = as_outcomes(correct, "correct")
-    check_shape(came_true, "correct", len(p))
+    _check_row(came_true, "correct", len(p))
     bin_of_prediction = torch.bucketize(p, edges)
     values = torch.stack([torch.ones_like(p), p, came_true.to(p)])
     sums = torch.zeros(3, len(edges) + 1, dtype=torch.float64)
@@ -197,8 +206,8 @@ class BinarySums:
         """
         p = _probabilities(probability, "probability").detach()
         came_true = as_outcomes(outcome, "outcome").to(p.device)
-        check_shape(p, "probability", None)
-        check_shape(came_true, "outcome", len(p))
+        _check_row(p, "probability")
+        _check_row(came_true, "outcome", len(p))
         cost = surprisal(torch.where(came_true, p, 1 - p))
         square = (p - came_true.double()).square()
         return cls(reliability(p, came_true, cls.EDGES), float(cost.sum()), float(square.sum()))

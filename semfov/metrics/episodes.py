@@ -27,11 +27,13 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> FloatArr
         `(..., shifts + 1)`, after 0, 1, … gaze shifts; NaN without episodes.
 
     Raises:
-        InputError: `shifts` is no whole number of 0 or more.
+        InputError: `shifts` is no whole number of 0 or more, or there are no numbers of searches.
     """
     check_whole(shifts, "shifts", 0, _MOST_SHIFTS)
     steps = np.arange(shifts + 1)
-    shift = np.asarray(found_at)[..., None]
+    numbers = as_numbers(found_at, "found_at").detach().double().cpu().numpy()
+    check(numbers.ndim > 0, "found_at", "a number for each search", numbers)
+    shift = numbers[..., None]
     found = (shift >= 0) & (shift <= steps)
     if not found.shape[-2]:
         return np.full((*found.shape[:-2], len(steps)), np.nan)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from semfov.metrics import scanpath
-from semfov.metrics.calibration import calibration, calibration_error, reliability
+from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
 from semfov.metrics.episodes import cumulative_performance, standard_error
 from semfov.metrics.merging import AreaUnderRoc
 from tests.refusals import refused
@@ -28,6 +28,19 @@ CALLS = {
     "half a bin": (lambda: calibration(HALVES, torch.zeros(1), bins=2.5), "bins: expected a whole number"),
     "no bins": (lambda: calibration_error(HALVES[0], torch.ones(2), 0), "bins: expected a whole number"),
     "edges": (lambda: reliability(HALVES[0], torch.ones(2), torch.tensor([0.5, 0.2])), "bins: expected edges that"),
+    "a search alone": (lambda: cumulative_performance(np.array(5), 3), "found_at: expected a number for each search"),
+    "searches in words": (lambda: cumulative_performance(["a"], 3), "found_at: expected numbers"),
+    "an edge alone": (lambda: reliability(HALVES[0], torch.ones(2), torch.tensor(0.5)), "bins: expected numbers in a"),
+    "edges in rows": (lambda: reliability(HALVES[0], torch.ones(2), torch.tensor([[0.1, 0.5]])), "bins: expected num"),
+    "no edge": (lambda: reliability(HALVES[0], torch.ones(2), torch.tensor([torch.nan])), "bins: expected numbers"),
+    "a probability": (lambda: reliability(HALVES[0, 0], torch.tensor(1)), "confidence: expected numbers in a row"),
+    "confidence in rows": (lambda: calibration_error(HALVES, torch.ones(1, 2)), "confidence: expected numbers in a"),
+    "fewer came true": (lambda: reliability(HALVES[0], torch.ones(1)), "correct: expected 2 in a row, got shape"),
+    "sums in rows": (lambda: BinarySums.of(HALVES, torch.ones(1, 2)), "probability: expected numbers in a row"),
+    "deep": (lambda: calibration(HALVES[None], torch.zeros(1)), "probabilities: expected a tensor of shape"),
+    "a duration": (lambda: scanpath.multimatch(PATH, PATH, SIZE, 5), "durations: expected those of both .* got 5"),
+    "letters' duration": (lambda: scanpath.scanmatch(PATH, PATH, SIZE, durations=np.array(5)), "durations: expected t"),
+    "cells": (lambda: scanpath.scanmatch(PATH, PATH, SIZE, cells=5), r"cells: expected \(columns, rows\), got 5"),
     "a side": (lambda: scanpath.multimatch(PATH, PATH, (30,)), "size: expected a width and a height above 0"),
     "no size": (lambda: scanpath.multimatch(PATH, PATH, None), "size: expected a width and a height above 0"),
     "size in words": (lambda: scanpath.multimatch(PATH, PATH, "ab"), "size: expected a width and a height above 0"),

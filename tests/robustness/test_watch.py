@@ -1,8 +1,11 @@
 """What the fuzzer watches is seen, and pictures of a few kinds do none of it."""
 
+import os
 import socket
+import struct
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -34,6 +37,32 @@ def test_what_a_call_does_is_seen(tmp_path):
     with opened_files(tmp_path) as names:
         assert watched((tmp_path / "secret").read_text, MOST).fault is None
     assert names == {"secret"}
+
+
+def test_nothing_stays_when_a_block_ends_or_fails(tmp_path):
+    def descriptors():
+        return len(os.listdir("/proc/self/fd"))
+
+    threads = threading.active_count()
+    before = descriptors()
+    with listener():
+        assert threading.active_count() == threads + 1
+    with pytest.raises(KeyError), listener(), opened_files(tmp_path):
+        raise KeyError
+    assert threading.active_count() == threads
+    assert descriptors() == before
+
+
+def test_a_request_that_breaks_off_leaves_the_listener_to_the_next():
+    with listener() as (address, requests):
+        place = "127.0.0.1", int(address.rpartition(":")[2])
+        broken = socket.create_connection(place)
+        broken.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closes with a reset
+        broken.close()
+        with socket.create_connection(place, timeout=5) as client:
+            client.sendall(b"GET /")
+            assert client.recv(100).startswith(b"HTTP/1.0 404")
+        assert requests == [b"GET /"]
 
 
 @pytest.mark.slow

@@ -1,15 +1,18 @@
 """Scanpaths aligned by distance: MultiMatch, ScanMatch, dynamic time warping, time delay embedding."""
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from reprlib import repr as short_repr
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.data.fixations.record import as_array, as_path, check_sides
-from semfov.errors import check, check_number, check_whole
+from semfov.errors import InputError, check, check_number, check_whole
 from semfov.human.scanpath.sequence import cell_labels
 
 _Array = NDArray[np.float64]
+_Item = TypeVar("_Item")
 
 _MOST_SCREENS = 10  # diagonals of a screen over which fixations may spread; more are of another unit
 _MOST_LETTERS = 10_000  # of a scanpath: the table of an alignment has their product
@@ -127,13 +130,21 @@ def _distances(first: NDArray[np.number], second: NDArray[np.number]) -> _Array:
 
 def _checked_durations(durations: tuple[ArrayLike, ArrayLike], first: int, second: int) -> tuple[_Array, _Array]:
     """Take the durations of two scanpaths of some numbers of fixations, and check them."""
-    check(len(durations) == 2, "durations", "those of both scanpaths", f"{len(durations)} of them")
-    s, t = (as_array(values, "durations") for values in durations)
+    s, t = (as_array(values, "durations") for values in _pair(durations, "durations", "those of both scanpaths"))
     expected = f"{first} and {second} numbers, one for each fixation"
     check(s.shape == (first,) and t.shape == (second,), "durations", expected, (s.shape, t.shape))
     is_usable = bool((s >= 0).all() and (t >= 0).all() and np.isfinite([s.sum(), t.sum()]).all())
     check(is_usable, "durations", "finite numbers of 0 or more", "others")
     return s, t
+
+
+def _pair(values: Iterable[_Item], argument: str, expected: str) -> tuple[_Item, _Item]:
+    """Take two values; raise `InputError` where there are not two."""
+    try:
+        first, second = values
+    except (TypeError, ValueError):
+        raise InputError(f"{argument}: expected {expected}, got {short_repr(values)}") from None
+    return first, second
 
 
 def _duration_similarity(s: _Array, t: _Array) -> float:
@@ -205,17 +216,15 @@ def scanmatch(
     check_number(threshold, "threshold", 1e-6, 1e6)
     check_number(gap, "gap", -1e6, 0)
     check_number(bin_ms, "bin_ms", 1e-6, 1e6)
-    check(len(cells) == 2, "cells", "(columns, rows)", cells)
-    for count in cells:
+    columns, rows = _pair(cells, "cells", "(columns, rows)")
+    for count in (columns, rows):
         check_whole(count, "cells", 1, 1000)
-    check(durations is None or len(durations) == 2, "durations", "those of both scanpaths", durations)
-    words = []
-    for number, path in enumerate((as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1))):
-        word = cell_labels(path, *cells, size)
-        if durations is not None:
-            word = _repeated(word, durations[number], bin_ms)
-        words.append(np.stack([word % cells[0], word // cells[0]], 1))
-    a, b = words
+    paths = as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1)
+    words = [cell_labels(path, columns, rows, size) for path in paths]
+    if durations is not None:
+        lasting = _pair(durations, "durations", "those of both scanpaths")
+        words = [_repeated(word, milliseconds, bin_ms) for word, milliseconds in zip(words, lasting, strict=True)]
+    a, b = (np.stack([word % columns, word // columns], 1) for word in words)
     best = _best_alignment(threshold - _distances(a, b), gap)
     return float(best / (threshold * max(len(a), len(b))))
 
