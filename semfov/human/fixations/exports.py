@@ -329,10 +329,15 @@ def table_reader(
     names_points = not {*(columns or ())} <= {*_NAMED}
     if is_ours or names_points:
         return read_table
-    whole = unfolded(table._replace(rows=[]))
-    if program_of([Column.of(name) for name in whole.columns]) is None:
+    # Unfolding looks at all rows, which most tables do not need.
+    if not (_is_known(table) or _is_known(unfolded(table))):
         raise DataError(f"{table.name}: {_of_no_program(table)}")
     return read_export
+
+
+def _is_known(table: Table) -> bool:
+    """Tell whether a table has the columns of a program."""
+    return program_of([Column.of(name) for name in table.columns]) is not None
 
 
 _GAZE = re.compile(r"gaze|pog|pred|raw[xy]|pupil")  # keys of samples

@@ -22,9 +22,9 @@ _MESSAGE = re.compile(r"^MSG\s+(\d+(?:\.\d+)?)\s+(?:(-?\d+)\s+(?=!V\s|TRIAL))?(.
 # Messages of a trial: a picture is loaded, its name, and the screen is cleared.
 _LOAD = re.compile(r"^!V\s+IMGLOAD\s+(\S+)\s+(.+?)\s*$", re.IGNORECASE)
 _VARIABLE = re.compile(r"^(?:!V\s+TRIAL_VAR|var)\s+(?:image|picture|img|stimulus)\s+(.+?)\s*$", re.IGNORECASE)
-# Trials of Experiment Builder, and of OpenSesame.
-_BEGIN = re.compile(r"^(?:TRIALID|start_trial)\b\s*(.*)$")
-_RESULT = re.compile(r"^(?:TRIAL_RESULT|end_trial|stop_trial)\b")
+# Trials of Experiment Builder, in which a name may follow without a space, and of OpenSesame.
+_BEGIN = re.compile(r"^(?:TRIALID|start_trial\b)\s*(.*)$")
+_RESULT = re.compile(r"^(?:TRIAL_RESULT|(?:end_trial|stop_trial)\b)")
 _CLEAR = re.compile(r"^!V\s+CLEAR\b", re.IGNORECASE)
 # What follows `IMGLOAD` and its mode: a name, x and y, and perhaps width and height.
 _PLACED = re.compile(r"^(.+?)\s+(-?[\d.]+)\s+(-?[\d.]+)(?:\s+([\d.]+)\s+([\d.]+))?$")

@@ -25,6 +25,13 @@ TIMES = {
 }
 """Milliseconds of a unit of time by the words in the names of columns."""
 
+_OTHER_UNITS = (
+    *("mm", "cm", "m", "in", "inch", "inches"),
+    *("deg", "degree", "degrees", "visual degrees", "degrees of visual angle", "dva", "°", "rad"),
+    *("min", "mins", "minutes", "h", "hours", "frames", "samples", "%", "percent"),
+)
+"""Units that are known, but not read."""
+
 # How a name ends in a unit: in brackets, perhaps after the frame, or after an underscore.
 _BRACKET = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 _ENDING = re.compile(r"_(px|norm|ms|msec|us|ns)$", re.IGNORECASE)
@@ -33,6 +40,8 @@ _FRAME = re.compile(r"^(mcs|dacs|ucs|hucs|rcs)\s*")
 
 class Column(NamedTuple):
     """A column of a table, and what its name tells: `Fixation point X [MCS px]` has a frame and a unit.
+
+    Words in brackets that are no unit are part of the name, as in `x (screen)`.
 
     Attributes:
         name: as the table has it.
@@ -59,16 +68,17 @@ class Column(NamedTuple):
         Returns:
             The column.
         """
-        plain = name
+        end = _BRACKET.search(name) or _ENDING.search(name)
+        if end is None:
+            return cls(name, key_of(name), "", "")
         frame = ""
-        unit = ""
-        if end := _BRACKET.search(name) or _ENDING.search(name):
-            plain = name[: end.start()]
-            unit = unicodedata.normalize("NFKC", end[1]).lower().strip().removeprefix("in ")  # two signs are micro
-            if prefix := _FRAME.match(unit):
-                frame = prefix[1]
-                unit = unit[prefix.end() :]
-        return cls(name, key_of(plain), frame, unit)
+        unit = unicodedata.normalize("NFKC", end[1]).lower().strip().removeprefix("in ")  # two signs are micro
+        if prefix := _FRAME.match(unit):
+            frame = prefix[1]
+            unit = unit[prefix.end() :]
+        if unit and unit not in (*LENGTHS, *TIMES, *_OTHER_UNITS):
+            return cls(name, key_of(name), "", "")
+        return cls(name, key_of(name[: end.start()]), frame, unit)
 
     @property
     def milliseconds(self) -> float | None:

@@ -40,7 +40,7 @@ def read_table(
     *,
     columns: Mapping[str, str] | None = None,
     size: Size | None = None,
-    units: Units = "pixels",
+    units: Units | None = None,
     origin: Origin = "top left",
 ) -> list[Fixations]:
     r"""Read fixations from a table.
@@ -63,7 +63,8 @@ def read_table(
         source: the file, or a `pandas.DataFrame`.
         columns: names of the columns in the source by the names above, such as `{"x": "FPOGX"}`.
         size: `(width, height)` of the frame, or of each picture by its name, for a table without these columns.
-        units: `pixels`, or `fractions` of the sides of the frame, where the names of the columns have no unit.
+        units: `pixels`, or `fractions` of the sides of the frame; None takes the unit in the names of the columns, else
+            pixels.
         origin: `top left`, `bottom left`, `centre`, or `centre, y up`, as in PsychoPy.
 
     Returns:
@@ -82,7 +83,8 @@ def read_table(
     ...     read_table(path)[0].points.tolist()
     [[40.0, 30.0], [52.5, 31.0]]
     """
-    lookup(units, get_args(Units), "unit")
+    if units is not None:
+        lookup(units, get_args(Units), "unit")
     lookup(origin, get_args(Origin), "origin")
     named = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
     table = table_of(source)
@@ -90,7 +92,10 @@ def read_table(
     theirs = _column_names(table, named)
     _check_columns(table, [theirs[name] for name in needed], needed)
     table.check_different(theirs.values())
-    units = _stated_units(table.name, theirs) or units
+    if size is None:
+        _check_sides(table.name, theirs)
+    if units is None:
+        units = _stated_units(table.name, theirs)
     milliseconds = _stated_milliseconds(table.name, theirs["duration"])
     rows = []
     for row in table.rows:
@@ -105,22 +110,43 @@ def read_table(
 def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
     """Find the names of a table's columns by ours: those that a user gives, else ours, in any case and with a unit."""
     # Reversed, so that the first of several such columns counts.
-    by_key = {Column.of(column).key: column for column in reversed(table.columns)}
+    by_key = {column.key: column for column in map(Column.of, reversed(table.columns))}
     names = {}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
+        similar = by_key.get(name)
         if name in named:
             names[name] = named[name]
+        elif name in table.columns or similar is None or (name in _SIZE and not _may_be_pixels(similar)):
+            names[name] = name
         else:
-            names[name] = name if name in table.columns else by_key.get(name, name)
+            names[name] = similar.name
     return names
 
 
-def _stated_units(table: str, names: Mapping[str, str]) -> Units | None:
-    """Read the unit of points from the names of their columns; None where these have none."""
+def _may_be_pixels(column: Column) -> bool:
+    """Tell whether the name of a column has the unit of pixels, or none."""
+    return not column.unit or LENGTHS.get(column.unit) == "pixels"
+
+
+def _check_sides(table: str, names: Mapping[str, str]) -> None:
+    """Raise `FrameError` for sides of frames whose columns have another unit than pixels in their names."""
+    width, height = (Column.of(names[name]) for name in _SIZE)
+    if not (_may_be_pixels(width) and _may_be_pixels(height)):
+        raise FrameError(
+            f"{table}: expected width and height in px, got the columns {width.name!r} and {height.name!r}; give size="
+        )
+
+
+def _stated_units(table: str, names: Mapping[str, str]) -> Units:
+    """Read the unit of points and boxes from the names of their columns: pixels where those of points have none."""
     x, y = (Column.of(names[name]) for name in ("x", "y"))
     is_read = x.unit == y.unit and (not x.unit or x.unit in LENGTHS)
     check_data(is_read, table, "x and y in px or norm", f"the columns {x.name!r} and {y.name!r}")
-    return LENGTHS.get(x.unit)
+    units = LENGTHS.get(x.unit, "pixels")
+    for edge in (Column.of(names[name]) for name in _EDGES):
+        is_same = not edge.unit or LENGTHS.get(edge.unit) == units
+        check_data(is_same, table, f"a box in {units}, as {x.name!r}", f"the column {edge.name!r}")
+    return units
 
 
 def _stated_milliseconds(table: str, name: str) -> float:

@@ -3,7 +3,7 @@
 import re
 from typing import NamedTuple
 
-from semfov.human.fixations.columns import Row, Table
+from semfov.human.fixations.columns import LOST, Row, Table
 from semfov.human.fixations.programs import Column, key_of
 
 _PAIR = ("location_x", "location_y")  # columns that are made of one of pairs
@@ -18,7 +18,8 @@ def unfolded(table: Table) -> Table:
     """Give each fixation a row, and its place two columns.
 
     Args:
-        table: a column `location` may have pairs `[x, y]`, and each snapshot of glasses columns of its own.
+        table: a column `location` may have pairs `[x, y]`, and each snapshot of glasses columns of its own. Snapshots
+            to which no fixation is mapped do not count.
 
     Returns:
         The table with further columns; that which is given, where it has neither.
@@ -45,6 +46,11 @@ class _Snapshot(NamedTuple):
     name: str
     columns: dict[str, str]
 
+    def has_fixation(self, row: Row) -> bool:
+        """Tell whether a row has the place of a fixation on the snapshot."""
+        texts = [row.fields.get(self.columns.get(key, ""), "") for key in ("fixationx", "fixationy")]
+        return not any(text.lower() in LOST for text in texts)
+
     def row(self, row: Row) -> Row:
         """Write what a row has of the snapshot into the columns of all snapshots."""
         keys = ("fixationx", "fixationy", "eyemovementtype", "eyemovementtypeindex")
@@ -53,13 +59,14 @@ class _Snapshot(NamedTuple):
 
 
 def _with_snapshots(table: Table) -> Table:
-    """Make a row of each row and snapshot, one snapshot after the other, if a table has some."""
+    """Make a row of each row and snapshot, one snapshot after the other, if a table has fixations on some."""
     snapshots: dict[str, _Snapshot] = {}
     for name in table.columns:
         if mapped := _MAPPED.fullmatch(name):
             key, snapshot = mapped.groups()
             snapshots.setdefault(snapshot, _Snapshot(snapshot, {})).columns[key_of(key)] = name
-    if not snapshots:
+    viewed = [snapshot for snapshot in snapshots.values() if any(map(snapshot.has_fixation, table.rows))]
+    if not viewed:
         return table
-    rows = [snapshot.row(row) for snapshot in snapshots.values() for row in table.rows]
+    rows = [snapshot.row(row) for snapshot in viewed for row in table.rows]
     return table._replace(columns=[*table.columns, *_SNAPSHOT], rows=rows)

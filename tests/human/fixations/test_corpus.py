@@ -160,6 +160,14 @@ def test_what_a_program_reports_is_what_is_read(tmp_path, program, end, encoding
     assert records[0].size == size
 
 
+def test_snapshots_without_fixations_leave_those_of_the_scene(tmp_path):
+    unmapped = GLASSES.replace("Fixation\t1\t500\t400", 3 * "\t").replace("Fixation\t1\t30\t40", 3 * "\t")
+    (tmp_path / "a.tsv").write_text(unmapped)
+    (record,) = read_fixations(tmp_path / "a.tsv", size=WIDE)
+    assert (record.picture, record.points.tolist()) == ("v.mp4", [[962, 647], [900, 600]])
+    assert record.durations.tolist() == [300, 200]
+
+
 def test_a_name_that_several_columns_have_counts_only_where_it_is_read(tmp_path):
     (tmp_path / "a.tsv").write_text((LAB + LAB_LINES).replace("AOI hit [a - Face]\n", "Participant name\n"))
     unusable("expected one column of a name, got several named Participant name", read_fixations, tmp_path / "a.tsv")
@@ -204,6 +212,8 @@ ASC = {
     "START\t503\tRIGHT\tSAMPLES\nEFIX R   510\t609\t100\t  5.0\t  5.0\t   1200\n",
     "OpenSesame": "MSG\t200 start_trial 0\nMSG\t201 var image a.png\nSTART\t203\tRIGHT\n" + FIXATION
     + "MSG\t450 stop_trial\nEFIX R   510\t609\t100\t  5.0\t  5.0\t   1200\n",
+    "names without a space": "MSG\t200 TRIALID_1\nMSG\t201 !V TRIAL_VAR image a.png\n" + FIXATION
+    + "MSG\t450 TRIAL_RESULT0\nEFIX R   510\t609\t100\t  5.0\t  5.0\t   1200\nMSG\t700 TRIALID2\n",
     "resolution and two kilohertz": "MSG\t200.5 TRIALID 1\nMSG\t202.0 !V IMGLOAD FILL a.png\n"
     "EFIX R   210.0\t409.5\t200.0\t  512.3\t  384.1\t   1200\t25.1\t25.2\n",
 }  # fmt: skip

@@ -54,6 +54,45 @@ def test_a_frame_other_names_and_a_size(tmp_path):
     refused("unknown column 'Y'", read_table, frame, columns={"Y": "y"})
 
 
+SIDES = {"width": [80], "height": [60]}
+EDGES = ("x1", "y1", "x2", "y2")
+
+
+def row(**columns):
+    """A table of one fixation with further columns, given by their names in the source."""
+    return pandas.DataFrame({"picture": ["a"], "subject": ["1"], **columns})
+
+
+def test_a_unit_that_is_given_counts_more_than_those_in_names():
+    frame = row(**{"x [px]": [0.25], "y [px]": [0.5], **SIDES})
+    for columns in (None, {"x": "x [px]", "y": "y [px]"}):
+        (record,) = read_fixations(frame, columns=columns, units="fractions")
+        assert record.points.tolist() == [[19.5, 29.5]]
+    other = row(**{"x [norm]": [12.0], "y [mm]": [13.0], **SIDES})
+    assert read_table(other, units="pixels")[0].points.tolist() == [[12, 13]]
+
+
+def test_words_in_brackets_that_are_no_units_are_part_of_a_name():
+    frame = row(**{"x (screen)": [12.0], "y (screen)": [13.0], "d (fixation)": [200], **SIDES})
+    names = {"x": "x (screen)", "y": "y (screen)", "duration": "d (fixation)"}
+    for units in (None, "pixels"):
+        (record,) = read_fixations(frame, columns=names, units=units)
+        assert (record.points.tolist(), record.durations.tolist()) == ([[12, 13]], [200])
+    unusable(r"none named x, y among 'picture', 'subject', 'x \(screen\)'", read_table, frame)
+
+
+def test_sides_and_boxes_in_other_units_than_pixels_are_no_pixels():
+    frame = row(x=[12.0], y=[13.0], **{"width (cm)": [52], "height (cm)": [60]})
+    sides = {"width": "width (cm)", "height": "height (cm)"}
+    for columns, said in ((None, "none named width, height among"), (sides, r"got the columns 'width \(cm\)' and")):
+        unusable(f"{said}.*give size=", read_table, frame, columns=columns)
+        assert read_table(frame, columns=columns, size=(80, 60))[0].size == (80, 60)
+    assert read_table(frame.rename(columns=lambda name: name.replace("cm", "px")))[0].size == (52, 60)
+    boxed = row(x=[12.0], y=[13.0], **{f"{edge} (cm)": [5.0 + number] for number, edge in enumerate(EDGES)}, **SIDES)
+    unusable(r"expected a box in pixels, as 'x', got the column 'x1 \(cm\)'", read_table, boxed)
+    assert read_table(boxed.rename(columns=lambda name: name.replace("cm", "px")))[0].box == (5, 6, 7, 8)
+
+
 def test_viewings_are_told_apart_by_their_trial(tmp_path):
     """Also where lines alternate; without a trial the lines of a scanpath follow each other."""
     path = tmp_path / "t.csv"
@@ -234,7 +273,7 @@ def test_people_of_a_column_of_floats_have_whole_numbers():
         ({"columns": {"x": 2}}, "^columns: expected names of the source by ours"),
         ({"size": "80x60"}, r"^size: expected \(width, height\)"),
         ({"size": 80}, r"^size: expected \(width, height\)"),
-        ({"units": None}, "^unknown unit None; known: pixels, fractions"),
+        ({"units": "feet"}, "^unknown unit 'feet'; known: pixels, fractions"),
         ({"sizes": {}}, "^sizes: expected an option of read_table, .* did you mean size="),
         ({"picture": "a.jpg"}, "^picture: expected an option of read_table, .* known: columns, size, units, origin"),
     ],
