@@ -33,7 +33,8 @@ class Cautions(NamedTuple):
         """Say what is known against it, one after the other."""
         width, height = self.size
         if self.blank:
-            yield "this picture has one colour, so the map only says that people look at the middle"
+            said = "how high people look" if self.panorama else "that people look at the middle"
+            yield f"this picture has one colour, so the map only says {said}"
         elif self.unlike:
             yield "this picture is unlike the photographs that the model learned from, so the map may be wrong"
         if self.is_shipped:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from torch import Tensor
 
 from semfov.errors import check
-from semfov.paths.areas import AreasLike, percent
+from semfov.paths.areas import Area, AreasLike, percent, read_areas
 from semfov.paths.gaze import GazePrediction
 
 if TYPE_CHECKING:
@@ -79,19 +79,28 @@ class Drafts:
 
         Args:
             areas: areas in pixels of each draft, as for `GazePrediction.share`. What moves between the drafts has its
-                box in each of them, by the names of the drafts.
+                box in each of them, by the names of the drafts (`names`).
 
         Returns:
             The shares by the name of the area.
 
         Raises:
-            InputError: an area has another form or reaches out of a draft.
+            InputError: an area has another form or reaches out of a draft, or the drafts have other areas.
             DataError: the file cannot be read.
         """
-        first = self.first.share(areas)
-        second = self.second.share(areas)
-        check(first.keys() == second.keys(), "areas", f"the same areas in both drafts: {', '.join(first)}", [*second])
+        in_first, in_second = self.areas(areas)
+        first = self.first.share(in_first)
+        second = self.second.share(in_second)
         return {name: AreaShares(first[name], second[name]) for name in first}
+
+    def areas(self, areas: AreasLike) -> tuple[dict[str, Area], dict[str, Area]]:
+        """Read areas of interest in each draft, as for `shares`, and check that they lie in it."""
+        first, second = (
+            read_areas(areas, draft.size, [name, draft.name, draft.source or draft.name])
+            for draft, name in zip((self.first, self.second), self.names, strict=True)
+        )
+        check(first.keys() == second.keys(), "areas", f"the same areas in both drafts: {', '.join(first)}", [*second])
+        return first, second
 
     def describe(self, areas: AreasLike | None = None) -> str:
         """Describe what differs, in a line for each area.
@@ -146,7 +155,9 @@ class Drafts:
         from semfov.report.gaze import gaze_page_html, gaze_part
         from semfov.report.template import write_html
 
-        parts = [gaze_part(draft, draft.scanpaths(), areas) for draft in (self.first, self.second)]
+        boxes = (None, None) if areas is None else self.areas(areas)
+        drafts = self.first, self.second
+        parts = [gaze_part(draft, draft.scanpaths(), these) for draft, these in zip(drafts, boxes, strict=True)]
         for part, name in zip(parts, self.names, strict=True):
             part["picture"]["name"] = name
         title = "semfov: where people look in two drafts"

@@ -106,7 +106,7 @@ class GazePrediction(OtherWords):
                 pixels; the prediction then knows only what the fovea has shown. None for the sharp picture.
             quality: `quick`, one pass; or `best`, six passes, over windows and a mirror image, too.
             panorama: whether it is a panorama of 360°, whose left and right edge meet. It is looked at in four windows
-                around it (`best`: eight), and no direction is the middle.
+                around it, a strip in more (`best`: twice as many), and no direction is the middle.
 
         Returns:
             The prediction.
@@ -130,8 +130,8 @@ class GazePrediction(OtherWords):
             if seen is None:
                 terms, unlikeness = picture_terms(detector, image, converted, quality=quality, panorama=panorama)
             elif isinstance(looking, Eye):
-                alone = quality == "quick" and not panorama
-                check(alone, "seen", "None for a panorama and for quality='best', which a fovea does not show", "both")
+                for is_asked, asked in ((panorama, "a panorama"), (quality == "best", "quality='best'")):
+                    check(not is_asked, "seen", f"None for {asked}, which a fovea does not show", "fixations")
                 fixations = fixations_of(seen, "seen", size, source)
                 number = len(fixations)
                 terms = converted.terms(_foveal_features(looking, image, fixations, fitted), size[::-1])

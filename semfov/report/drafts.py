@@ -16,14 +16,15 @@ def drafts_section(drafts: Drafts, areas: AreasLike | None = None) -> str:
 
     Args:
         drafts: the drafts.
-        areas: areas of interest, as for `GazePrediction.share`.
+        areas: areas of interest, as for `Drafts.shares`.
 
     Returns:
         HTML.
     """
+    boxes = (None, None) if areas is None else drafts.areas(areas)
     panels = [
-        figure_html(name, plot_gaze(prediction, areas=areas, title=False))
-        for name, prediction in zip(drafts.names, (drafts.first, drafts.second), strict=True)
+        figure_html(name, plot_gaze(prediction, areas=these, title=False))
+        for name, prediction, these in zip(drafts.names, (drafts.first, drafts.second), boxes, strict=True)
     ]
     if drafts.difference is not None:
         caption = f"More fixations in {drafts.names[1]} are orange, fewer are purple"

@@ -27,7 +27,7 @@ def plot_drafts(drafts: Drafts, *, areas: AreasLike | None = None) -> Figure:
 
     Args:
         drafts: the drafts.
-        areas: areas to draw with their shares, as for `GazePrediction.share`.
+        areas: areas to draw with their shares, as for `Drafts.shares`.
 
     Returns:
         The figure.
@@ -36,10 +36,11 @@ def plot_drafts(drafts: Drafts, *, areas: AreasLike | None = None) -> Figure:
     panels = 2 if drafts.difference is None else 3
     height = max(_WIDTH * each.size[1] / each.size[0] for each in predictions) + 0.9
     figure, axes = make_figure(1, panels, width=_WIDTH * panels, height=height, layout="compressed")
-    for ax, prediction, name in zip(axes[:2], predictions, drafts.names, strict=True):
+    boxes = (None, None) if areas is None else drafts.areas(areas)
+    for ax, prediction, name, these in zip(axes[:2], predictions, drafts.names, boxes, strict=True):
         draw_gaze(ax, prediction, prediction.cells)
-        if areas is not None:
-            draw_areas(ax, prediction, areas)
+        if these is not None:
+            draw_areas(ax, prediction, these)
         draw_first_fixations(ax, prediction)
         caution = "" if prediction.caution is None else f"\nCaution: {prediction.caution}"
         ax.set_title("\n".join(fill(line, 64) for line in (name + caution).split("\n")), parse_math=False)

@@ -54,6 +54,19 @@ def test_views_show_every_cell(cells, panorama):
         torch.testing.assert_close(joined(maps, views, cells), torch.ones(cells))
 
 
+@pytest.mark.parametrize("rows", range(1, 36))
+def test_the_windows_around_a_panorama_overlap_all_the_way_round(rows):
+    views = views_of((rows, 52), "quick", panorama=True)
+    most = torch.zeros(52)
+    for view in views:
+        columns = (view.left + torch.arange(view.columns)) % 52
+        most[columns] = most[columns].maximum(torch.tensor(falling(view.columns)))
+    assert float(most.min()) > 0.39  # an end of a window of five columns has 0.4
+    assert {(view.left + 13) % 52 for view in views} == {view.left for view in views}
+    assert len({view.left for view in views}) == len(views)
+    assert joined([torch.ones(3, 4)] * len(views), views, (rows, 52)).eq(1).all()
+
+
 def test_the_mirror_image_has_the_mirrored_map():
     torch.manual_seed(0)
     detector = Shown("colours", ("none",), (80, 60), stride=4).eval()

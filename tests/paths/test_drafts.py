@@ -60,6 +60,18 @@ def test_an_area_that_moves_has_its_box_in_each_draft(drafts):
     refused("areas: expected boxes for after.png", drafts.shares, {"before.png": {"button": LEFT}})
 
 
+def test_boxes_are_taken_by_the_names_by_which_drafts_are_told_apart():
+    """Pictures without a file have the same name, so theirs are counted."""
+    drafts = Drafts(draft(None, 0.4), draft(None, 0.75))
+    areas = {drafts.names[0]: {"button": LEFT}, drafts.names[1]: {"button": RIGHT}}
+    moved = drafts.shares(areas)["button"]
+    assert moved.first == drafts.first.share({"button": LEFT})["button"]
+    assert moved.second == drafts.second.share({"button": RIGHT})["button"]
+    alike = drafts.shares({drafts.first.name: {"button": LEFT}})["button"]
+    assert alike.first == moved.first
+    refused(r"expected boxes for .*\(second\)", drafts.shares, {drafts.names[0]: {"button": LEFT}})
+
+
 def test_drafts_of_one_name_are_told_apart_by_their_folders():
     assert Drafts(draft("a/x.png", 0.4), draft("b/x.png", 0.5)).names == ("a/x.png", "b/x.png")
     assert Drafts(draft("a/x.png", 0.4), draft("b/y.png", 0.5)).names == ("x.png", "y.png")
@@ -76,14 +88,16 @@ def test_drafts_of_other_proportions_have_shares_alone(drafts):
     refused("two pictures of the same proportions", plot_difference, tall)
 
 
-def test_the_figure_and_the_page_have_both_maps_and_what_differs(drafts, tmp_path):
-    figure = drafts.plot(areas={"right": RIGHT})
+def test_the_figure_and_the_page_have_both_maps_and_what_differs(tmp_path):
+    drafts = Drafts(draft("before.png", 0.4), draft("before.png", 0.75))
+    areas = {f"before.png ({number})": {"<right>": RIGHT} for number in ("first", "second")}
+    figure = drafts.plot(areas=areas)
     titles = [axes.get_title() for axes in figure.axes]
-    assert titles[:2] == ["before.png", "after.png"]
+    assert titles[:2] == ["before.png (first)", "before.png (second)"]
     assert titles[2].startswith("35 % of the fixations move")
     texts = [[text.get_text() for text in axes.texts] for axes in figure.axes[:2]]
     assert [each[0].rpartition(" %")[0].rpartition(" ")[2] for each in texts] == ["40", "75"]
-    path = drafts.report(tmp_path / "drafts.html", areas={"<right>": RIGHT})
+    path = drafts.report(tmp_path / "drafts.html", areas=areas)
     page = path.read_text(encoding="utf-8")
     assert "35 % of the fixations move between the drafts" in page
     difference = 100 * drafts.shares({"right": RIGHT})["right"].difference

@@ -140,6 +140,9 @@ def test_proportions_unlike_those_of_the_shipped_fit_have_a_caution(gaze):
         assert said is None or said in caution
         assert replace(gaze, size=size).caution is None
     assert replace(gaze, size=(200, 100), is_shipped=True, panorama=True).caution is None
+    card = replace(gaze, photograph=torch.full((3, 78, 104), 99, dtype=torch.uint8))
+    assert card.caution.endswith("that people look at the middle")
+    assert replace(card, panorama=True).caution.endswith("how high people look")
 
 
 @pytest.mark.parametrize("size", [(60, 80), (18, 24), (10, 400), (100, 50)])
@@ -175,10 +178,24 @@ def test_the_edges_of_a_panorama_meet():
     assert float(steps[0]) <= float(steps[1:].max())
     seen = {"seen": [[3.0, 4.0]], "model": model}
     eye = Eye(Foveation(8.0, growth=1.0), detector, reference=80.0)
-    refused("seen: expected None for a panorama", GazePrediction.of, eye, picture, **seen, panorama=True)
-    refused("seen: expected None for a panorama", GazePrediction.of, eye, picture, **seen, quality="best")
+    refused("seen: expected None for a panorama, which", GazePrediction.of, eye, picture, **seen, panorama=True)
+    refused("seen: expected None for quality='best', which", GazePrediction.of, eye, picture, **seen, quality="best")
     refused("panorama: expected", GazePrediction.of, detector, picture[..., :104], model=model, panorama=True)
     refused("quality", GazePrediction.of, detector, picture, model=model, quality="better")
+
+
+@pytest.mark.parametrize("height", [277, 104, 80, 77, 52, 35, 4])
+def test_a_panorama_of_any_proportions_has_a_density_that_turns_with_it(height):
+    torch.manual_seed(0)
+    detector = Shown("colours", ("none",), (80, 60), stride=4).eval()
+    model = FixationDensity({"backbone8": 3}).eval().requires_grad_(False)
+    picture = rand(3, height, 416).float()
+    before = GazePrediction.of(detector, picture, model=model, panorama=True)
+    turned = GazePrediction.of(detector, picture.roll(104, -1), model=model, panorama=True)
+    assert before.density.isfinite().all()
+    assert float(before.density.sum()) == pytest.approx(1, abs=1e-5)
+    assert before.terms["map"].std() > 0
+    torch.testing.assert_close(turned.density, before.density.roll(104, -1))
 
 
 def test_a_place_at_the_seam_of_a_panorama_is_one_place(gaze):

@@ -16,7 +16,8 @@ from semfov.kinds import Quality
 
 _WHOLE = 0.7  # share of the whole picture in the map, where there are windows, too
 _SIDE = 2 / 3  # side of a window of a photograph, in sides of it
-_RING = 4  # windows around a panorama
+_RING = 4  # the number of windows around a panorama is a multiple, so that a quarter turn of it turns the map
+_OVERLAP = 1.5  # least number of windows around a panorama that show a column, on average
 _PROPORTION = 4 / 3  # width over height of a window of a panorama, that of the pictures of the fit
 _GAIN = {"quick": 1.0, "best": 1.1}  # of the map: the mean of several is flatter than each of them
 _EDGE = 1 / 4  # share of a window's side over which its weight falls to an edge inside the picture
@@ -60,8 +61,8 @@ def views_of(cells: tuple[int, int], quality: Quality, *, panorama: bool = False
 
     A photograph is looked at as a whole, for `best` also in its mirror image and in four windows of two thirds of its
     sides. The windows on the right are mirrored, so that the mirror image of a photograph has the mirrored map. A
-    panorama of 360° is looked at in four windows of 4 : 3 around it, which overlap, so that no place is at the border
-    of all of them, and for `best` also in their mirror images.
+    panorama of 360° is looked at in windows of 4 : 3 around it, four or the multiple of four that a strip needs. They
+    overlap all the way round. For `best` it is also looked at in their mirror images.
 
     Args:
         cells: rows and columns of cells of the picture.
@@ -73,19 +74,23 @@ def views_of(cells: tuple[int, int], quality: Quality, *, panorama: bool = False
 
     >>> [len(views_of((39, 52), quality)) for quality in ("quick", "best")]
     [1, 6]
-    >>> len(views_of((26, 52), "quick", panorama=True))
-    4
+    >>> [len(views_of((rows, 52), "quick", panorama=True)) for rows in (26, 9)]
+    [4, 8]
     """
     rows, columns = cells
-    if panorama:
-        width = min(columns, round(rows * _PROPORTION))
-        views = [PictureView(0, number * columns // _RING, rows, width) for number in range(_RING)]
-    else:
-        views = [PictureView(0, 0, rows, columns)]
+    views = [*_windows_around(rows, columns)] if panorama else [PictureView(0, 0, rows, columns)]
     if quality == "quick":
         return views
     views += [view._replace(mirrored=True) for view in views]
     return views if panorama else [*views, *_windows(rows, columns)]
+
+
+def _windows_around(rows: int, columns: int) -> Iterable[PictureView]:
+    """List the windows around a panorama, at most one from each column."""
+    width = min(columns, round(rows * _PROPORTION))
+    count = min(columns, _RING * math.ceil(_OVERLAP * columns / width / _RING))
+    for number in range(count):
+        yield PictureView(0, number * columns // count, rows, width)
 
 
 def _windows(rows: int, columns: int) -> Iterable[PictureView]:
