@@ -229,19 +229,27 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
 
 def _nearest_options(name: str, known: list[str]) -> str:
     """Suggest the options that others call by this name, or those with a similar name, or list all."""
-    options = meant_options(name, known) or get_close_matches(name, known)
+    options = meant_options(name, known) or get_close_matches(name, known, cutoff=0.7)
     if not options:
         return f"known: {', '.join(known) or 'none'}"
     return f"did you mean {' or '.join(f'{option}=' for option in options)}?"
 
 
-def _rename_former(options: dict[str, object], known: Collection[str]) -> None:
-    """Give options of a call their present names, with a warning for each that has an earlier one."""
+def rename_former(options: dict[str, object], known: Collection[str]) -> None:
+    """Give options of a call their present names, with a warning for each that has an earlier one.
+
+    Args:
+        options: the options of the call of a function, which are changed.
+        known: names of the options that there are.
+
+    Raises:
+        InputError: an option is given by both of its names.
+    """
     for former in FORMER.keys() & options.keys():
         present = FORMER[former]
         if present in known:
             check(present not in options, present, "one value", f"another as {former}, its earlier name")
-            warnings.warn(note_of_former(former, present), FutureWarning, stacklevel=3)
+            warnings.warn(note_of_former(former, present), FutureWarning, stacklevel=3)  # of who calls the function
             options[present] = options.pop(former)
 
 
@@ -251,7 +259,7 @@ def former_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Re
 
     @wraps(function)
     def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
-        _rename_former(options, known)
+        rename_former(options, known)
         return function(*arguments, **options)
 
     return call
@@ -268,7 +276,7 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
 
     @wraps(function)
     def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
-        _rename_former(options, known)
+        rename_former(options, known)
         check_options(options, known, name)
         try:
             form.bind(*arguments, **options)

@@ -17,7 +17,7 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
 OPTIONS = _by_word(
     {
         "score_threshold confirm threshold": "conf conf_thres confidence min_score score threshold",
-        "iou": "iou_thres iou_threshold nms nms_threshold",
+        "iou per_class": "iou iou_thres iou_threshold nms nms_threshold",
         "limit": "max_det max_detections topk",
         "input_size": "image_size img_size imgsz",
         "min_gain": "expected_gain gain min_improvement tol tolerance",
@@ -50,7 +50,7 @@ OPTIONS = _by_word(
 """Options of methods and of the command, several where the word of others can mean each of them."""
 
 FORMER = {"least": "score_threshold", "give_up": "stop_below", "worth": "min_gain", "price": "look_cost"}
-"""Present names of settings by those that they had in earlier versions, which are still taken, with a note."""
+"""Present names of settings by earlier ones, which agents, `semfov.run` and the command take with a note."""
 
 
 def note_of_former(former: str, present: str) -> str:
@@ -80,7 +80,7 @@ _OF_TARGETS = "find_all(picture, target) lists what is there of a class, search(
 _OTHER_METHODS = {("explore", "target"): _OF_TARGETS, ("gaze", "target"): _OF_TARGETS}
 """What to call in place of a method of an agent, by its name and the option that it has not."""
 
-_OF_DETECTORS = ("iou", "limit", "input_size", "device", "weights", "per_class", "classes", "half")
+_OF_DETECTORS = ("iou", "limit", "input_size", "device", "weights", "per_class", "classes")
 """Options that an agent is made with, and not a look."""
 
 _OTHER_PLACES = _by_word(
@@ -96,13 +96,14 @@ _OTHER_PLACES = _by_word(
         "leave it out, as nothing is printed; on_look= is called after each look": "progress quiet verbose",
         "a whole list is looked at by semfov.run(pictures, target, workers=)": "batch_size jobs num_workers workers",
         "color='bgr' says that an array is BGR": "bgr channels",
+        "agent.half() makes numbers of 16 bits of a detector of PyTorch": "float16 fp16 half",
     }
 )
 """What to do in place of an option of a look that others have."""
 
 
 def meant_options(word: str, known: Collection[str]) -> list[str]:
-    """Find the options that a word of others means.
+    """Find the options that a word of others, or an earlier name, means.
 
     Args:
         word: the word.
@@ -111,7 +112,8 @@ def meant_options(word: str, known: Collection[str]) -> list[str]:
     Returns:
         Those of our names that are known; none where the word is not listed.
     """
-    return [option for option in OPTIONS.get(word, "").split() if option in known]
+    meant = FORMER.get(word) or OPTIONS.get(word, "")
+    return [option for option in meant.split() if option in known]
 
 
 def other_method(method: str, option: str, known: Collection[str]) -> str | None:
@@ -190,9 +192,9 @@ LIVE = _by_word(
 
 OBJECTS = _by_word(
     {
-        "semfov.detection.objects, whose boxes are corners: boxes[:, 2:] - boxes[:, :2] are their sizes": "area xywh",
-        "objects.above(score), or objects.of(class)": "filter select where",
-        "leave it out: an object has one box": "nms with_nms with_nmm",
+        "objects.boxes, which are corners: objects.boxes[:, 2:] - objects.boxes[:, :2] are their sizes": "area xywh",
+        "objects.above(score), or objects.of(name)": "filter select where",
+        "the objects as they are, as each has one box already": "nms with_nms with_nmm",
         "record.to_csv(path, 'objects')": "save to_csv write",
         "record.to_frame('objects')": "dataframe df to_dataframe to_df to_frame to_pandas",
         "record.object_rows()": "to_dict to_json tolist",
@@ -231,7 +233,7 @@ RECORD = _by_word(
         "record.rows(), which has the seconds of each look": "speed times timing",
         "record.objects.track_ids, of a stream": "id ids track_id tracker_id",
         "[look.fixation for look in record]": "fixations gaze path saccades scanpath",
-        "record.belief_map(number), of looks by a fovea or a head": "belief heatmap map posterior probabilities",
+        "record.belief_map(-1), of looks by a fovea or a head": "belief heatmap map posterior probabilities",
     }
 )
 
@@ -242,7 +244,7 @@ GAZE_PREDICTION = _by_word(
         "gaze.density": "heatmap map probability saliency saliency_map",
         "gaze.density.log()": "log_density log_probability logits",
         "gaze.scanpaths(people)": "fixations sample sample_scanpaths scanpath",
-        "semfov.metrics.scanpath, which has nss, auc and correlation of a density": "auc cc evaluate nss score",
+        "`from semfov.metrics.scanpath import nss, auc, correlation`": "auc cc evaluate nss score",
     }
 )
 

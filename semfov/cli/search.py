@@ -22,7 +22,7 @@ from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import held_outputs
 from semfov.cli.written import PictureFiles
 from semfov.data.classes import counted
-from semfov.errors import InputError, SemfovError, check, check_options, lookup
+from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
 
@@ -121,6 +121,7 @@ def run(
     names = _names_of(pictures)
     positional = ("pictures", "target", "agent", "quiet", "stream")
     names_of_options = [setting.name for setting in fields(kind) if setting.name not in (*positional, *kind.unused)]
+    rename_former(options, names_of_options)
     check_options(options, names_of_options, f"semfov {task}")
     check(task != "search" or target is not None, "target", "a class to search for; task='find' finds all objects",
           target)  # fmt: skip

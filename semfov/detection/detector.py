@@ -14,7 +14,7 @@ from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
-from semfov.errors import InputError, check, check_pixels, check_whole, devices_here
+from semfov.errors import InputError, check, check_pixels, check_whole, checked_keywords, devices_here
 from semfov.io.state import StatedModule
 
 FAINT = 0.002  # confidence from which on a candidate is a hint, unless the head has another one
@@ -59,6 +59,7 @@ class Detector(StatedModule, ABC):
 
     _setting_names = ("classes",)
 
+    @checked_keywords
     def __init__(
         self,
         name: str,

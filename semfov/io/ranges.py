@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
-from semfov.errors import check
+from semfov.errors import check, check_options
 from semfov.io.schema import excerpt, interval
 
 
@@ -187,6 +187,11 @@ class CheckedSettings:
 
     A class documents its own settings, and inherited ones only where they mean something else.
     """
+
+    def __new__(cls, *_: object, **values: object) -> Self:
+        """Refuse unknown settings, with those that may be meant."""
+        check_options(values, (setting.name for setting in fields(cls)), cls.__name__)
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         """Check all values (`check_settings`)."""

@@ -110,19 +110,23 @@ class Record(Conversion):
         """Return the belief after a look.
 
         Args:
-            number: number of the look.
+            number: place of the look in the record, from 0; negative ones count from the end.
 
         Returns:
             The cells, and the probability `(cells,)` that each of them holds the target, or any object; None for
             windows.
+
+        Raises:
+            InputError: the record has no such look.
         """
+        self._place(number)
         return None
 
     def regions(self, number: int = -1) -> Sequence[Region]:
         """Find the regions of the map of what is where, as an exploration with a fovea makes it.
 
         Args:
-            number: number of the look after which the map is read; -1 is the last.
+            number: place of the look after which the map is read, from 0; negative ones count from the end.
 
         Returns:
             Regions of adjacent cells with the same class, the largest first; none without such a map.

@@ -327,7 +327,7 @@ class HeadPath(Record):
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """Probability of the target, or of any object, in each cell of the scene after a look."""
-        return self.views.world.scene, self.maps[number]
+        return self.views.world.scene, self.maps[self._place(number)]
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
         """Render the views of the head from a picture of the scene in any size."""

@@ -17,7 +17,7 @@ from semfov.data.classes import class_index
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import NO_TRACK, SCORE_THRESHOLD, Objects
-from semfov.errors import check
+from semfov.errors import check, check_whole
 from semfov.kinds import LookKind
 from semfov.observation.matching import box_iou
 from semfov.paths.files import Ending
@@ -113,6 +113,12 @@ class Outcome(ABC):
         remedy = f"; its objects of a class are record.objects.of({index!r})"
         check(not isinstance(index, str), "record", "the place of a look, from 0", f"{index!r}{remedy}")
         return self.looks[index]
+
+    def _place(self, number: int) -> int:
+        """Count a look from the start; refuse one that the record has not."""
+        count = len(self)
+        check_whole(number, "number", -count, count - 1)
+        return number % count
 
     @property
     def passes(self) -> int:

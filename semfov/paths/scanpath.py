@@ -253,12 +253,15 @@ class Scanpath(_CellRecord):
         """Count to the last fixation up to a look, from 0: the index of the tensors of the fixations.
 
         Args:
-            number: number of the look; negative ones count from the end.
+            number: place of the look in the record, from 0; negative ones count from the end.
 
         Returns:
             The number of the fixation.
+
+        Raises:
+            InputError: the record has no such look.
         """
-        return sum(not look.is_closer for look in self.looks[: number % len(self.looks) + 1]) - 1
+        return sum(not look.is_closer for look in self.looks[: self._place(number) + 1]) - 1
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """Probability in each cell after a look: of the target by the belief of the search, or of any object."""
@@ -458,6 +461,7 @@ class FoveaMoment(_CellRecord, Moment):
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """Give the probability of the target, or of any object, in each cell."""
+        self._place(number)
         return self.grid, self.probability
 
     @classmethod

@@ -143,7 +143,7 @@ def _unknown_argument(text: str, options: Iterable[str], help_option: str) -> st
     if option is None:
         return f"unexpected argument {text!r}; put a name with spaces in quotes, and commas in a list"
     names = [name[2:].replace("_", "-") for name in options]
-    matches = get_close_matches(option.lstrip("-").replace("_", "-"), names, n=1, cutoff=0.6)
+    matches = get_close_matches(option.lstrip("-").replace("_", "-"), names, n=1, cutoff=0.7)
     remedy = f"did you mean --{matches[0]}?" if matches else f"{help_option} lists all options"
     return f"unknown option {option}; {remedy}"
 

@@ -90,6 +90,8 @@ WRONG_USE = {
     "search --target cup --conf 0.5": "unknown option --conf; did you mean --confirm?",
     "gaze a.jpg --target cup": "unknown option --target; it is one of `semfov search` and `semfov find`",
     "search --xyz": "unknown option --xyz; --help-all lists all options",
+    "find --iou 0.5": "unknown option --iou; did you mean --per-class?",
+    "find --oat 3": "unknown option --oat; --help-all lists all options",
     "search --target": "--target: expected a value, got none",
     "search --passes many --target cup": "passes: expected a whole number from 1 to 1,000,000, got 'many'",
     "search --target cup --start 5;5": "start: expected a cell as column,row (5,5) or as its number (47), got '5;5'",

@@ -31,6 +31,7 @@ from semfov.errors import SemfovError
 from semfov.gaze.saliency import VOCUS2, IttiKoch
 from semfov.live import LivePerception
 from semfov.paths import GazePrediction, Scanpath, WindowMoment
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence
 from tests import small
 
@@ -340,6 +341,39 @@ def test_earlier_names_of_settings_are_taken_with_a_note(method, former, present
         getattr(agent, method)(*picture, "cup", **{former: -1})
     with pytest.raises(SemfovError, match=f"^{present}: expected one value, got another as {former}"):
         getattr(agent, method)(*picture, "cup", **{former: 0.5, present: 0.5})
+
+
+def test_a_run_takes_earlier_names_and_settings_name_the_present_ones(agent):
+    with (
+        pytest.warns(FutureWarning, match="^least is called score_threshold now") as noted,
+        pytest.raises(SemfovError, match=r"^score_threshold: expected a .*, got -1"),
+    ):
+        semfov.run("a.jpg", "cup", agent=agent, least=-1)
+    assert noted[0].filename == __file__
+    for kind, former, present in [
+        (FindSettings, "least", "score_threshold"), (ExploreSettings, "worth", "min_gain"),
+        (SearchSettings, "give_up", "stop_below"), (StreamSettings, "give_up", "stop_below"),
+    ]:  # fmt: skip
+        said = f"^{former}: expected an option of {kind.__name__}, .* did you mean {present}="
+        with pytest.raises(SemfovError, match=said):
+            kind(**{former: 0.5})
+    with pytest.raises(SemfovError, match=r"^iou: .* did you mean per_class=\?$"):
+        semfov.run("a.jpg", "cup", agent=agent, iou=0.5)
+    with pytest.warns(FutureWarning, match="least is called score_threshold now"):
+        assert small.Fixed(("cup",), least=0.4).score_threshold == 0.4
+
+
+@pytest.mark.parametrize("options", [{"how": "fovea", "shifts": 3}, {"passes": 2}])
+def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
+    record = agent.search(PIXELS, "cup", **options)
+    count = len(record)
+    for number in range(count):
+        first = record.belief_map(number)
+        last = record.belief_map(number - count)
+        assert first is last is None or torch.equal(first[1], last[1])
+    for number in (count, -count - 1, 0.5, None):
+        with pytest.raises(SemfovError, match=f"^number: expected a whole number from -{count} to {count - 1}, got"):
+            record.belief_map(number)
 
 
 @pytest.mark.parametrize(

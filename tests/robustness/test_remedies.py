@@ -1,0 +1,120 @@
+"""Every remedy of the tables of words names what is there: attributes, calls with their options, commands."""
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import fields
+from inspect import Parameter, signature
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+import semfov
+from semfov import ActivePerception, words
+from semfov.cli.commands import SUBCOMMANDS
+from semfov.cli.options import FindOptions
+from semfov.detection.load import loader_options
+from semfov.gaze.saliency import FixationDensity
+from semfov.paths import GazePrediction
+from tests import small
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (30, 44, 3), dtype=np.uint8)
+
+ATTRIBUTES = (
+    words.PACKAGE, words.AGENT, words.DECISION, words.LIVE, words.OBJECTS, words.RECORD, words.GAZE_PREDICTION,
+)  # fmt: skip
+REMEDIES = {
+    *(remedy for table in (*ATTRIBUTES, words._OTHER_PLACES) for remedy in table.values()),
+    *(f"semfov.{call}" for call in words.MAKERS.values()),
+    *(words.other_method("search", option, ()) for option in words._OF_DETECTORS),
+    *(f"agent.{call}" for call in re.findall(r"\w+\(.*?\)", words._OF_TARGETS)),
+}
+
+PASSED_ON = {
+    "recommended": {*signature(ActivePerception.recommended).parameters, *loader_options()},
+    "run": {setting.name for setting in fields(FindOptions)},
+}
+"""Options of calls that pass them on."""
+
+
+@pytest.fixture(scope="module")
+def things():
+    """What the first names of remedies stand for."""
+    agent = small.agent(small.Fixed(("cup", "wine glass")), grid=(4, 3), sigma=10.0, reference=64.0)
+    model = FixationDensity({"backbone8": 3}).eval()
+    record = agent.search(PIXELS, "cup", how="fovea", shifts=1)
+    return {
+        "semfov": semfov,
+        "agent": agent,
+        "record": record,
+        "objects": record.objects,
+        "decision": record.decision,
+        "look": record[0],
+        "live": agent.live("cup"),
+        "gaze": GazePrediction(model, {"map": torch.zeros(1, 39, 52)}, (104, 78), torch.zeros(3, 78, 104)),
+    }
+
+
+def expressions(remedy: str, names: object) -> Iterator[ast.expr]:
+    """Each expression of a remedy that begins with one of the names; a missing value is an ellipsis."""
+    brackets = r"\((?:[^()]|\([^()]*\))*\)|\[[^\]]*\]"
+    for match in re.finditer(rf"(?<![\w.`])(?:{'|'.join(names)})(?:\.\w+|{brackets})+", remedy):
+        yield ast.parse(re.sub(r"=…?(?=[,)])", "=...", match[0]), mode="eval").body
+
+
+def value_of(code: ast.expr, things: dict[str, object]) -> object:
+    """What an expression stands for; of a call, whose arguments are checked alone, what it is known to return."""
+    if isinstance(code, ast.Name):
+        return things[code.id]
+    if isinstance(code, ast.Attribute):
+        return getattr(value_of(code.value, things), code.attr)
+    if isinstance(code, ast.Subscript):
+        return eval(ast.unparse(code), things)
+    assert isinstance(code, ast.Call)
+    function = value_of(code.func, things)
+    name = ast.unparse(code.func).rpartition(".")[2]
+    options = {keyword.arg for keyword in code.keywords}
+    if not str(getattr(function, "__module__", None)).startswith("semfov"):  # of tensors and figures
+        return callable(function)
+    form = signature(function)
+    form.bind(*code.args, **dict.fromkeys(options))
+    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in form.parameters.values()):
+        assert options <= PASSED_ON.get(name, set())
+    known = {"recommended": things["agent"], "live": things["live"], "find_all": things["record"], "plot": Figure}
+    return known.get(name)
+
+
+@pytest.mark.parametrize("remedy", sorted(REMEDIES))
+def test_what_a_remedy_names_is_there(remedy, things):
+    for statement in re.findall(r"`(from [\w.]+ import .*?)`", remedy):
+        exec(statement, {})
+    for code in expressions(remedy, things):
+        value_of(code, things)
+    assert {*re.findall(r"`semfov (\w+)", remedy)} <= {*SUBCOMMANDS}
+
+
+def test_remedies_are_read():
+    """So that the test above cannot pass because nothing is found in them."""
+    roots = ("semfov", "agent", "record", "objects", "decision", "look", "live", "gaze")
+    silent = [remedy for remedy in REMEDIES if "`" not in remedy and not [*expressions(remedy, roots)]]
+    assert len(silent) < 10 < len(REMEDIES) - 50
+
+
+def test_methods_of_the_record_are_there(things):
+    named = [word for word, remedy in words.OBJECTS.items() if remedy == "the method of the record"]
+    assert named
+    assert [name for name in named if not callable(getattr(things["record"], name))] == []
+
+
+def test_sizes_of_objects_are_those_that_the_remedy_computes():
+    code = words.OBJECTS["xywh"].rpartition(": ")[2].removesuffix(" are their sizes")
+    objects = small.agent(small.Fixed(("cup",)), grid=(4, 3), sigma=10.0).find_all(PIXELS, "cup").candidates
+    for (x1, y1, x2, y2), (width, height) in zip(objects.boxes.tolist(), eval(code, {"objects": objects}), strict=True):
+        assert (float(width), float(height)) == pytest.approx((x2 - x1, y2 - y1))
+
+
+def test_remedies_of_attributes_complete_the_sentence():
+    """They follow the word "use"."""
+    assert [remedy for table in ATTRIBUTES for remedy in table.values() if re.match(r"leave|use|is\b", remedy)] == []
