@@ -53,6 +53,11 @@ FORMER = {"least": "score_threshold", "give_up": "stop_below", "worth": "min_gai
 """Present names of settings by earlier ones, which agents, `semfov.run` and the command take with a note."""
 
 
+def dashed(setting: str) -> str:
+    """Write the name of a setting as the option of a command, without its two dashes: `try_` is try."""
+    return setting.rstrip("_").replace("_", "-")
+
+
 def note_of_former(former: str, present: str) -> str:
     """Say that a setting has another name now."""
     return f"{former} is called {present} now; the earlier name will go"

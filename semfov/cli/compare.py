@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from itertools import takewhile
 
 from tqdm import tqdm
 
@@ -32,12 +33,13 @@ def compare(options: CompareOptions) -> int:
         options: the options of the command.
 
     Returns:
-        The exit code, 1 if a picture was left out.
+        The exit code, 1 if a picture was left out; where all were, nothing is written.
     """
     check_writable(options.out, folder=True)
     check(bool(options.with_), "with", "sahi, ranked, or both", "none")
     has_reference = options.annotations is not None or "sahi" in options.with_
-    check(has_reference, "with", "sahi, whose objects stand for the truth where there are no annotations", "ranked")
+    remedies = "--with sahi,ranked, where what all slices list stands for the truth, or --annotations FILE"
+    check(has_reference, "with", remedies, "ranked alone")
     truth = None if options.annotations is None else Truth(options.annotations)
     # What is wrong with the classes and the pictures is said before the agent is loaded.
     several_classes(options.target, detector_classes(options))
@@ -64,6 +66,9 @@ def compare(options: CompareOptions) -> int:
                 raise
             print(f"skipped {source.name}: {error}", file=sys.stderr)
             skipped += 1
+    if scores.pictures == 0:
+        print("error: no picture could be looked at, so there is nothing to compare or write", file=sys.stderr)
+        return 1
     points = scores.points()
     about = f"{scores.pictures} picture{'s' if scores.pictures != 1 else ''}, {', '.join(targets or ['all classes'])}"
     sentences = [
@@ -93,7 +98,7 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
     """Say in a sentence or two how semfov compares with all slices.
 
     Args:
-        points: the points of all ways.
+        points: the points of all ways, with some of semfov, each way in the order of its passes.
         is_truth: whether the reference is annotated.
 
     Returns:
@@ -103,23 +108,28 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
     slices = next((point for point in points if point.way == ALL_SLICES), None)
     last = ours[-1]
     if slices is None:
-        return [f"After {last.passes:.3g} passes semfov has {_precision(last)} in {last.seconds:.2f} s."]
+        return [f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s."]
     share = last.seconds / slices.seconds
     if not is_truth:
         found = f"{last.right} of the {last.reference} objects that all slices list"
         return [
-            f"After {last.passes:.3g} passes semfov lists {found}, in {share:.2f} of their time, and "
+            f"After {_passes(last)} semfov lists {found}, in {share:.2f} of their time, and "
             f"{last.listed - last.right} others.",
             "All slices stand for the truth here, though they miss and invent objects, too: give --annotations FILE.",
         ]
     sentence = (
-        f"After {last.passes:.3g} passes semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "
-        f"{_precision(slices)} in {slices.seconds:.2f} s ({slices.passes:.3g} passes)."
+        f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "
+        f"{_precision(slices)} in {slices.seconds:.2f} s ({_passes(slices)})."
     )
-    level = next((point for point in ours if (point.ap50 or 0) >= (slices.ap50 or 0) > 0), None)
-    if level is None:
+    level = [*takewhile(lambda point: (point.ap50 or 0) >= (slices.ap50 or 0) > 0, reversed(ours))]
+    if not level:
         return [sentence]
-    return [sentence, f"It is level with them from {level.passes:.3g} passes and {level.seconds:.2f} s on."]
+    return [sentence, f"It is level with them from {_passes(level[-1])} and {level[-1].seconds:.2f} s on."]
+
+
+def _passes(point: Point) -> str:
+    number = f"{point.passes:.3g}"
+    return f"{number} pass" if number == "1" else f"{number} passes"
 
 
 def _precision(point: Point) -> str:

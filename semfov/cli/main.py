@@ -16,7 +16,7 @@ from typing import Any
 
 from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
-from semfov.words import COMMANDS, FORMER, OPTIONS, meant_options, note_of_former
+from semfov.words import COMMANDS, FORMER, OPTIONS, dashed, meant_options, note_of_former
 
 _LOOKING = tuple(name for name, command in SUBCOMMANDS.items() if command.looking)
 """Subcommands that look at pictures or frames."""
@@ -123,7 +123,7 @@ def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
     cases = []
     lines = []
     for command, names in options.items():
-        words = [name.replace("_", "-") for name in names]
+        words = [dashed(name) for name in names]
         cases.append(f'    {command}) words="{" ".join(f"--{word}" for word in words)}";;')
         lines += [f'complete -c semfov -n "__fish_seen_subcommand_from {command}" -l {word}' for word in words]
     start = "autoload -Uz compinit bashcompinit && compinit && bashcompinit\n" if shell == "zsh" else ""
@@ -167,9 +167,9 @@ def _with_present_names(command: str, words: Sequence[str]) -> list[str]:
         option, equals, value = word.partition("=")
         present = FORMER.get(option.removeprefix("--").replace("-", "_"), "")
         if option.startswith("--") and present in known:
-            dashed = f"--{present.replace('_', '-')}"
-            print(f"note: {note_of_former(option, dashed)}", file=sys.stderr)
-            word = dashed + equals + value
+            present_option = f"--{dashed(present)}"
+            print(f"note: {note_of_former(option, present_option)}", file=sys.stderr)
+            word = present_option + equals + value
         renamed.append(word)
     return renamed
 
@@ -200,13 +200,13 @@ def _refusal(command: str, option: str) -> str | None:
         return f"unknown option --{option}; the {singular} has no option before it: {usage}"
     if command not in (*_LOOKING, "gaze") or not is_unknown:
         return None
-    dashed = option.replace("_", "-")
+    written = dashed(option)
     meant = next(iter(meant_options(option, names[command])), None)
     if meant is not None:
-        return f"unknown option --{dashed}; did you mean --{meant.replace('_', '-')}?"
+        return f"unknown option --{written}; did you mean --{dashed(meant)}?"
     having = [name for name in _LOOKING if option in names[name]]
     if having:
-        return f"unknown option --{dashed}; it is one of `semfov {'` and `semfov '.join(having)}`"
+        return f"unknown option --{written}; it is one of `semfov {'` and `semfov '.join(having)}`"
     return None
 
 
@@ -234,7 +234,7 @@ def _in_command_words(message: str, options: Iterable[str]) -> str:
 
     def option(match: re.Match[str]) -> str:
         value = (match[2] or "").strip("'\"").removeprefix("True")
-        return f"--{by_name[match[1]].replace('_', '-')}{' ' if value else ''}{value}"
+        return f"--{dashed(by_name[match[1]])}{' ' if value else ''}{value}"
 
     # Settings of other programs stay as they are.
     return re.sub(rf"(?<![\w.-])(?<!yolo export )({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)

@@ -1,6 +1,7 @@
 """Arguments of a command line as users write them: brought into the parser's form, or refused in one line."""
 
 import re
+import sys
 from collections import deque
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import fields
@@ -10,8 +11,12 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Literal, Union, get_args, get_origin, get_type_hints
 
+import yaml
+
 from semfov.errors import check
 from semfov.io.ranges import NOUNS, CheckedSettings, Form
+from semfov.runs.settings import load_yaml
+from semfov.words import FORMER, dashed, note_of_former
 
 _FLAGS = ("true", "false", "yes", "no", "True", "False")
 """Words that may follow a flag as its value."""
@@ -43,7 +48,7 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
             return [*usual, word, *words]
         # Everything else is left to the parser, with its messages.
         name, has_value, text = word.partition("=")
-        option = _in_python(name)
+        option = f"--{_in_python(name[2:])}"
         if not word.startswith("--") or option not in options:
             usual.append(word)
             continue
@@ -54,7 +59,7 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
         if hint is Path:
             # As `--out "$FOLDER"` is where the variable is not set; it would be the present folder.
             following = words[0] if value is None and words else value
-            check(following != "", setting, "the name of a file or folder", "an empty one")
+            check(following != "", setting.rstrip("_"), "the name of a file or folder", "an empty one")
         if value is not None:
             option = f"{option}={_in_brackets(hint, value)}"
         usual.append(option)
@@ -63,8 +68,41 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
 
 def _in_python(name: str) -> str:
     """Write the name of an option with underscores, and as its setting is called where Python has the word itself."""
-    option = "--" + name[2:].replace("-", "_")
-    return f"{option}_" if iskeyword(option[2:]) else option  # --try is `try_`
+    setting = name.replace("-", "_")
+    return f"{setting}_" if iskeyword(setting) else setting  # --try is `try_`
+
+
+def in_present_names(text: str, config: type[CheckedSettings]) -> str:
+    """Give the settings of a file the names that they have in Python.
+
+    Args:
+        text: YAML, with names of options, present or earlier ones; an earlier one is noted in standard error.
+        config: dataclass of the settings.
+
+    Returns:
+        YAML with names of settings. Names that are not known stay as they are, and what is no YAML.
+
+    Raises:
+        InputError: the file has a setting twice.
+    """
+    try:
+        values = load_yaml(text)
+    except (yaml.YAMLError, ValueError):  # ValueError: a date that there is not
+        return text
+    if not isinstance(values, dict):
+        return text
+    known = setting_types(config)
+    renamed: dict[str, object] = {}
+    for name, value in ((str(key), value) for key, value in values.items()):
+        setting = _in_python(name)
+        present = FORMER.get(setting, setting)
+        if present in known and setting not in known:
+            print(f"note: {note_of_former(name, present)}", file=sys.stderr)
+            setting = present
+        key = setting if setting in known else name
+        check(key not in renamed, key.rstrip("_"), "once", f"it again as {name!r}")
+        renamed[key] = value
+    return text if renamed.keys() == values.keys() else yaml.safe_dump(renamed, sort_keys=False)
 
 
 def _check_given_once(option: str, hint: object, before: Iterable[str]) -> None:
@@ -73,7 +111,7 @@ def _check_given_once(option: str, hint: object, before: Iterable[str]) -> None:
         return
     given_before = any(word.partition("=")[0] == option for word in before)
     remedy = "; where it takes several, as a,b" if hint is str or _is_list(hint) else ""
-    check(not given_before, option.removeprefix("--"), "once", f"it again{remedy}")
+    check(not given_before, option.removeprefix("--").rstrip("_"), "once", f"it again{remedy}")
 
 
 def _value_after(hint: object, words: deque[str]) -> str | None:
@@ -124,7 +162,7 @@ def mistake(message: str, config: type[CheckedSettings], options: Iterable[str],
         return _unknown_argument(unknown[1], options, help_option)
     missing = re.match(r"argument (--\S+): expected one argument", message)
     if missing:
-        return f"{missing[1].replace('_', '-')}: expected a value, got none"
+        return f"--{dashed(missing[1][2:])}: expected a value, got none"
     setting = re.search(r'Parser key "([\w.]+)"', message)
     got = re.search(r"(?:Given|Got) value: (.*)", message)
     hint = setting_types(config).get(setting[1]) if setting else None
@@ -142,8 +180,8 @@ def _unknown_argument(text: str, options: Iterable[str], help_option: str) -> st
     option = next((word.partition("=")[0] for word in text.split() if word.startswith("-")), None)
     if option is None:
         return f"unexpected argument {text!r}; put a name with spaces in quotes, and commas in a list"
-    names = [name[2:].replace("_", "-") for name in options]
-    matches = get_close_matches(option.lstrip("-").replace("_", "-"), names, n=1, cutoff=0.7)
+    names = [dashed(name[2:]) for name in options]
+    matches = get_close_matches(dashed(option.lstrip("-")), names, n=1, cutoff=0.7)
     remedy = f"did you mean --{matches[0]}?" if matches else f"{help_option} lists all options"
     return f"unknown option {option}; {remedy}"
 

@@ -13,16 +13,16 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn, TypeVar, get_origin
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, get_origin
 
 from semfov.errors import InputError, SemfovError
 from semfov.io.files import discard_unfinished
 from semfov.io.ranges import check_settings
-from semfov.runs.arguments import mistake, setting_types, usual_form
+from semfov.runs.arguments import in_present_names, mistake, setting_types, usual_form
 from semfov.runs.settings import Settings, load_yaml
 
 if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser
+    from jsonargparse import ArgumentParser, Namespace
 
 _Config = TypeVar("_Config", bound=Settings)
 
@@ -66,7 +66,18 @@ def make_parser(
             return _with_readable_types(super()._expand_help(action))
 
     class Parser(ArgumentParser):
-        """A parser that reports wrong arguments in one line."""
+        """A parser that reports wrong arguments in one line, and whose files have the names of options."""
+
+        def parse_string(self, content: str, *arguments: Any, **options: Any) -> Namespace:
+            try:
+                content = in_present_names(content, config)
+            except InputError as error:
+                self.error(str(error), error)
+            return super().parse_string(content, *arguments, **options)
+
+        def dump(self, namespace: Namespace, *arguments: Any, **options: Any) -> str:
+            # What stands at the start of a line is a name: texts of several lines are indented.
+            return re.sub(r"^(\w+)_:", r"\1:", super().dump(namespace, *arguments, **options), flags=re.M)
 
         def error(self, message: str, ex: Exception | None = None) -> NoReturn:
             if not self.exit_on_error:  # a parser of nested settings, whose error the outer parser tells

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from semfov.cli import compare as command
+from semfov.cli.rivals import Point
 from semfov.zoom.lattice import Lattice
 
 SQUARES = {"a": [(1000, 700), (100, 300)], "b": [(600, 420)]}
@@ -104,7 +105,7 @@ def test_without_annotations_all_slices_are_the_truth(compare, tmp_path):
 
 def test_what_cannot_be_compared_is_refused(compare, truth, tmp_path):
     for options, words in (
-        (("--with", "ranked"), "with: expected sahi, whose objects stand for the truth"),
+        (("--with", "ranked"), "or --annotations FILE, got ranked alone"),
         (("--with", "none"), "with: expected sahi, ranked, or both, got none"),
         (("--passes", 0), "passes: expected a whole number from 1"),
     ):
@@ -117,6 +118,36 @@ def test_what_cannot_be_compared_is_refused(compare, truth, tmp_path):
     assert code == 1
     assert "skipped" in printed.err
     assert points["all slices"][0]["reference"] == "3"
+
+
+def test_where_every_picture_is_skipped_nothing_is_written(compare, truth, tmp_path):
+    for name in SQUARES:
+        (tmp_path / "pictures" / f"{name}.png").rename(tmp_path / "pictures" / f"other-{name}.png")
+    code, printed, points = compare("--annotations", truth, "--passes", 1)
+    assert code == 1
+    assert printed.err.count("skipped") == 2
+    assert "no picture could be looked at" in printed.err
+    assert (printed.out, points) == ("", {})
+    assert not list((tmp_path / "out").glob("*"))
+
+
+@pytest.mark.parametrize(
+    ("precisions", "told"),
+    [
+        ((0.6, 0.4, 0.5, 0.7), "from 3 passes and 3.00 s on"),
+        ((0.5, 0.6), "from 1 pass and 1.00 s on"),
+        ((0.6, 0.4), None),
+        ((None, 0.5), "from 2 passes and 2.00 s on"),
+    ],
+)
+def test_it_is_level_from_where_no_later_point_falls_below(precisions, told):
+    ours = [
+        Point("semfov", float(number), float(number), precision, 3, 3, 3)
+        for number, precision in enumerate(precisions, start=1)
+    ]
+    sentences = command.conclusion([*ours, Point("all slices", 9.0, 9.0, 0.5, 3, 3, 3)], is_truth=True)
+    level = [sentence for sentence in sentences if "level" in sentence]
+    assert level == ([] if told is None else [f"It is level with them {told}."])
 
 
 def test_a_slice_as_large_as_the_picture_repeats_no_look(agent):

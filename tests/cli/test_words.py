@@ -78,6 +78,8 @@ WRONG_USE = {
     "detect a.jpg": "unknown command 'detect'; did you mean 'find'?",
     "saliency a.jpg": "unknown command 'saliency'; did you mean 'gaze'?",
     "compare . --with slicing": "with: expected some of 'sahi', 'ranked', got 'slicing'",
+    "compare . --worth 0.2": "unknown option --worth; did you mean --with?",
+    "compare . --with": "--with: expected a value, got none",
     "serch a.jpg": "unknown command 'serch'; did you mean 'search'?",
     "count a.jpg": "unknown command 'count'; did you mean 'find'?",
     "--target cup": "expected a command before --target: search, find",
@@ -188,6 +190,35 @@ def test_earlier_names_of_options_are_taken_with_a_note(command, former, present
         printed = capsys.readouterr()
         assert f"{present[2:].replace('-', '_')}: 0.25" in printed.out
         assert printed.err == f"note: {former} is called {present} now; the earlier name will go\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "text", "printed", "note"),
+    [
+        ("find", "least: 0.9", "score_threshold: 0.9", "least is called score_threshold now"),
+        ("search", "give_up: 0.25\ntarget: cup", "stop_below: 0.25", "give_up is called stop_below now"),
+        ("search", "stop-below: 0.25", "stop_below: 0.25", ""),
+        ("compare", "with: [ranked]", "with:\n- ranked", ""),
+        ("compare", "with_: [ranked]", "with:\n- ranked", ""),
+    ],
+)
+def test_files_of_settings_have_names_of_options_and_earlier_ones(command, text, printed, note, tmp_path, capsys):
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--config", str(tmp_path / "settings.yaml"), "--print-config"])
+    assert stopped.value.code == 0
+    told = capsys.readouterr()
+    assert printed in told.out
+    assert told.err == (f"note: {note}; the earlier name will go\n" if note else "")
+
+
+@pytest.mark.parametrize("text", ["least: 0.9\nscore_threshold: 0.3", "score-threshold: 0.9\nscore_threshold: 0.3"])
+def test_a_file_that_has_a_setting_by_two_names_is_refused(text, tmp_path, capsys):
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(SystemExit) as stopped:
+        main(["find", "--config", str(tmp_path / "settings.yaml")])
+    assert stopped.value.code == 2
+    assert "error: score_threshold: expected once, got it again as 'score_threshold'" in capsys.readouterr().err
 
 
 def test_detectors_are_listed_with_licence_and_models(capsys):
