@@ -78,7 +78,7 @@ WRONG_USE = {
     "detect a.jpg": "unknown command 'detect'; did you mean 'find'?",
     "saliency a.jpg": "unknown command 'saliency'; did you mean 'gaze'?",
     "compare . --with slicing": "with: expected some of 'sahi', 'ranked', got 'slicing'",
-    "compare . --worth 0.2": "unknown option --worth; did you mean --with?",
+    "compare . --wth sahi": "unknown option --wth; did you mean --with?",
     "compare . --with": "--with: expected a value, got none",
     "serch a.jpg": "unknown command 'serch'; did you mean 'search'?",
     "count a.jpg": "unknown command 'count'; did you mean 'find'?",
