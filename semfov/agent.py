@@ -416,7 +416,7 @@ class ActivePerception(nn.Module):
         """Find all objects of a class, of several or of all classes (`record.objects`, `record.expected`).
 
         The first look is the whole picture. Each other look is a window at the magnification with the largest expected
-        number of new objects. A picture that fits the detector's input needs few more looks than the first.
+        number of new objects. A photograph is looked at wholly, in few more looks than the first.
 
         Args:
             picture: as for `search`.

@@ -189,7 +189,8 @@ class FindSettings(LookSettings):
 
     Args:
         min_gain: least expected gain of another look; below it the episode ends. For windows it counts new objects
-            (None: 0.01), for a head cells that are newly classified right (None: 0).
+            (None: 0.01), for a head cells that are newly classified right (None: 0). A photograph is looked at wholly
+            by windows, whatever it is.
         score_threshold: score from which on an object is listed; in windows its probability, or its score in the whole
             picture (None: 0.5 there).
         batch: number of windows that are chosen jointly and pass the detector together.
@@ -213,7 +214,7 @@ class ExploreSettings(LookSettings, StartSettings):
     Args:
         min_gain: least expected gain of another look; below it the episode ends. For a fovea with a learned map it
             counts cells that are newly classified right (None: 0.1), for a head likewise (None: 0), for windows new
-            objects (None: 0.01). 0 makes all looks.
+            objects (None: 0.01). 0 makes all looks. A photograph is looked at wholly by windows, whatever it is.
         score_threshold: score from which on an object is listed; in windows its probability, or its score in the whole
             picture (None: 0.5 there).
         policy: `people` moves a fovea as people move their gaze (`semfov.gaze.Viewer`); None as the agent does.

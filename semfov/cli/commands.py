@@ -110,7 +110,7 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
   --target CLASSES     a class, or several with commas (default: all classes)
 {_AGENT}
 {_LOOKS}
-  --min-gain N         stop when the next look is expected to show fewer new objects than this (default 0.01)
+  --min-gain N         in a large picture stop when the next look should show fewer new objects than this (default 0.01)
   --score-threshold P  objects are listed from this probability on, without fitted models from this score (default 0.5)
   --batch N            windows that are looked at together
 {_OUTPUT}
@@ -137,8 +137,8 @@ usage: semfov explore [PICTURE ...] [options]
   PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
 {_AGENT}
 {_LOOKS}
-  --min-gain N         stop when the next look is expected to show fewer new objects than this, or with a fovea to
-                       classify fewer more cells right (default 0.01 and 0.1)
+  --min-gain N         in a large picture stop when the next look should show fewer new objects than this, with a
+                       fovea when it should classify fewer more cells right (default 0.01 and 0.1)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,

@@ -14,7 +14,7 @@ from semfov.envs.environment import EpisodeEnv, GazeExplore, GazeSearch, ZoomEnv
 from semfov.envs.gazes import Arrays
 from semfov.envs.scenery import ZoomScenery, open_zoom_scenery, scenery_or_open
 from semfov.envs.vector import GazeVectorEnv
-from semfov.errors import lookup
+from semfov.errors import lookup, rename_former
 from semfov.gaze.acquisition.base import Task
 
 _IDS: dict[Task, str] = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}
@@ -67,6 +67,7 @@ def _make_zoom_vector(
 ) -> _Vectors:
     """Make single environments with shared looks, since a belief about windows is about one picture."""
     names = signature(ZoomEnv).parameters.keys()
+    rename_former(options, names)
     env_options = {name: option for name, option in options.items() if name in names}
     scenery_options = {name: option for name, option in options.items() if name not in names}
     scenery = scenery_or_open(scenery, open_zoom_scenery, scenery_options)

@@ -95,7 +95,7 @@ class WindowGaze(Gazes[_WindowEpisode]):
 
     def action(self, action: object) -> Tensor:
         try:
-            given = np.asarray(action)
+            given = np.asarray(action.detach().cpu() if isinstance(action, Tensor) else action)
         except (ValueError, TypeError):  # it has no numbers in a row
             given = np.empty(0)
         place = given.astype(np.float64) if given.dtype.kind in "iuf" else np.empty(0)

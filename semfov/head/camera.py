@@ -1,7 +1,6 @@
 """Cameras that turn: the protocol that a camera of your own implements, and the scene around it."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias, cast
 
@@ -12,7 +11,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture, resized
 from semfov.errors import DataError, InputError, check, check_number
-from semfov.head.scenes import Flat, Panorama, Sphere, World, check_degrees, check_fields
+from semfov.head.scenes import Flat, Panorama, Sphere, World, check_fields, check_limits
 from semfov.head.speeds import Speeds
 from semfov.sensor.sphere import Camera, panorama_directions
 
@@ -98,8 +97,7 @@ class _CameraScene(Sphere):
         check(not missing, "camera", f"a camera with {', '.join(names)}", got)
         fields = check_fields(camera.fields)
         for name, limits in (("pan", camera.pan), ("tilt", camera.tilt)):
-            check(isinstance(limits, Sequence) and len(limits) == 2, name, "a pair of limits in degrees", limits)
-            check_degrees(name, limits)
+            check_limits(name, limits)
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
         super().__init__(
             (width, width // 2), camera.size, pan=camera.pan, tilt=camera.tilt, fields=fields, speeds=camera.speeds

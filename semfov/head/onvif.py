@@ -18,12 +18,13 @@ from xml.sax.saxutils import escape
 from semfov.data.inputs import ImageLike
 from semfov.errors import DataError, check, check_number
 from semfov.head.camera import CameraFrame, PanTiltCamera
-from semfov.head.scenes import check_degrees, check_fields
+from semfov.head.scenes import check_fields, check_limits
 from semfov.head.speeds import Speeds
 
 _MOST_BYTES = 1 << 20  # of an answer
 _POLL = 0.05  # seconds between two questions whether the camera has arrived
 _NEAR = 0.01  # largest distance from the goal, in the units of ONVIF, at which a camera that says nothing has arrived
+_OTHER_CENTURY = timedelta(days=36525)  # from here on the clock of a camera, which may begin in 1970, says nothing
 _SECURITY = "http://docs.oasis-open.org/wss/2004/01/oasis-200401-wss-"
 _DEVICE = "http://www.onvif.org/ver10/device/wsdl"
 _MEDIA = "http://www.onvif.org/ver10/media/wsdl"
@@ -144,8 +145,8 @@ class OnvifClient:
     def _clock_difference(self) -> timedelta:
         """Ask how far the camera's clock is ahead of ours: it refuses a digest that is minutes old, or of the future.
 
-        Every camera tells its time without a user (ONVIF Core, `GetSystemDateAndTime`); one that does not is taken to
-        have ours.
+        Every camera tells its time without a user (ONVIF Core, `GetSystemDateAndTime`); one that does not, or is
+        a century away, is taken to have ours.
         """
         try:
             answer = self._send(self.address, "", f'<GetSystemDateAndTime xmlns="{_DEVICE}"/>')
@@ -155,9 +156,10 @@ class OnvifClient:
             names = ("Date/Year", "Date/Month", "Date/Day", "Time/Hour", "Time/Minute", "Time/Second")
             paths = ["/".join(f"{{{_TYPES}}}{part}" for part in name.split("/")) for name in names]
             year, month, day, hour, minute, second = (int(moment.findtext(path, "")) for path in paths)
-            return datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC) - datetime.now(UTC)
+            ahead = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC) - datetime.now(UTC)
         except (DataError, ValueError, OverflowError):
             return timedelta()
+        return ahead if abs(ahead) < _OTHER_CENTURY else timedelta()
 
     def _credentials(self, user: str) -> str:
         """Make the header that names a user, with a digest of the password for this message alone."""
@@ -249,8 +251,8 @@ class OnvifCamera(PanTiltCamera):
         check(callable(frame), "frame", "a function that gives the newest frame", type(frame).__name__)
         check_number(patience, "patience", 0, 1e6)
         for name, limits in (("pan", pan), ("tilt", tilt)):
+            check_limits(name, limits)
             check(limits[0] < limits[1], name, "two different limits in degrees, the lower one first", limits)
-            check_degrees(name, limits)
         self.client = client
         self.frame = frame
         self.size = size

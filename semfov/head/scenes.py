@@ -6,6 +6,7 @@ Panoramas lie around the viewer, and large pictures in front of it.
 import math
 import warnings
 from collections.abc import Sequence
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -52,6 +53,22 @@ def check_degrees(name: str, angles: Sequence[float]) -> None:
     if largest <= 1:
         unit = "numbers from -1 to 1, as ONVIF has them; multiply them by the camera's largest angles"
     check(largest == 0 or largest > _RADIANS[name], name, "degrees", f"{angles}, which look like {unit}")
+
+
+def check_limits(name: str, limits: Sequence[float]) -> None:
+    """Check that the limits of a camera are a pair of angles in degrees.
+
+    Args:
+        name: `pan` or `tilt`.
+        limits: the lower and the upper one.
+
+    Raises:
+        InputError: they are not.
+    """
+    is_pair = isinstance(limits, Sequence) and len(limits) == 2
+    are_numbers = is_pair and all(isinstance(limit, Real) and math.isfinite(limit) for limit in limits)
+    check(are_numbers, name, "a pair of limits in degrees", limits)
+    check_degrees(name, limits)
 
 
 def check_fields(fields: Sequence[float]) -> tuple[float, ...]:

@@ -205,6 +205,10 @@ def test_actions_are_those_of_the_space_and_copies_begin_the_same_episodes(zoom_
         assert env.action_space.contains(np.asarray(action))
         env.reset(seed=0)
         env.step(action)
+    env.reset(seed=0)
+    of_numbers = env.step([0.5, 0.2, 0])[0]
+    env.reset(seed=0)
+    assert same(env.step(torch.tensor([0.5, 0.2, 0.0], requires_grad=True))[0], of_numbers)
     for action in ([0.5, 0.2], "x", [2, 0, 0], np.full(3, np.nan), None, np.array(["a", "b", "c"])):
         assert not env.action_space.contains(np.asarray(action))
         env.reset(seed=0)
@@ -224,4 +228,7 @@ def test_options_of_a_reset_and_of_shared_pictures_are_checked(zoom_scenery):
         refused(r"target: expected one of \[0\]", env.reset, options={"scene": 0, "target": target})
     make = partial(gymnasium.make_vec, _IDS["exploration"], num_envs=2, action="window")
     refused("scenery: expected no options of `open_zoom_scenery` beside it", make, scenery=zoom_scenery, count=1)
+    with pytest.warns(FutureWarning, match="price is called look_cost now"):
+        envs = make(scenery=zoom_scenery, price=0.25)
+    assert {env.unwrapped.gazes.look_cost for env in envs.envs} == {0.25}
     refused("pases: expected an option of `open_zoom_scenery`", make, pases=3)

@@ -85,6 +85,15 @@ def test_a_digest_has_the_time_of_the_camera(server, make):
     assert make().where() == Position(0.5, -0.5, 0)
 
 
+@pytest.mark.parametrize("year", [1, 9999])
+def test_a_clock_of_another_century_is_ignored(server, make, year):
+    date = f"<t:Date><t:Year>{year}</t:Year><t:Month>12</t:Month><t:Day>31</t:Day></t:Date>"
+    time = "<t:Time><t:Hour>23</t:Hour><t:Minute>59</t:Minute><t:Second>59</t:Second></t:Time>"
+    moment = f'<r xmlns:t="{TYPES}"><t:UTCDateTime>{time}{date}</t:UTCDateTime></r>'
+    server.answers["GetSystemDateAndTime"] = (200, envelope(moment))
+    assert make().where() == Position(0.5, -0.5, 0)
+
+
 def test_a_fault_is_one_also_where_http_says_that_all_is_well(server, make):
     fault = f'<s:Fault xmlns:s="{SOAP}"><s:Reason><s:Text xml:lang="en">No space left</s:Text></s:Reason></s:Fault>'
     camera = make()
@@ -155,6 +164,8 @@ def test_arguments_are_checked(server, make, panorama):
     client = OnvifClient(server.address, USER, PASSWORD)
     refused("frame: expected a function", OnvifCamera, client, None, (104, 78))
     refused("pan: expected two different limits", OnvifCamera, client, lambda: panorama, (360, 180), pan=(90, -90))
+    for limits in ((1,), (0, 90, 180), 90.0, None, "ab", (math.nan, 90.0), (None, 90.0)):
+        refused("pan: expected a pair", OnvifCamera, client, lambda: panorama, (360, 180), pan=limits)
     refused("tilt: expected degrees", OnvifCamera, client, lambda: panorama, (360, 180), tilt=(-1.0, 1.0))
     closed = OnvifClient("http://127.0.0.1:9", timeout=0.5)
     unusable("no answer from http://127.0.0.1:9", closed.services)
