@@ -179,12 +179,16 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._places = [(time, place) for time, place in self._places if time >= oldest]
 
     def follow(self, motion: Motion | None) -> None:
-        """Carry examined places along with the camera, or forget them where a frame fits none before."""
+        """Carry examined places along with the camera.
+
+        All are forgotten where a frame fits none before, and those that are behind the camera now.
+        """
         if motion is None:
             self._looks = []
             self._examined = []
             self._places = []
             return
+        self._examined = [place for place in self._examined if bool(motion.shows(place.boxes).all())]
         moved = moved_together([place.boxes for place in self._examined], motion)
         self._examined = [place._replace(boxes=boxes) for place, boxes in zip(self._examined, moved, strict=True)]
 

@@ -101,7 +101,10 @@ class Verifier(Generic[LookType]):
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
     def follow(self, motion: Motion | None) -> None:
-        """Carry the candidate and examined places along, or forget them where a frame fits none before."""
+        """Carry the candidate and examined places along.
+
+        All are forgotten where a frame fits none before, and those that are behind the camera now.
+        """
         self._judged = None
         self.places.follow(motion)
         if motion is None:
@@ -110,7 +113,9 @@ class Verifier(Generic[LookType]):
             return
         if self.candidate is not None:
             # The closer look that is due is made in the next frame, wherever the camera has turned.
-            self.candidate = self.candidate._replace(box=motion.boxes(self.candidate.box))
+            box = self.candidate.box
+            self.candidate = self.candidate._replace(box=motion.boxes(box)) if bool(motion.shows(box)) else None
+        self.verdicts = [verdict for verdict in self.verdicts if bool(motion.shows(verdict.look.box))]
         for number, verdict in enumerate(self.verdicts):
             moved = replace(verdict.look, box=motion.boxes(verdict.look.box))
             self.verdicts[number] = verdict._replace(look=moved)

@@ -30,6 +30,7 @@ _SAME = 6.0  # largest mean change of a block, in grey values, of a frame that h
 _EQUAL = 2  # largest change of a pixel, in grey values, of a frame that has not changed though it has no texture
 _CLEAR = 0.93  # correlation of the blocks from which on the fine detail alone is enough
 _COARSE_SHIFT = 0.4  # reduced pixels by which what is coarse may move otherwise than the fine detail
+_AS_GOOD = 0.02  # by so much they correlate less, at most, where the camera may have stood still as well
 _AHEAD = 0.1  # by so much the blocks correlate better than after a shift by which the frame repeats itself
 _STEADY = 4.0  # reduced pixels by which a motion differs from the last one at most, where it has a rival
 
@@ -101,10 +102,15 @@ class KnownPoses:
 
 
 class _Fit(NamedTuple):
-    """The motion between two reduced frames, `(3, 3)`, and the one that another part of them has in common, if any."""
+    """The motion between two reduced frames, `(3, 3)`, and the one that another part of them has in common, if any.
+
+    `median` is that of the blocks' correlations, and `is_repeated` tells whether it is nearly as high a period away.
+    """
 
     similarity: NDArray[np.float64]
     rival: NDArray[np.float64] | None
+    median: float
+    is_repeated: bool = False
 
 
 class _LostFrame:
@@ -129,12 +135,14 @@ class CameraMotion:
     A motion is believed if enough corners agree with it, if it is no leap of scale or turn, and if the key frame, moved
     by it, correlates with the present one in most blocks that have texture. It is doubted
 
-    - if the key frame correlates nearly as well a period away, as bricks and rows of windows do;
+    - if the key frame correlates nearly as well a period away, as bricks and rows of windows do, unless nothing moved;
     - if a part of the frame moves otherwise, until the motion goes on as before: that may be a lorry before the camera,
       or all that is left of the scene behind one;
     - if what is coarse moves otherwise than its edges, as in a film that was compressed too much;
     - if the picture of the key frame has gone little by little, as in a dissolve;
-    - if there is nothing to follow, unless the frame is the same: in the dark, or before a clear sky.
+    - if there is nothing to follow, unless the frame is the same: in the dark, before a clear sky, or before blinds.
+
+    Before a pattern that repeats itself, a camera that moved by whole periods from frame to frame would seem to stand.
 
     A doubted motion is none. The next frames are then compared with the key frame before it, too, for `patience`
     frames, so that a short disturbance loses nothing.
@@ -195,7 +203,7 @@ class CameraMotion:
         """Compare the present frame with what was seen before a disturbance, which is given up after a while."""
         lost.waited += 1
         fit = self._between(lost.key, present, lost.key_to_last)
-        found = fit is not None and self._is_certain(fit, None)
+        found = fit is not None and not fit.is_repeated and self._is_certain(fit, None)
         if found or lost.waited >= self.patience:
             self._lost = None
             if not found:
@@ -207,27 +215,38 @@ class CameraMotion:
     def _since_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> Motion | None:
         """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
         fit = self._between(key, present, self._key_to_last)
+        unmoved = key if np.array_equal(self._key_to_last, _STILL) else None
         if fit is None and last is not key:
             fit = self._between(last, present, _STILL)
             if fit is not None and self._is_replaced(present, fit):
                 fit = None
             key = last
             self._key_to_last = _STILL
+        # Stripes have no corners, or any motion along them fits. The key frame tells, so that a slow drift is seen.
+        is_doubted = fit is None or fit.is_repeated
+        least = _CLEAR if fit is None else max(_CLEAR, fit.median - _AS_GOOD)
+        if is_doubted and unmoved is not None and self._is_unchanged(unmoved, present, least):
+            return Motion.still()
         if fit is None:
             self._begin_at(present)
             return Motion.still() if self._is_same(last, present) else None
         last_to_present = fit.similarity @ np.linalg.inv(self._key_to_last)
         rival = None if fit.rival is None else fit.rival @ np.linalg.inv(self._key_to_last)
-        if not self._is_certain(_Fit(last_to_present, rival), self._course):
+        shift = _largest_shift(last_to_present, present.grey.shape) * max(present.ratio)
+        is_certain = self._is_certain(_Fit(last_to_present, rival, fit.median), self._course)
+        is_still = shift < _STILL_SHIFT
+        # Edges of the blocks of a broken film stay, too, but the blocks change.
+        if not is_certain or (fit.is_repeated and not (is_still and largest_change(last.grey, present.grey) < _SAME)):
             self._begin_at(present)
             if self._course is None:
                 self._course = last_to_present
             return None
         self._course = last_to_present
-        self._anchor_to_last = last_to_present @ self._anchor_to_last
-        if _largest_shift(last_to_present, present.grey.shape) * max(present.ratio) < _STILL_SHIFT:
+        if is_still:
             self._key = key
             return Motion.still()
+        # As with the motion of the key frame, that of a camera that stands is left out: its noise would add up.
+        self._anchor_to_last = last_to_present @ self._anchor_to_last
         if _share_in_view(self._anchor_to_last, present.grey.shape) < _LEAST_IN_VIEW:
             self._begin_at(present)
         else:
@@ -251,9 +270,14 @@ class CameraMotion:
         # Noise hides a slow motion where there is no texture: a sky, or the dark.
         if int(self._cv2.absdiff(last.grey, present.grey).max()) <= _EQUAL:
             return True
-        if len(last.corners) >= LEAST_CORNERS:
+        return len(last.corners) < LEAST_CORNERS and self._is_unchanged(last, present)
+
+    def _is_unchanged(self, first: GreyFrame, present: GreyFrame, least: float = 0.0) -> bool:
+        """Tell whether all texture of two frames is where it was, by a least correlation, and nothing else is new."""
+        if first.grey.shape != present.grey.shape or largest_change(first.grey, present.grey) >= _SAME:
             return False
-        return agreement(self._cv2, last.contrast, present.contrast, _STILL[:2]).is_whole
+        found = agreement(self._cv2, first.contrast, present.contrast, _STILL[:2])
+        return found.is_whole and found.median >= least
 
     def _is_replaced(self, present: GreyFrame, fit: _Fit) -> bool:
         """Tell whether another scene has come little by little, as in a dissolve; `fit` is that of the last frame."""
@@ -280,14 +304,14 @@ class CameraMotion:
             return None
         if found.median < _CLEAR and coarse_shift(cv2, first, present, similarity[:2]) > _COARSE_SHIFT:
             return None
+        rival = rival_between(cv2, first, present, similarity, found.elsewhere) if found.is_partial else None
         for shift in first.repeats:
             for sign in (-1, 1):
                 repeated = similarity.copy()
                 repeated[:2, 2] += sign * similarity[:2, :2] @ shift
                 if agreement(cv2, first.contrast, present.contrast, repeated[:2]).median > found.median - _AHEAD:
-                    return None
-        rival = rival_between(cv2, first, present, similarity, found.elsewhere) if found.is_partial else None
-        return _Fit(similarity, rival)
+                    return _Fit(similarity, rival, found.median, is_repeated=True)
+        return _Fit(similarity, rival, found.median)
 
 
 def _difference(first: NDArray[np.float64], second: NDArray[np.float64], shape: tuple[int, ...]) -> float:

@@ -35,10 +35,12 @@ def coarse_shift(cv2: Any, first: GreyFrame, second: GreyFrame, similarity: NDAr
         similarity: `(2, 3)`, maps pixels of the first frame to those of the second.
 
     Returns:
-        The least shift in reduced pixels; infinite where no quarter tells.
+        The least shift in reduced pixels; infinite where no quarter tells, as in a frame too narrow for slopes.
     """
     height, width = second.grey.shape
     size = max(1, width // _COARSE), max(1, height // _COARSE)
+    if min(size) < 2:
+        return np.inf
     moved = cv2.warpAffine(first.grey, similarity, (width, height), flags=cv2.INTER_LINEAR)
     shown = cv2.warpAffine(np.full_like(first.grey, 255), similarity, (width, height), flags=cv2.INTER_NEAREST)
     shown = cv2.erode(cv2.resize(shown, size, interpolation=cv2.INTER_AREA), np.ones((_BORDER, _BORDER))) == 255

@@ -45,9 +45,12 @@ class Motion:
         matrix = np.array(self.matrix, dtype=np.float64)
         expected = "a 3 × 3 matrix that maps a frame to a frame (np.vstack adds (0, 0, 1) to a 2 × 3 one)"
         check(matrix.shape == (3, 3), "motion", expected, f"shape {matrix.shape}")
-        keeps_area = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix)) > _LEAST_AREA
-        check(keeps_area and matrix[2, 2] != 0, "motion", expected, matrix.tolist())
-        object.__setattr__(self, "matrix", matrix / matrix[2, 2])
+        is_map = bool(np.isfinite(matrix).all()) and matrix[2, 2] != 0
+        check(is_map, "motion", expected, matrix.tolist())
+        # A matrix times any number is the same map, so areas are those of the matrix with 1 in its corner.
+        normal = matrix / matrix[2, 2]
+        check(abs(np.linalg.det(normal)) > _LEAST_AREA, "motion", expected, matrix.tolist())
+        object.__setattr__(self, "matrix", normal)
 
     @classmethod
     def still(cls) -> Self:
@@ -140,6 +143,20 @@ class Motion:
         matrix = torch.from_numpy(self.matrix)
         return _is_ahead(matrix, points.double() @ matrix[2, :2] + 1.0)
 
+    def shows(self, boxes: Tensor) -> Tensor:
+        """Tell which boxes have their centres before the camera (`is_ahead`); no motion brings the others back.
+
+        Args:
+            boxes: `(..., 4)`, `(x1, y1, x2, y2)` in pixels of the first frame.
+
+        Returns:
+            `(...)` boolean.
+
+        >>> Motion.similarity(shift=(9000, 0)).shows(torch.tensor([[0.0, 0.0, 4.0, 2.0]]))
+        tensor([True])
+        """
+        return self.is_ahead((boxes[..., :2] + boxes[..., 2:]) / 2)
+
     def scale_at(self, points: Tensor) -> Tensor:
         """Compute the local scale: pixels of the second frame for one of the first, as the root of the areas' ratio.
 
@@ -187,7 +204,8 @@ def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
 
     .. math:: s(c) = \sqrt{|\det M| / |w(c)|^3}
 
-    What is behind the camera becomes an empty box far beyond the frame.
+    What is behind the camera becomes an empty box far beyond the frame, whose place is lost: what is kept from frame to
+    frame is to be dropped there (`Motion.shows`).
 
     Args:
         matrices: `(..., 3, 3)`, of motions (`Motion.matrix`).

@@ -152,9 +152,11 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         """Carry the boxes of the target along, too."""
         super().follow(motion)
         if motion is not None:
-            moved = moved_together([boxes for _, (boxes, _) in self._looks], motion)
-            pairs = zip(self._looks, moved, strict=True)
-            self._looks = [(time, (boxes, scores)) for (time, (_, scores)), boxes in pairs]
+            shown = [motion.shows(boxes) for _, (boxes, _) in self._looks]
+            ahead = [boxes[is_shown] for (_, (boxes, _)), is_shown in zip(self._looks, shown, strict=True)]
+            moved = moved_together(ahead, motion)
+            looks = zip(self._looks, shown, moved, strict=True)
+            self._looks = [(time, (boxes, scores[is_shown])) for (time, (_, scores)), is_shown, boxes in looks]
 
     def probability(self, look: CloseUp) -> float:
         """Compute the present probability that the target is at the place of a closer look.

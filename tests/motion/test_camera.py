@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from semfov.motion import CameraMotion, CameraStep, Motion
+from semfov.motion.coarse import coarse_shift
+from semfov.motion.frames import GreyFrame
 
 WIDTH, HEIGHT = 640, 360
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
@@ -179,3 +181,53 @@ def test_steps_of_two_frames_are_composed():
     assert CameraStep(None, waits=True).then(CameraStep(second, recovered=first)) == CameraStep(None, recovered=first)
     found = CameraStep(None, recovered=first).then(CameraStep(second))
     assert found.recovered.matrix[:2, 2].tolist() == [3, 4]
+
+
+def blinds():
+    return np.repeat(np.where(np.arange(HEIGHT) % 24 < 9, 90, 200), WIDTH).reshape(HEIGHT, WIDTH)
+
+
+def grid():
+    return np.where(np.arange(WIDTH) % 32 < 5, 60, blinds())
+
+
+def dots():
+    across, down = np.meshgrid(np.arange(WIDTH) % 24 - 12, np.arange(HEIGHT) % 24 - 12)
+    return np.where(np.hypot(across, down) <= 6, 220, 120)
+
+
+@pytest.mark.parametrize("pattern", [blinds, grid, dots])
+@pytest.mark.parametrize("noise", [2, 5])
+@pytest.mark.parametrize("something_else", [False, True])
+def test_a_camera_that_stands_before_a_pattern_has_not_moved(pattern, noise, something_else):
+    frame = np.repeat(pattern()[..., None], 3, 2).astype(np.uint8)
+    if something_else:
+        frame[100:300, 250:350] = scene()[:200, :100]
+    camera, random = CameraMotion(), np.random.default_rng(1)
+    frames = np.clip(frame + random.normal(0, noise, (4, *frame.shape)), 0, 255).astype(np.uint8)
+    camera.step(frames[0])
+    assert all(camera.step(noisy).is_still for noisy in frames[1:])
+
+
+@pytest.mark.parametrize("pattern", [blinds, grid, dots])
+def test_a_camera_that_drifts_before_a_pattern_is_not_taken_to_stand(pattern):
+    """One pixel a frame, until it is a third of a period away."""
+    frame, camera = np.repeat(pattern()[..., None], 3, 2).astype(np.uint8), CameraMotion()
+    steps = [camera.step(np.roll(frame, (number, number), (0, 1))) for number in range(9)]
+    assert not all(step.is_still for step in steps[1:])
+
+
+def test_noise_of_a_camera_that_stands_does_not_add_up():
+    """It stands beside the key frame by less than a pixel for a while, and then zooms."""
+    picture, camera = scene(), CameraMotion()
+    camera.step(view(picture, 800, 800)[0])
+    beside, _ = view(picture, 800.2, 800.15)
+    assert all(camera.step(beside).is_still for _ in range(100))
+    for number in range(1, 13):
+        assert camera.step(view(picture, 800.2, 800.15, 0.0, 1.06**number)[0]).motion is not None
+
+
+@pytest.mark.parametrize("size", [(480, 7), (7, 480), (2, 2), (1, 1)])
+def test_frames_of_some_pixels_across_have_no_slopes_that_tell(size):
+    frame = GreyFrame(cv2, np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8))
+    assert coarse_shift(cv2, frame, frame, np.eye(3)[:2]) == np.inf

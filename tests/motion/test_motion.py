@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov import InputError
-from semfov.motion import Motion
+from semfov.motion import KnownPoses, Motion
 
 numbers = st.floats(-200, 200)
 
@@ -64,6 +64,22 @@ def test_matrices_of_opencv_are_taken_and_others_refused():
     for matrix in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.eye(4), np.diag([1.0, 1.0, 0.0])):
         with pytest.raises(InputError, match="motion: expected a 3 × 3 matrix"):
             Motion.of(matrix)
+
+
+@given(motions, st.sampled_from([1e-6, 1e-3, -1.0, 1e4]), points)
+def test_a_matrix_times_a_number_is_the_same_map(motion, factor, places):
+    torch.testing.assert_close(Motion.of(motion.matrix * factor).points(places), motion.points(places))
+
+
+def test_poses_of_a_head_that_turns_around_are_taken():
+    lens = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+    camera = KnownPoses()
+    for pan in range(0, 361):
+        turn = cv2.Rodrigues(np.array([0, np.radians(pan), 0]))[0]
+        step = camera.step(lens @ turn @ np.linalg.inv(lens))
+        if step.motion is not None:
+            centre = step.motion.points(torch.tensor([320.0, 240.0], dtype=torch.float64))
+            torch.testing.assert_close(centre, torch.tensor([320 + 600 * np.tan(np.radians(1)), 240]))
 
 
 @given(st.floats(-170, 170), st.floats(-60, 60))

@@ -4,6 +4,8 @@ import json
 import math
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +16,7 @@ from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
 from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
+from semfov.motion import Motion
 from semfov.settings import FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
@@ -184,6 +187,24 @@ def test_improbable_places_are_examined_only_at_the_end():
     none_left = verifier(FromScore(), [0.1, 0.1])
     none_left.see(look(24, 0.9, 0.0, ONE))
     assert none_left.look_closely(0) == []
+
+
+@pytest.mark.parametrize("looks", [0, 1])
+def test_what_the_camera_turns_away_from_is_forgotten_and_found_anew(looks):
+    """By 120 degrees and on to 360: what was at one place before is at no place then, until it is seen again."""
+    lens = np.array([[600.0, 0, 120], [0, 600, 120], [0, 0, 1]])
+    third = cv2.Rodrigues(np.array([0, np.radians(120), 0]))[0]
+    motion = Motion(lens @ third @ np.linalg.inv(lens))
+    judge = verifier(FromScore(0.7), [0.8, 0.7])
+    judge.see(look(1, 0.9, 0.5, ONE))
+    for _ in range(looks):
+        judge.look()
+    for _ in range(3):
+        judge.follow(motion)
+        assert judge.candidate is None
+        assert not judge.verdicts
+    judge.see(look(5, 0.9, 0.5, ONE))
+    assert judge.candidate.box.tolist() == ONE
 
 
 def test_a_search_looks_closely_before_it_finds(detector, picture):
