@@ -17,7 +17,7 @@ from semfov.data.inputs import FRAME
 from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
-from semfov.motion import Motion, moved_together
+from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 
 SAME = 0.5  # boxes with at least this overlap (intersection over union) are of the same object
@@ -189,7 +189,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
             self._places = []
             return
         self._examined = [place for place in self._examined if bool(motion.shows(place.boxes).all())]
-        moved = moved_together([place.boxes for place in self._examined], motion)
+        moved = motion.boxes_in_parts([place.boxes for place in self._examined])
         self._examined = [place._replace(boxes=boxes) for place, boxes in zip(self._examined, moved, strict=True)]
 
     def cell(self, box: Tensor) -> int | None:

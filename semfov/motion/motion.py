@@ -181,6 +181,23 @@ class Motion:
         """
         return moved_boxes(torch.from_numpy(self.matrix), boxes)[0]
 
+    def boxes_in_parts(self, parts: Sequence[Tensor]) -> list[Tensor]:
+        """Map boxes that are kept in parts all at once, which takes the time of one.
+
+        Args:
+            parts: boxes, `(N, 4)` each, in pixels of the first frame.
+
+        Returns:
+            The boxes of each part in pixels of the second frame.
+
+        >>> parts = [torch.zeros(0, 4), torch.tensor([[0.0, 0.0, 4.0, 2.0]])]
+        >>> Motion.similarity(shift=(10, 0)).boxes_in_parts(parts)[1]
+        tensor([[10.,  0., 14.,  2.]])
+        """
+        if not parts:
+            return []
+        return list(self.boxes(torch.cat(list(parts))).split([len(boxes) for boxes in parts]))
+
 
 def _local_scale(matrices: Tensor, weight: Tensor) -> Tensor:
     """Compute the root of the ratio of areas; the determinant of a map's derivative is det(M) / w³."""
@@ -230,18 +247,3 @@ def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     half_size = torch.where(is_ahead, (bottom_right - top_left) / 2 * scale[..., None], 0.0)
     moved = torch.cat([moved_centre - half_size, moved_centre + half_size], -1)
     return moved.to(boxes), scale.to(boxes)
-
-
-def moved_together(parts: Sequence[Tensor], motion: Motion) -> list[Tensor]:
-    """Map boxes that are kept in parts all at once, which takes the time of one.
-
-    Args:
-        parts: boxes, `(N, 4)` each, in pixels of the first frame.
-        motion: the motion.
-
-    Returns:
-        The boxes of each part in pixels of the second frame.
-    """
-    if not parts:
-        return []
-    return list(motion.boxes(torch.cat(list(parts))).split([len(boxes) for boxes in parts]))

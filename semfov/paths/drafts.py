@@ -94,7 +94,14 @@ class Drafts:
         return {name: AreaShares(first[name], second[name]) for name in first}
 
     def areas(self, areas: AreasLike) -> tuple[dict[str, Area], dict[str, Area]]:
-        """Read areas of interest in each draft, as for `shares`, and check that they lie in it."""
+        """Read areas of interest in each draft, and check that they lie in it.
+
+        Args:
+            areas: as for `shares`.
+
+        Returns:
+            The areas by name, in the first and in the second draft.
+        """
         first, second = (
             read_areas(areas, draft.size, [name, draft.name, draft.source or draft.name])
             for draft, name in zip((self.first, self.second), self.names, strict=True)

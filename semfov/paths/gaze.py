@@ -277,7 +277,14 @@ class GazePrediction(OtherWords):
         return {name: share_in(self.density, area) for name, area in self.areas(areas).items()}
 
     def areas(self, areas: AreasLike) -> dict[str, Area]:
-        """Read areas of interest in this picture, as for `share`, and check that they lie in it."""
+        """Read areas of interest in this picture, and check that they lie in it.
+
+        Args:
+            areas: as for `share`.
+
+        Returns:
+            The areas by name.
+        """
         return read_areas(areas, self.size, [self.name, self.source or self.name])
 
     @checked_keywords

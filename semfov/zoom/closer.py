@@ -14,7 +14,7 @@ from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
-from semfov.motion import Motion, moved_together
+from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
 from semfov.zoom.hints import DETECTION_SCORE
@@ -154,7 +154,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         if motion is not None:
             shown = [motion.shows(boxes) for _, (boxes, _) in self._looks]
             ahead = [boxes[is_shown] for (_, (boxes, _)), is_shown in zip(self._looks, shown, strict=True)]
-            moved = moved_together(ahead, motion)
+            moved = motion.boxes_in_parts(ahead)
             looks = zip(self._looks, shown, moved, strict=True)
             self._looks = [(time, (boxes, scores[is_shown])) for (time, (_, scores)), is_shown, boxes in looks]
 

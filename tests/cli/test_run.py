@@ -127,7 +127,7 @@ def test_pictures_with_long_names_end_no_command(run, photo, tmp_path):
     assert skipped == [252, 255]
     assert [len(row["objects"]) for row in rows if "error" not in row] == [1] * 5
     assert {row["error"].rpartition(": ")[2] for row in rows if "error" in row} == {os.strerror(errno.ENAMETOOLONG)}
-    assert f"{len(names)} pictures: 5 looked at; 2 skipped" in printed.out
+    assert f"{len(names)} pictures: 5 looked at; 5 reds found; 2 skipped" in printed.out
     code, _ = run(*command, "--labels", tmp_path / "more")
     assert code == 0
     assert {path.stem for path in (tmp_path / "more").iterdir()} == {name.removesuffix(".png") for name in names}

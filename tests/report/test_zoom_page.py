@@ -93,7 +93,7 @@ def test_numbers_are_rounded_once(zoom_path, large_picture):
 def test_confirmed_objects_are_told_only_where_something_can_confirm_them(zoom_path, large_picture, sought):
     path = replace(zoom_path, unseen=(0.0, 0.0), **({} if sought else {"decision": None}))
     page = page_html("field", [zoom_data(path, large_picture, name="field")])
-    assert ("value of a look is the probability that it shows the target" in page) == sought
+    assert ("value of a look is the probability that it finds the target" in page) == sought
     assert ("value of a look is the expected number of new objects" in page) != sought
     assert ("confirmed by the decision or a closer look" in page) == sought
     assert ('<button type="button" class="sort">confirmed</button>' in page) == sought

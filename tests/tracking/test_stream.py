@@ -92,7 +92,7 @@ def test_the_way_of_an_object_is_drawn_where_it_was(moments):
 
 
 def test_several_passes_at_a_frame_are_looks_without_time_between_them():
-    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2, 8)).eval()
+    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2)).eval()
     twice, once = (agent.stream(None, (RED,), StreamSettings(passes=passes)) for passes in (2, 1))
     for frame, _ in frames(6):
         moment = twice.step(frame)
