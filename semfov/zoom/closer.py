@@ -151,8 +151,9 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
     def follow(self, motion: Motion | None) -> None:
         """Carry the boxes of the target along, too."""
         super().follow(motion)
-        if motion is not None:
-            shown = [motion.shows(boxes) for _, (boxes, _) in self._looks]
+        if motion is not None and self._looks:
+            parts = [boxes for _, (boxes, _) in self._looks]
+            shown = motion.shows(torch.cat(parts)).split([len(boxes) for boxes in parts])
             ahead = [boxes[is_shown] for (_, (boxes, _)), is_shown in zip(self._looks, shown, strict=True)]
             moved = motion.boxes_in_parts(ahead)
             looks = zip(self._looks, shown, moved, strict=True)
