@@ -6,6 +6,7 @@ from itertools import takewhile
 
 from tqdm import tqdm
 
+from semfov.agent import ActivePerception
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import CompareOptions
 from semfov.cli.outcome import table_lines
@@ -35,11 +36,7 @@ def compare(options: CompareOptions) -> int:
     Returns:
         The exit code, 1 if a picture was left out; where all were, nothing is written.
     """
-    check_writable(options.out, folder=True)
-    check(bool(options.with_), "with", "sahi, ranked, or both", "none")
-    has_reference = options.annotations is not None or "sahi" in options.with_
-    remedies = "--with sahi,ranked, where what all slices list stands for the truth, or --annotations FILE"
-    check(has_reference, "with", remedies, "ranked alone")
+    _check_options(options)
     truth = None if options.annotations is None else Truth(options.annotations)
     # What is wrong with the classes and the pictures is said before the agent is loaded.
     several_classes(options.target, detector_classes(options))
@@ -50,22 +47,9 @@ def compare(options: CompareOptions) -> int:
     labels = tuple(names.index(name) + 1 for name in targets or ())
     sources = sources or [example_source("sheet", names)]
     side = min(agent.eye.detector.input_size) if options.slice is None else options.slice
-    eye = agent.zoom.eye
-    ways: dict[str, Way] = {SEMFOV: by_semfov(agent, labels, options.passes)}
-    if "sahi" in options.with_:
-        ways[ALL_SLICES] = all_slices(eye, labels, side, options.overlap)
-    if "ranked" in options.with_:
-        ways["best slices"] = best_slices(eye, labels, side, options.overlap, options.passes)
+    ways = _ways(options, agent, labels, side)
     scores = Scores(names, labels, truth)
-    skipped = 0
-    for source in tqdm(sources, desc="pictures", leave=False, disable=options.quiet or not sys.stderr.isatty()):
-        try:
-            _look(source, eye, ways, scores, several=len(sources) > 1)
-        except SemfovError as error:
-            if len(sources) == 1:
-                raise
-            print(f"skipped {source.name}: {error}", file=sys.stderr)
-            skipped += 1
+    skipped = _look_at_all(sources, agent.zoom.eye, ways, scores, quiet=options.quiet)
     if scores.pictures == 0:
         print("error: no picture could be looked at, so there is nothing to compare or write", file=sys.stderr)
         return 1
@@ -81,6 +65,42 @@ def compare(options: CompareOptions) -> int:
     print("\n".join([about, *table_lines([_HEADINGS, *map(_cells, points)]), *sentences]))
     print(f"wrote {options.out}: compare.html, compare.csv, compare.png")
     return int(skipped > 0)
+
+
+def _check_options(options: CompareOptions) -> None:
+    """Raise an error for options that cannot be followed, before anything is loaded."""
+    check_writable(options.out, folder=True)
+    check(bool(options.with_), "with", "sahi, ranked, or both", "none")
+    has_reference = options.annotations is not None or "sahi" in options.with_
+    remedies = "--with sahi,ranked, where what all slices list stands for the truth, or --annotations FILE"
+    check(has_reference, "with", remedies, "ranked alone")
+
+
+def _ways(options: CompareOptions, agent: ActivePerception, labels: tuple[int, ...], side: int) -> dict[str, Way]:
+    """Make semfov's way to look at a picture, and those that it is compared with; slices of a side in pixels."""
+    eye = agent.zoom.eye
+    ways: dict[str, Way] = {SEMFOV: by_semfov(agent, labels, options.passes)}
+    if "sahi" in options.with_:
+        ways[ALL_SLICES] = all_slices(eye, labels, side, options.overlap)
+    if "ranked" in options.with_:
+        ways["best slices"] = best_slices(eye, labels, side, options.overlap, options.passes)
+    return ways
+
+
+def _look_at_all(
+    sources: Sequence[PictureSource], eye: WindowEye, ways: dict[str, Way], scores: Scores, *, quiet: bool
+) -> int:
+    """Look at all pictures in all ways; returns how many were skipped, each with its reason."""
+    skipped = 0
+    for source in tqdm(sources, desc="pictures", leave=False, disable=quiet or not sys.stderr.isatty()):
+        try:
+            _look(source, eye, ways, scores, several=len(sources) > 1)
+        except SemfovError as error:
+            if len(sources) == 1:
+                raise
+            print(f"skipped {source.name}: {error}", file=sys.stderr)
+            skipped += 1
+    return skipped
 
 
 def _look(source: PictureSource, eye: WindowEye, ways: dict[str, Way], scores: Scores, *, several: bool) -> None:

@@ -214,14 +214,8 @@ class CameraMotion:
 
     def _since_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> Motion | None:
         """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
-        fit = self._between(key, present, self._key_to_last)
         unmoved = key if np.array_equal(self._key_to_last, _STILL) else None
-        if fit is None and last is not key:
-            fit = self._between(last, present, _STILL)
-            if fit is not None and self._is_replaced(present, fit):
-                fit = None
-            key = last
-            self._key_to_last = _STILL
+        key, fit = self._fit_to_key_or_last(key, last, present)
         # Stripes have no corners, or any motion along them fits. The key frame tells, so that a slow drift is seen.
         is_doubted = fit is None or fit.is_repeated
         least = _CLEAR if fit is None else max(_CLEAR, fit.median - _AS_GOOD)
@@ -253,6 +247,19 @@ class CameraMotion:
             self._key = key
             self._key_to_last = fit.similarity
         return _at_full_size(last_to_present, present.ratio)
+
+    def _fit_to_key_or_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> tuple[GreyFrame, _Fit | None]:
+        """Fit the present frame to the key frame, or where it fits none to the last frame, which is the key then.
+
+        A frame that fits the last one, but no longer the anchor, shows another scene that has come little by little.
+        """
+        fit = self._between(key, present, self._key_to_last)
+        if fit is not None or last is key:
+            return key, fit
+        self._key_to_last = _STILL
+        fit = self._between(last, present, _STILL)
+        is_replaced = fit is not None and self._is_replaced(present, fit)
+        return last, None if is_replaced else fit
 
     def _is_certain(self, fit: _Fit, course: NDArray[np.float64] | None) -> bool:
         """Tell whether no other motion is as good: there is no rival, or the motion is that of the frames before."""
