@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from eval.human.viewing import filled
+from eval.human.viewing import write_tables
 from semfov.data.pictures import Pictures
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
@@ -23,7 +23,6 @@ from semfov.fit.viewing import Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.views import picture_terms
 from semfov.io.code import modules_digest
-from semfov.io.files import write_text
 from semfov.io.ranges import Range
 from semfov.kinds import Quality
 from semfov.metrics.episodes import standard_error
@@ -78,13 +77,7 @@ def compare_qualities(config: QualityConfig) -> None:
                 parts.setdefault(name, []).append(tensor)
         rows[settings.name] = {name: torch.cat(of_folds) for name, of_folds in parts.items()}
     lines = quality_table(rows)
-    print("\n".join(lines))
-    written = [config.out / "summary.md"]
-    write_text(written[0], "\n".join([*lines, ""]))
-    if config.page is not None:
-        write_text(config.page, filled(config.page.read_text(encoding="utf-8"), {"quality": lines}))
-        written.append(config.page)
-    print("written:", *(f"  {path}" for path in written), sep="\n")
+    write_tables("\n".join([*lines, ""]), {"quality": lines}, config.out, config.page)
 
 
 def _scores(detector: Detector, config: QualityConfig, store: FoldStore, fold: Fold) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eval.human.drawn_pictures import KINDS, web_page_with_photograph
-from eval.human.viewing import filled
+from eval.human.viewing import write_tables
 from semfov.data.inputs import as_image
 from semfov.data.reading import read_image
 from semfov.data.sources import picture_files
@@ -23,7 +23,6 @@ from semfov.errors import check
 from semfov.fit.viewing import MapSource, features_of
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.likeness import PictureLikeness, pooled
-from semfov.io.files import write_text
 from semfov.io.ranges import Count, Range, Seed
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.config import DetectorConfig
@@ -73,13 +72,7 @@ def tell_apart(config: UnlikeConfig) -> None:
     detectors = [DetectorConfig(name=each) if isinstance(each, str) else each for each in config.detectors]
     columns = {each.name: _measured(each, files, others, config) for each in detectors}
     lines = unlike_table(columns)
-    print("\n".join(lines))
-    written = [config.out / "summary.md"]
-    write_text(written[0], "\n".join([*lines, ""]))
-    if config.page is not None:
-        write_text(config.page, filled(config.page.read_text(encoding="utf-8"), {"unlike": lines}))
-        written.append(config.page)
-    print("written:", *(f"  {path}" for path in written), sep="\n")
+    write_tables("\n".join([*lines, ""]), {"unlike": lines}, config.out, config.page)
 
 
 def _measured(

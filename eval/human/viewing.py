@@ -125,13 +125,7 @@ def compare_viewing(config: ViewingConfig) -> None:
         "viewing sequences": sequences_table(drawn),
     }
     text = "\n".join(["\n".join([f"## {name}", "", *lines, ""]) for name, lines in tables.items()])
-    print(text)
-    written = [config.out / "summary.md"]
-    write_text(written[0], text)
-    if config.page is not None:
-        write_text(config.page, filled(config.page.read_text(encoding="utf-8"), tables))
-        written.append(config.page)
-    print("written:", *(f"  {path}" for path in written), sep="\n")
+    write_tables(text, tables, config.out, config.page)
 
 
 def _bar(folds: Sequence[Fold], name: str) -> Iterator[Fold]:
@@ -232,6 +226,24 @@ def _figures(scores: Scores, row: str, source: int) -> list[str]:
     own, base = scores[row, source].double().numpy(), scores[CENTRE, source].double().numpy()
     columns = own[:, 0], own[:, 1], own[:, 2] - base[:, 2]
     return [plus_minus(float(each.mean()), float(standard_error(each)), 3) for each in columns]
+
+
+def write_tables(text: str, tables: Mapping[str, list[str]], out: Path, page: Path | None) -> None:
+    """Print tables, write them as `summary.md`, and put them into a page.
+
+    Args:
+        text: the tables in one text.
+        tables: the lines of each table by its name on the page.
+        out: folder of the study.
+        page: page of the site; None for none.
+    """
+    print(text)
+    written = [out / "summary.md"]
+    write_text(written[0], text)
+    if page is not None:
+        write_text(page, filled(page.read_text(encoding="utf-8"), tables))
+        written.append(page)
+    print("written:", *(f"  {path}" for path in written), sep="\n")
 
 
 def filled(page: str, tables: Mapping[str, Sequence[str]]) -> str:
