@@ -24,7 +24,7 @@ from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
 from semfov.paths.conversion import Conversion, Values
-from semfov.paths.files import Format
+from semfov.paths.files import Format, SharedFields
 from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
 from semfov.paths.regions import Region
 
@@ -78,14 +78,14 @@ class Record(Conversion):
     def __repr__(self) -> str:
         """Return the summary, the looks, and the most confident objects."""
         rows = self.object_rows()
-        objects = [
-            f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}){' (confirmed)' * row['confirmed']}"
-            for row in rows[:_NAMED]
-        ]
+        names = []
+        for row in rows[:_NAMED]:
+            confirmed = " (confirmed)" if row["confirmed"] else ""
+            names.append(f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}){confirmed}")
         if len(rows) > _NAMED:
-            objects.append(f"and {len(rows) - _NAMED} more")
-        found = f"objects from {self.words.threshold}: {', '.join(objects) or 'none'}"
-        return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self.words.lines, found])
+            names.append(f"and {len(rows) - _NAMED} more")
+        objects = f"objects from {self.words.threshold}: {', '.join(names) or 'none'}"
+        return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self.words.lines, objects])
 
     def outline(self, look: RecordedLook) -> Tensor | None:
         """Return the border of what a look shows.
@@ -154,13 +154,16 @@ class Record(Conversion):
             Pixels, boxes and gaze of each look.
         """
         for look in self:
-            x1, y1, x2, y2 = whole_pixels(look.region, self.size)
+            region = whole_pixels(look.region, self.size)
+            left, top, right, bottom = region
+            width = right - left
             # Read no more pixels than the detector saw of it.
-            width_seen = max(1, round((x2 - x1) * look.more.get("magnification", 1.0)))
-            pixels = read_region(source, (x1, y1, x2, y2), self.size, width_seen)
-            boxes = look.detections.boxes[0] - look.detections.boxes.new_tensor([x1, y1, x1, y1])
+            width_seen = max(1, round(width * look.more.get("magnification", 1.0)))
+            pixels = read_region(source, region, self.size, width_seen)
+            boxes = look.detections.boxes[0]
+            boxes_in_view = boxes - boxes.new_tensor([left, top, left, top])
             x, y = look.fixation
-            yield LookView(pixels, (x2 - x1, y2 - y1), boxes, (x - x1, y - y1))
+            yield LookView(pixels, (width, bottom - top), boxes_in_view, (x - left, y - top))
 
     def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
         """Convert the fixations to the format of human data (`semfov.data.fixations`), to write or to compare them.
@@ -317,7 +320,7 @@ class Record(Conversion):
 
     @classmethod
     @abstractmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: Values) -> Values:
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
         """Make the other attributes from the tensors and JSON values of a file."""
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from math import nextafter
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, TypedDict, get_args
 
 import torch
 from torch import Tensor
@@ -104,6 +104,26 @@ class _Shared(Protocol):
     def photograph(self) -> Tensor | None: ...
 
 
+class SharedFields(TypedDict):
+    """Attributes that all records have, by name, as the file of a record gives them."""
+
+    classes: tuple[str, ...]
+    target: int | None
+    targets: tuple[int, ...]
+    found: bool
+    detections: tuple[Detections, ...]
+    decision: Decision | None
+    closer: tuple[CloseUp, ...]
+    prior: float | None
+    assumed: float | None
+    score_threshold: float
+    source: str | None
+    shown: dict[str, Any] | None
+    detector: str | None
+    ending: Ending | None
+    photograph: Tensor | None
+
+
 class Format:
     """Format of the files of one kind of records.
 
@@ -155,7 +175,7 @@ class Format:
         }
         write_file(path, {**_shared_tensors(outcome), **tensors}, values)
 
-    def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
+    def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], SharedFields]:
         """Read and check a file that `write` wrote.
 
         Args:
@@ -175,18 +195,31 @@ class Format:
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
         self.schema.check(tensors, record)
         _check_shared(tensors, record)
-        decision = record.get("decision")
-        boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
-        shared = {
-            **{name: record.get(name) for name in _PLAIN},
-            "classes": tuple(record["classes"]),
-            "targets": tuple(record["targets"]),
-            "photograph": tensors.get("photograph"),
-            "detections": _separated(tensors, record["lengths"]),
-            "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
-            "closer": tuple(CloseUp(**look, box=box) for look, box in zip(record["closer"], boxes, strict=True)),
-        }
-        return tensors, record, shared
+        return tensors, record, _shared_fields(tensors, record)
+
+
+def _shared_fields(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> SharedFields:
+    """Make the attributes that all records have from the checked tensors and JSON values of a file."""
+    decision = record.get("decision")
+    closer_boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
+    close_ups = zip(record["closer"], closer_boxes, strict=True)
+    return {
+        "classes": tuple(record["classes"]),
+        "target": record.get("target"),
+        "targets": tuple(record["targets"]),
+        "found": record["found"],
+        "detections": _separated(tensors, record["lengths"]),
+        "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
+        "closer": tuple(CloseUp(**values, box=box) for values, box in close_ups),
+        "prior": record.get("prior"),
+        "assumed": record.get("assumed"),
+        "score_threshold": record["score_threshold"],
+        "source": record.get("source"),
+        "shown": record.get("shown"),
+        "detector": record.get("detector"),
+        "ending": record.get("ending"),
+        "photograph": tensors.get("photograph"),
+    }
 
 
 def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
@@ -204,10 +237,18 @@ def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
 
 
 def _separated(tensors: Mapping[str, Tensor], lengths: list[int]) -> tuple[Detections, ...]:
-    """Separate the detections of the looks, batches of one."""
-    names = [name for name in (*_DETECTIONS, "confidence") if name in tensors]
-    looks = zip(*(tensors[name].split(lengths) for name in names), strict=True)
-    return tuple(Detections(*(part[None] for part in look)) for look in looks)
+    """Separate the detections of the looks, which stand in a row in a file; return batches of one.
+
+    Args:
+        tensors: boxes `(M, 4)`, scores, mask, and from present versions confidence of all looks.
+        lengths: number of detections of each look, with sum M.
+    """
+    columns = [tensors[name].split(lengths) for name in (*_DETECTIONS, "confidence") if name in tensors]
+    looks = []
+    for parts in zip(*columns, strict=True):
+        batch_of_one = [part[None] for part in parts]
+        looks.append(Detections(*batch_of_one))
+    return tuple(looks)
 
 
 def _rename_former(record: dict[str, Any]) -> None:
@@ -224,21 +265,30 @@ def _check_shared(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> N
     classes = len(record["classes"])
     lengths = record["lengths"]
     target = record.get("target")
+    check(target is None or _is_class(target, classes), "target", "the index of a class", target)
+    rows = len(tensors["mask"])
+    check(sum(lengths) == rows, "lengths", f"a sum of {rows}", sum(lengths))
     targets = record["targets"]
-    check(target is None or 1 <= target < classes, "target", "the index of a class", target)
-    check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
-    check(all(1 <= label < classes for label in targets), "targets", "indices of classes", targets)
+    check(all(_is_class(label, classes) for label in targets), "targets", "indices of classes", targets)
     if "photograph" in tensors:
-        sides = tensors["photograph"].shape[1:]
-        check(min(sides) >= 1 and max(sides) <= LONGEST, "photograph", f"1 to {LONGEST} px", max(sides))
+        height, width = tensors["photograph"].shape[1:]
+        has_size = min(height, width) >= 1 and max(height, width) <= LONGEST
+        check(has_size, "photograph", f"1 to {LONGEST} px", max(height, width))
     closer = record["closer"]
     boxes = len(tensors.get("closer_boxes", ()))
     check(boxes == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", boxes)
-    for look in closer:
-        last = max(look["fixation"] or 0, look["number"] or 0)
-        check(
-            last < len(lengths) and 1 <= look["target"] < classes,
-            "closer",
-            f"a look below {len(lengths)} and the index of a class",
-            look,
-        )
+    expected = f"a look below {len(lengths)} and the index of a class"
+    for values in closer:
+        look = max(values["fixation"] or 0, values["number"] or 0)
+        check(look < len(lengths) and _is_class(values["target"], classes), "closer", expected, values)
+
+
+def _is_class(label: int, classes: int) -> bool:
+    """Tell whether a number is the index of one of the classes, of which the first is the background."""
+    return 1 <= label < classes
+
+
+def check_decided_cell(decision: Decision | None, cells: int) -> None:
+    """Raise `InputError` unless the cell of the decision of a file, if it has one, is a cell of its grid."""
+    cell = None if decision is None else decision.cell
+    check(cell is None or cell < cells, "decision.cell", f"a cell number below {cells}", cell)

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,13 +21,13 @@ from semfov.io.schema import Array, Field, Maybe, Number, Object, Text
 from semfov.io.tables import pixels
 from semfov.kinds import HEAD
 from semfov.paths.base import Record
-from semfov.paths.conversion import COLUMNS
-from semfov.paths.files import POSITIVE, Format
+from semfov.paths.conversion import COLUMNS, Values
+from semfov.paths.files import POSITIVE, Format, SharedFields, check_decided_cell
 from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
 from semfov.paths.words import Words
-from semfov.sensor.sphere import Boxes, panorama_directions
+from semfov.sensor.sphere import Boxes, Regions, panorama_directions
 
 _WORLDS: dict[str, tuple[type[Sphere] | type[Flat], tuple[str, ...]]] = {
     "panorama": (Panorama, ("picture", "size", "cell", "reach")),
@@ -64,6 +63,8 @@ _FORMAT = Format(
 )
 """Format of the files of paths of eye and head."""
 
+_BORDER = 2.0  # pixels; a box that is as near to the border of its view counts as cut
+
 
 class HeadWords(Words):
     """Words for an episode of eye and head."""
@@ -75,8 +76,8 @@ class HeadWords(Words):
         record = self.record
         outcome = self.objects
         if record.decision is not None and record.target_name is not None:
-            certainty = f"there with probability {record.decision.probability:.2f}"
-            outcome = f"{self.verdict(record.target_name, ':')} ({certainty})"
+            verdict = self.verdict(record.target_name, ":")
+            outcome = f"{verdict} (there with probability {record.decision.probability:.2f})"
         looks = f"{len(record)} look{'s' if len(record) != 1 else ''}"
         turns = f"{record.turns} turn{'s' if record.turns != 1 else ''} of the head"
         seconds = record.seconds[-1] if record.looks else 0.0
@@ -131,20 +132,20 @@ def head_look(
     """
     world = views.world
     pose = views.poses[action // views.cells]
-    pan, tilt, degrees = pose.tolist()
+    pan, tilt, field = pose.tolist()
     x, y = world.pixels_of(views.gaze[[action]])[0].tolist()
-    frame = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
-    x1, y1, x2, y2 = world.boxes(frame, pose)[0].tolist()
-    boxes = world.boxes(in_view.boxes[0], pose)[None].to(in_view.boxes)
+    whole_view = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
+    x1, y1, x2, y2 = world.boxes(whole_view, pose)[0].tolist()
+    boxes_in_picture = world.boxes(in_view.boxes[0], pose)[None].to(in_view.boxes)
     cells = cell_columns(world.scene, int(views.gaze_cell[action]), map_after)
     return HeadLook(
         index=number,
         fixation=(x, y),
         region=(x1, y1, x2, y2),
-        detections=replace(in_view, boxes=boxes),
+        detections=replace(in_view, boxes=boxes_in_picture),
         seconds=seconds,
         value=value if math.isfinite(value) else None,
-        more={"action": action, "pan": pan, "tilt": tilt, "field": degrees, **cells},
+        more={"action": action, "pan": pan, "tilt": tilt, "field": field, **cells},
         action=action,
         in_view=in_view,
     )
@@ -219,7 +220,7 @@ class HeadPath(Record):
     def turns(self) -> int:
         """Number of times that the head moved."""
         poses = [action // self.views.cells for action in self.actions]
-        return sum(one != other for one, other in pairwise(poses))
+        return sum(pose != pose_before for pose_before, pose in pairwise(poses))
 
     @cached_property
     def candidates(self) -> Objects:
@@ -229,16 +230,34 @@ class HeadPath(Record):
         the picture and ends beyond its right border. Of several boxes of one object, one that no border of the view
         cuts is kept, and of these the box of the nearest fixation.
         """
-        distances, cut = [], []
+        return merge_fixations(
+            [look.detections for look in self.looks],
+            [self._distances_to_gaze(look) for look in self.looks],
+            self.closer,
+            cut=[self._cut_by_border(look) for look in self.looks],
+            around=self.around,
+        )
+
+    def _distances_to_gaze(self, look: HeadLook) -> Tensor:
+        """Compute the distance in degrees from the gaze to the boxes of a look, `(L,)`."""
+        field = float(self.pose(look.index)[2])
+        width = self.views.world.size[0]
+        # Pixels of a narrow view are fewer degrees, so that distances in pixels of different views do not compare.
+        return distances_to(look.in_view.boxes[0], self._gaze_in_view(look)) * field / width
+
+    def _cut_by_border(self, look: HeadLook) -> Tensor:
+        """Tell which boxes of a look end at the border of its view, `(L,)`, so that they may show a part alone."""
+        boxes = look.in_view.boxes[0]
         width, height = self.views.world.size
-        for look in self.looks:
-            boxes = look.in_view.boxes[0]
-            field = float(self.pose(look.index)[2])
-            point = self.views.view_grid.centres[look.action % self.views.cells]
-            distances.append(distances_to(boxes, point) * field / width)
-            border = boxes.new_tensor([2.0, 2.0, width - 2.0, height - 2.0])  # a box this near to it counts as cut
-            cut.append((boxes[:, :2] <= border[:2]).any(-1) | (boxes[:, 2:] >= border[2:]).any(-1))
-        return merge_fixations([look.detections for look in self], distances, self.closer, cut=cut, around=self.around)
+        upper_left = boxes.new_tensor([_BORDER, _BORDER])
+        lower_right = boxes.new_tensor([width - _BORDER, height - _BORDER])
+        begins_before = (boxes[:, :2] <= upper_left).any(-1)
+        ends_after = (boxes[:, 2:] >= lower_right).any(-1)
+        return begins_before | ends_after
+
+    def _gaze_in_view(self, look: HeadLook) -> Tensor:
+        """Find the point `(2,)` in pixels of the view that the eye fixates in a look."""
+        return self.views.view_grid.centres[look.action % self.views.cells]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -251,14 +270,17 @@ class HeadPath(Record):
         """Width in pixels of a panorama, after which it repeats; None for other scenes."""
         return float(self.size[0]) if self.views.world.closed else None
 
-    def object_rows(self) -> list[dict[str, Any]]:
+    def object_rows(self) -> list[Values]:
         """List the objects, with `pan` to the right and `tilt` up of the middle of each box, in degrees."""
         rows = super().object_rows()
         world = self.views.world
-        points = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2) - 0.5
-        places = panorama_directions(points, self.size) if isinstance(world, Sphere) else points
-        angles = world.angles_of(places).tolist()
-        return [row | {"pan": pixels(pan), "tilt": pixels(tilt)} for row, (pan, tilt) in zip(rows, angles, strict=True)]
+        middles = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2)
+        points = middles - 0.5  # pixel centres at integers
+        in_scene = panorama_directions(points, self.size) if isinstance(world, Sphere) else points
+        for row, (pan, tilt) in zip(rows, world.angles_of(in_scene).tolist(), strict=True):
+            row["pan"] = pixels(pan)
+            row["tilt"] = pixels(tilt)
+        return rows
 
     def pose(self, look: int) -> Tensor:
         """Pose of the head in a look.
@@ -305,25 +327,24 @@ class HeadPath(Record):
             The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
         """
         detections = self.looks[look].in_view
-        best, label = detections.confidence[0], detections.labels[0]
-        chosen = detections.mask[0] & (best >= score)
+        confidence = detections.confidence[0]
+        labels = detections.labels[0]
+        chosen = detections.mask[0] & (confidence >= score)
         if self.target is not None:
-            chosen &= label == self.target
-        return self.views.world.places(detections.boxes[0, chosen], self.pose(look)), label[chosen], best[chosen]
+            chosen &= labels == self.target
+        regions = self.views.world.places(detections.boxes[0, chosen], self.pose(look))
+        return regions, labels[chosen], confidence[chosen]
 
     def outline(self, look: RecordedLook) -> Tensor:
         """Border of the view of a look, `(P, 2)`; it goes on beyond the picture where it crosses its seam."""
         world = self.views.world
         view = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
-        places: Any = world.places(view, self.pose(look.index))
-        if not hasattr(places, "outlines"):
-            x1, y1, x2, y2 = places.boxes[0].tolist()
-            return torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
-        x, y = (world.pixels_of(places.outlines()[0]) + 0.5).unbind(-1)
-        if self.around is not None:
-            step = (x.diff() + self.around / 2) % self.around - self.around / 2
-            x = torch.cat([x[:1], x[:1] + step.cumsum(0)])
-        return torch.stack([x, y], -1)
+        places = world.places(view, self.pose(look.index))
+        if isinstance(places, Regions):
+            x, y = (world.pixels_of(places.outlines()[0]) + 0.5).unbind(-1)
+            return torch.stack([x if self.around is None else _unwrapped(x, self.around), y], -1)
+        x1, y1, x2, y2 = places.boxes[0].tolist()
+        return torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
 
     def belief_map(self, number: int) -> tuple[Grid, Tensor]:
         """Probability of the target, or of any object, in each cell of the scene after a look."""
@@ -331,61 +352,98 @@ class HeadPath(Record):
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
         """Render the views of the head from a picture of the scene in any size."""
-        world, (width, height) = self.views.world, self.size
+        world = self.views.world
+        width, height = self.size
         image = read_region(source, (0, 0, width, height), self.size, 2 * LONGEST)
         # Poses in a panorama are angles, which do not depend on the size of the picture.
-        scene = Panorama(image[..., : image.shape[-1] // 2 * 2], world.size, reach=90) if world.closed else None
-        across, down = image.shape[-1] / width, image.shape[-2] / height
+        even_columns = image[..., : image.shape[-1] // 2 * 2]
+        panorama = Panorama(even_columns, world.size, reach=90) if world.closed else None
         for look in self.looks:
-            if scene is not None:
-                pixels = scene.view(self.pose(look.index))[0]
+            if panorama is None:
+                view = self._window_of(look, image)
             else:
-                x1, y1, x2, y2 = (side * by for side, by in zip(look.region, (across, down) * 2, strict=True))
-                left, top, right, bottom = whole_pixels((x1, y1, x2, y2), (image.shape[-1], image.shape[-2]))
-                pixels = resize(image[None, :, top:bottom, left:right], world.size)[0].clamp(0, 1)
-            x, y = self.views.view_grid.centres[look.action % self.views.cells].tolist()
-            yield LookView(pixels, world.size, look.in_view.boxes[0], (x, y))
+                view, _ = panorama.view(self.pose(look.index))
+            x, y = self._gaze_in_view(look).tolist()
+            yield LookView(view, world.size, look.in_view.boxes[0], (x, y))
 
-    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        views = self.views
-        record: dict[str, Any] = {"fields": list(views.fields), "fovea": views.fovea, "duration": self.duration}
-        record["seconds"] = list(self.seconds)
-        record["aimed"] = views.poses[views.lattice :].tolist()
-        tensors = {"actions": torch.tensor(self.actions), "maps": self.maps}
-        tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
-        return tensors, {"world": _settings(views.world), **record}
+    def _window_of(self, look: HeadLook, image: Tensor) -> Tensor:
+        """Cut the view of a look out of a flat picture `(3, H, W)` in any size, at the size of a view."""
+        height, width = image.shape[-2:]
+        scale_x = width / self.size[0]
+        scale_y = height / self.size[1]
+        x1, y1, x2, y2 = look.region
+        region = (x1 * scale_x, y1 * scale_y, x2 * scale_x, y2 * scale_y)
+        left, top, right, bottom = whole_pixels(region, (width, height))
+        window = image[None, :, top:bottom, left:right]
+        return resize(window, self.views.world.size)[0].clamp(0, 1)
+
+    def _contents(self) -> tuple[dict[str, Tensor], Values]:
+        tensors = {
+            "actions": torch.tensor(self.actions),
+            "maps": self.maps,
+            "values": torch.tensor(self.values, dtype=torch.float64),
+        }
+        record = {
+            "world": _settings(self.views.world),
+            "fields": list(self.views.fields),
+            "fovea": self.views.fovea,
+            "duration": self.duration,
+            "seconds": list(self.seconds),
+            # The poses of the lattice follow from the scene; those of closer looks, which come after them, do not.
+            "aimed": self.views.poses[self.views.lattice :].tolist(),
+        }
+        return tensors, record
 
     @classmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-        settings = record["world"]
-        scene, names = _WORLDS[settings["kind"]]
-        for name in names:
-            check(name in settings, f"world.{name}", "a value", "nothing")
-        given = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
-        options: dict[str, Any] = {name: given[name] for name in names[2:]}
-        world = scene(given["picture"], given["size"], **options)
-        views = Views(world, record["fields"], fovea=record["fovea"])
-        aimed = record.get("aimed")
-        is_known = aimed is not None or len(views.fields) == 1
-        check(is_known, "aimed", "the poses of closer looks", "none, as earlier versions wrote it")
-        for pose in aimed or ():
-            views.add(torch.tensor(pose))
-        actions, cells = tensors["actions"], len(views.world.scene)
-        check(int(actions.max()) < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", int(actions.max()))
-        maps, decision = tensors["maps"], shared["decision"]
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
+        views = _views_of_file(record)
+        cells = len(views.world.scene)
+        actions = tensors["actions"]
+        highest = int(actions.max())
+        check(highest < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", highest)
+        maps = tensors["maps"]
         check(maps.shape[-1] == cells, "maps", f"values of {cells} cells", maps.shape[-1])
-        cell = None if decision is None else decision.cell
-        check(cell is None or cell < cells, "decision.cell", f"a cell number below {cells}", cell)
+        check_decided_cell(shared["decision"], cells)
         values = tensors["values"].tolist() if "values" in tensors else []
         looks = head_looks(views, actions.tolist(), shared["detections"], maps, record["seconds"], values)
         return {"views": views, "looks": looks, "maps": maps, "duration": record.get("duration")}
 
 
-def _settings(world: World) -> dict[str, Any]:
+def _unwrapped(x: Tensor, around: float) -> Tensor:
+    """Join the columns `(P,)` of a closed line, each the shorter way round from the one before, across the seam."""
+    step = (x.diff() + around / 2) % around - around / 2
+    return torch.cat([x[:1], x[:1] + step.cumsum(0)])
+
+
+def _views_of_file(record: Values) -> Views:
+    """Make the views of a path from the JSON values of its file, with the poses of its closer looks."""
+    views = Views(_world_of_file(record["world"]), record["fields"], fovea=record["fovea"])
+    aimed = record.get("aimed")
+    # With one field of view there were no closer looks, also in files that do not say so.
+    is_known = aimed is not None or len(views.fields) == 1
+    check(is_known, "aimed", "the poses of closer looks", "none, as earlier versions wrote it")
+    for pose in aimed or ():
+        views.add(torch.tensor(pose))
+    return views
+
+
+def _world_of_file(settings: Values) -> World:
+    """Make the geometry of a scene, without its picture, from the values that `_settings` described it by."""
+    scene, names = _WORLDS[settings["kind"]]
+    arguments: Values = {}
+    for name in names:
+        check(name in settings, f"world.{name}", "a value", "nothing")
+        value = settings[name]
+        arguments[name] = tuple(value) if isinstance(value, list) else value
+    return scene(arguments.pop("picture"), **arguments)
+
+
+def _settings(world: World) -> Values:
     """Describe the geometry of a scene by JSON values."""
-    what = type(world) if world.still else Sphere  # that of a camera
-    for kind, (made, names) in _WORLDS.items():
-        if what is made:
+    # What a camera shows changes, and its class is a driver's own; its geometry is that of a sphere.
+    geometry = type(world) if world.still else Sphere
+    for kind, (scene, names) in _WORLDS.items():
+        if geometry is scene:
             return {"kind": kind, **{name: getattr(world, name) for name in names}}
     expected = "a scene that files can describe, Panorama, Flat or that of a camera"
     raise InputError(f"views: expected {expected}, got {type(world).__name__}")

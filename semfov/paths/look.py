@@ -49,9 +49,10 @@ class RecordedLook:
 
     def __repr__(self) -> str:
         """Tell number, point, region and number of detections from score 0.1 on in one line."""
-        (x, y), count = self.fixation, int(confident_detections(self.detections).count)
-        seen = f"{count} detection{'s' if count != 1 else ''} from score {CONFIDENT:g} on"
-        return f"{type(self).__name__} {self.number} at ({x:.0f}, {y:.0f}), box {box_text(self.region)}: {seen}"
+        x, y = self.fixation
+        count = int(confident_detections(self.detections).count)
+        detections = f"{count} detection{'s' if count != 1 else ''} from score {CONFIDENT:g} on"
+        return f"{type(self).__name__} {self.number} at ({x:.0f}, {y:.0f}), box {box_text(self.region)}: {detections}"
 
 
 class LookView(NamedTuple):
@@ -65,19 +66,41 @@ class LookView(NamedTuple):
 
 def whole_pixels(box: Sequence[float], size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Round a region to whole pixels, at least one, inside a picture of `(width, height)`."""
-    x1, y1 = (min(max(round(low), 0), most - 1) for low, most in zip(box[:2], size, strict=True))
-    x2, y2 = (min(max(round(high), low + 1), most) for high, low, most in zip(box[2:], (x1, y1), size, strict=True))
-    return x1, y1, x2, y2
+    x1, y1, x2, y2 = box
+    width, height = size
+    left, right = _whole_side(x1, x2, width)
+    top, bottom = _whole_side(y1, y2, height)
+    return left, top, right, bottom
+
+
+def _whole_side(start: float, end: float, length: int) -> tuple[int, int]:
+    """Round a side of a region to whole pixels, at least one, from 0 to a length."""
+    first = min(max(round(start), 0), length - 1)
+    return first, min(max(round(end), first + 1), length)
 
 
 def read_region(source: LargePicture, region: Sequence[float], size: tuple[int, int], across: int) -> Tensor:
-    """Pixels `(3, h, w)` in [0, 1] of a region of a picture of `size`; one wider than `across` is read coarsely."""
-    scale = [there / here for there, here in zip(source.size, size, strict=True)] * 2
-    frame = whole_pixels([n * by for n, by in zip(region, scale, strict=True)], source.size)
-    return source.read(frame, reduction_for((frame[2] - frame[0]) // across)).float() / 255
+    """Read a region of a picture, coarsely if it is wider than needed.
+
+    Args:
+        source: the opened picture, which may have another size than the record's.
+        region: `(x1, y1, x2, y2)`, in pixels of a picture of `size`.
+        size: `(width, height)` of the picture of the record.
+        across: number of columns that are needed.
+
+    Returns:
+        `(3, h, w)` in [0, 1].
+    """
+    x1, y1, x2, y2 = region
+    width, height = source.size
+    scale_x = width / size[0]
+    scale_y = height / size[1]
+    frame = whole_pixels((x1 * scale_x, y1 * scale_y, x2 * scale_x, y2 * scale_y), source.size)
+    left, _, right, _ = frame
+    return source.read(frame, reduction_for((right - left) // across)).float() / 255
 
 
-def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]:
+def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, float | None]:
     """Columns of a table on a look at a cell: its place, its probability, and the most probable cell.
 
     Args:
@@ -86,11 +109,11 @@ def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, Any]
         belief: `(cells,)`, the probability of each cell after the look; None if there is none.
     """
     row, column = divmod(cell, grid.columns)
-    place = {"cell": cell, "column": column, "row": row}
+    columns: dict[str, float | None] = {"cell": cell, "column": column, "row": row}
     if belief is None:
-        return {**place, "probability": None, "highest": None, "highest_cell": None}
+        return {**columns, "probability": None, "highest": None, "highest_cell": None}
     return {
-        **place,
+        **columns,
         "probability": float(belief[cell]),
         "highest": float(belief.max()),
         "highest_cell": int(belief.argmax()),
@@ -107,16 +130,30 @@ def confident_detections(detections: Detections, most: int | None = None) -> Det
 def detections_in_words(
     detections: Detections, classes: Sequence[str], most: int = 3, target: int | None = None
 ) -> str:
-    """Name the most confident detections of a look, before them the best one of the target with its box."""
+    """Name the most confident detections of a look, before them the best one of the target with its box.
+
+    Args:
+        detections: of the look, a batch of one.
+        classes: names of the classes, background first.
+        most: largest number that is named.
+        target: class 1..K; None for none.
+
+    Returns:
+        Classes and scores, such as `cup 0.80 in (10, 20, 30, 40), person 0.60 and 2 more`.
+    """
     confident = confident_detections(detections)
-    labels, scores = confident.labels[0].tolist(), confident.confidence[0].tolist()
+    labels = confident.labels[0].tolist()
+    scores = confident.confidence[0].tolist()
     names = [f"{classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
     if target is not None and bool(detections.mask.any()):
-        best = int(detections.class_scores[0, :, target - 1].argmax())
-        score, place = detections.class_scores[0, best, target - 1], box_text(detections.boxes[0, best].tolist())
-        own = f"{classes[target]} {score:.2f}"
-        if own in names:
-            names.remove(own)
-        names.insert(0, f"{own} in {place}")
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more or "nothing"
+        target_scores = detections.class_scores[0, :, target - 1]
+        best = int(target_scores.argmax())
+        name = f"{classes[target]} {target_scores[best]:.2f}"
+        if name in names:
+            # It is named with its box below, and not again among the others.
+            names.remove(name)
+        names.insert(0, f"{name} in {box_text(detections.boxes[0, best].tolist())}")
+    if not names:
+        return "nothing"
+    named = ", ".join(names[:most])
+    return f"{named} and {len(names) - most} more" if len(names) > most else named

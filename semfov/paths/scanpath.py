@@ -19,7 +19,8 @@ from semfov.errors import InputError, check
 from semfov.io.schema import Array, Field, Json, Maybe, Number, Object, Text
 from semfov.kinds import FOVEA
 from semfov.paths.base import Moment, Record
-from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
+from semfov.paths.conversion import Values
+from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, SharedFields, check_decided_cell
 from semfov.paths.fovea import FoveaLook, FoveaLooks, moment_look
 from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import LookView
@@ -100,25 +101,34 @@ class _CellRecord(Record):
         width, height = (int(side) for side in self.grid.extent)
         return width, height
 
-    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
-        tensors = {name: getattr(self, name) for name in self._tensors if getattr(self, name) is not None}
-        record = {name: getattr(self, name) for name in self._plain}
-        record |= {"grid": [self.grid.columns, self.grid.rows], "size": size}
-        return tensors, {**record, "seconds": [dict(stages) for stages in self.seconds]}
+    def _contents(self) -> tuple[dict[str, Tensor], Values]:
+        tensors = {}
+        for name in self._tensors:
+            tensor = getattr(self, name)
+            if tensor is not None:
+                tensors[name] = tensor
+        grid = self.grid
+        record = {
+            **{name: getattr(self, name) for name in self._plain},
+            "grid": [grid.columns, grid.rows],
+            "size": grid.size.tolist() if isinstance(grid.size, Tensor) else list(grid.size),
+            "seconds": [dict(stages) for stages in self.seconds],
+        }
+        return tensors, record
 
     @classmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-        looks, seconds, decision = len(shared["detections"]), record["seconds"], shared["decision"]
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
         columns, rows = record["grid"]
         grid = Grid(columns, rows, tuple(record["size"]))
-        check(len(seconds) in (0, looks), "seconds", f"times of {looks} looks, or none", len(seconds))
-        cell = None if decision is None else decision.cell
-        check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
+        looks = len(shared["detections"])
+        seconds = len(record["seconds"])
+        check(seconds in (0, looks), "seconds", f"times of {looks} looks, or none", seconds)
+        check_decided_cell(shared["decision"], len(grid))
         for look in shared["closer"]:
             check((look.cell or 0) < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
-        kept = {name: tensors.get(name) for name in cls._tensors} | {name: record[name] for name in cls._plain}
-        return {**kept, "grid": grid}
+        optional_tensors = {name: tensors.get(name) for name in cls._tensors}
+        plain_values = {name: record[name] for name in cls._plain}
+        return {**optional_tensors, **plain_values, "grid": grid}
 
 
 class ScanpathWords(Words):
@@ -134,17 +144,18 @@ class ScanpathWords(Words):
     def describe(self) -> str:
         """Describe the outcome of the episode in one line."""
         record = self.record
-        shifts = f"{record.shifts} gaze shift{'s' if record.shifts != 1 else ''}"
+        looks = f"{record.shifts} gaze shift{'s' if record.shifts != 1 else ''}"
         if record.target is None:
-            return f"explored with {shifts}: {self.objects}"
-        if record.decision is None:
-            return f"“{record.target_name}” {'found after' if record.found else 'not found in'} {shifts}"
-        if record.closer:
-            shifts += f" and {len(record.closer)} closer look{'s' if len(record.closer) != 1 else ''}"
+            return f"explored with {looks}: {self.objects}"
         name = f"“{record.target_name}”"
-        absent = record.decision.outcome == "absent"
-        verdict = f"{name} {self.doubt}not there" if absent else self.verdict(name)
-        return f"{verdict} after {shifts} ({self._certainty(record.decision)})"
+        if record.decision is None:
+            return f"{name} {'found after' if record.found else 'not found in'} {looks}"
+        closer = len(record.closer)
+        if closer:
+            looks += f" and {closer} closer look{'s' if closer != 1 else ''}"
+        is_absent = record.decision.outcome == "absent"
+        verdict = f"{name} {self.doubt}not there" if is_absent else self.verdict(name)
+        return f"{verdict} after {looks} ({self._certainty(record.decision)})"
 
     def _certainty(self, decision: Decision) -> str:
         """Say how sure the decision is."""
@@ -158,11 +169,14 @@ class ScanpathWords(Words):
     def lines(self) -> list[str]:
         """The fixated cells, the first and the last of many, and the grid."""
         grid = self.record.grid
-        cells = [f"({cell % grid.columns}, {cell // grid.columns})" for cell in self.record.cells.tolist()]
-        path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
+        cells = []
+        for cell in self.record.cells.tolist():
+            row, column = divmod(cell, grid.columns)
+            cells.append(f"({column}, {row})")
+        path = " ".join(cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]])
         width, height = grid.extent.tolist()
         cells_of_grid = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
-        return [f"looks at (column, row): {' '.join(path)} of {cells_of_grid}"]
+        return [f"looks at (column, row): {path} of {cells_of_grid}"]
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -213,7 +227,8 @@ class Scanpath(_CellRecord):
     _format = _FORMAT
     _tensors = "cells", "fixations", "probabilities", "values", "posterior", "presence"
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
+        # A function that makes the map later cannot be pickled.
         return {**vars(self), "probabilities": self.probabilities}
 
     @cached_property
@@ -304,7 +319,7 @@ class Scanpath(_CellRecord):
             else:
                 yield LookView(next(views), self.size, look.detections.boxes[0], look.fixation)
 
-    def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> dict[str, Any]:
+    def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> Values:
         """Collect the data of the scanpath for a page (`semfov.report.episode.episode_data`)."""
         from semfov.report.episode import episode_data
 
@@ -317,61 +332,78 @@ class Scanpath(_CellRecord):
 
         return scanpath_html(self)
 
-    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], Values]:
         tensors, record = super()._contents()
-        record |= {"placement": None, "settings": None}
         closer = [look for look in self.looks if look.is_closer]
         if closer:
             tensors["closer_regions"] = torch.tensor([look.region for look in closer], dtype=torch.float64)
             tensors["closer_values"] = torch.tensor([look.value for look in closer], dtype=torch.float64)
-        if self.stimulus is not None:
-            tensors["canvas"] = self.stimulus.canvas
-            record["placement"] = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
-            record["settings"] = dict(self.stimulus.settings)
-        return tensors, record
+        if self.stimulus is None:
+            return tensors, {**record, "placement": None, "settings": None}
+        tensors["canvas"] = self.stimulus.canvas
+        placement = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
+        return tensors, {**record, "placement": placement, "settings": dict(self.stimulus.settings)}
 
     @classmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-        kept = super()._fields(tensors, record, shared)
-        grid = kept["grid"]
-        cells, most, values = len(grid), int(tensors["cells"].max()), tensors["values"].shape[-1]
-        check(values == cells, "values", f"one for each of {cells} cells", values)
-        check(most < cells, "cells", f"cell numbers below {cells}", most)
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
+        fields = super()._fields(tensors, record, shared)
+        grid = fields["grid"]
+        columns = tensors["values"].shape[-1]
+        check(columns == len(grid), "values", f"one for each of {len(grid)} cells", columns)
+        highest = int(tensors["cells"].max())
+        check(highest < len(grid), "cells", f"cell numbers below {len(grid)}", highest)
         looks = _looks_of_file(grid, tensors, record, shared)
-        return {**kept, "looks": looks, "stimulus": Stimulus.restored(tensors, record)}
+        return {**fields, "looks": looks, "stimulus": Stimulus.restored(tensors, record)}
 
 
 def _looks_of_file(
-    grid: Grid, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]
+    grid: Grid, tensors: dict[str, Tensor], record: Values, shared: SharedFields
 ) -> tuple[FoveaLook, ...]:
     """Make the looks of a scanpath from the tensors and values of a file.
 
+    Detections are of all looks in their order; other tensors are of the fixations alone, or of the closer looks alone.
     Closer looks of earlier versions have no number: they are in `closer` alone, not among the looks.
     """
-    numbered = {close_up.number: close_up for close_up in shared["closer"] if close_up.number is not None}
-    detections, seconds = shared["detections"], record["seconds"]
+    close_ups = {close_up.number: close_up for close_up in shared["closer"] if close_up.number is not None}
+    detections = shared["detections"]
+    seconds = record["seconds"] or [{}] * len(detections)
+    cells = tensors["cells"].tolist()
     regions = tensors.get("closer_regions", torch.zeros(0, 4)).tolist()
     chances = tensors.get("closer_values", torch.zeros(0)).tolist()
-    cells, points = tensors["cells"].tolist(), tensors["fixations"].tolist()
     expected = f"{len(cells)} fixations and {len(regions)} closer looks"
     check(len(detections) == len(cells) + len(regions), "lengths", expected, len(detections))
-    check(len(numbered) == len(regions) == len(chances), "closer_regions", f"{len(numbered)} regions", len(regions))
-    posterior, presence = tensors.get("posterior"), tensors.get("presence")
-    made = FoveaLooks(grid)
-    fixation = 0
-    for number, seen in enumerate(detections):
-        stages = seconds[number] if seconds else {}
-        if number in numbered:
-            closer = number - fixation
-            made.look_closely(numbered[number].cell or 0, regions[closer], seen, stages, chances[closer])
-            continue
-        cell = cells[fixation]
-        value = float(tensors["values"][fixation - 1, cell]) if fixation else None
-        probability = None if posterior is None else posterior[fixation]
-        there = None if presence is None else float(presence[fixation])
-        made.fixate(cell, points[fixation], seen, stages, value, probability, there)
-        fixation += 1
-    return tuple(made.looks)
+    have_regions = len(close_ups) == len(regions) == len(chances)
+    check(have_regions, "closer_regions", f"{len(close_ups)} regions", len(regions))
+    points = tensors["fixations"].tolist()
+    fovea = FoveaLooks(grid)
+    for number, (seen, stages) in enumerate(zip(detections, seconds, strict=True)):
+        closer = sum(earlier < number for earlier in close_ups)  # closer looks before this one
+        fixation = number - closer
+        if number in close_ups:
+            fovea.look_closely(close_ups[number].cell or 0, regions[closer], seen, stages, chances[closer])
+        else:
+            belief = _belief_of_file(tensors, fixation)
+            fovea.fixate(cells[fixation], points[fixation], seen, stages, *belief)
+    return tuple(fovea.looks)
+
+
+def _belief_of_file(tensors: Mapping[str, Tensor], fixation: int) -> tuple[float | None, Tensor | None, float | None]:
+    """Read what was believed at a fixation: the value of its cell, and what it makes of the target's probabilities.
+
+    Args:
+        tensors: `cells` `(f,)` and `values` `(f, X·Y)`, and of a search `posterior` `(f, X·Y)` and `presence` `(f,)`.
+        fixation: its number, from 0.
+
+    Returns:
+        The value for which the cell was chosen, and after the fixation the probability of the target in each cell
+        `(X·Y,)` and in the picture.
+    """
+    posterior = tensors.get("posterior")
+    presence = tensors.get("presence")
+    # A cell is chosen by its value after the fixation before; the start is not chosen.
+    value = float(tensors["values"][fixation - 1, int(tensors["cells"][fixation])]) if fixation else None
+    probability = None if posterior is None else posterior[fixation]
+    return value, probability, None if presence is None else float(presence[fixation])
 
 
 _FOVEA = Format(
@@ -465,15 +497,15 @@ class FoveaMoment(_CellRecord, Moment):
         return self.grid, self.probability
 
     @classmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-        check(len(shared["detections"]) == 1, "lengths", "one look", len(shared["detections"]))
-        kept = super()._fields(tensors, record, shared)
-        cells, visited = len(kept["grid"]), len(tensors["visited"])
-        check(visited == cells, "visited", f"{cells} cells", visited)
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
+        looks = shared["detections"]
+        check(len(looks) == 1, "lengths", "one look", len(looks))
+        fields = super()._fields(tensors, record, shared)
+        grid = fields["grid"]
+        visited = len(tensors["visited"])
+        check(visited == len(grid), "visited", f"{len(grid)} cells", visited)
         for name in ("cell", "next_cell"):
-            check(record[name] < cells, name, f"a cell number below {cells}", record[name])
+            check(record[name] < len(grid), name, f"a cell number below {len(grid)}", record[name])
         stages = record["seconds"][0] if record["seconds"] else {}
-        look = moment_look(
-            kept["grid"], record["number"], record["cell"], shared["detections"][0], tensors["probability"], stages
-        )
-        return {**kept, "looks": (look,)}
+        look = moment_look(grid, record["number"], record["cell"], looks[0], tensors["probability"], stages)
+        return {**fields, "looks": (look,)}

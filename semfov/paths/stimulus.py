@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.data.windowed import LargePicture, resized
 from semfov.detection.placement import Placement, resize
-from semfov.errors import check, check_shape
+from semfov.errors import InputError, check, check_shape
 from semfov.eye import Eye
 from semfov.sensor import Sensor
 from semfov.sensor.named import sensor_of
@@ -45,19 +45,20 @@ class Stimulus:
     @classmethod
     def restored(cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Self | None:
         """Make the stimulus from the content of a file, and check that its parts fit each other."""
-        values = [record[name] for name in ("placement", "settings") if record.get(name) is not None]
-        if "canvas" not in tensors and not values:
+        settings = record.get("settings")
+        placement_values = record.get("placement")
+        stimulus_parts = (tensors.get("canvas"), placement_values, settings)
+        if all(part is None for part in stimulus_parts):
             return None
-        got = len(tensors.keys() & {"photograph", "canvas"}) + len(values)
-        check(got == 4, "photograph", "photograph, canvas, placement and settings together", f"{got} of these 4")
-        placement_values, settings = values
+        if "photograph" not in tensors or "canvas" not in tensors or placement_values is None or settings is None:
+            got = sum(part is not None for part in (tensors.get("photograph"), *stimulus_parts))
+            expected = "photograph, canvas, placement and settings together"
+            raise InputError(f"photograph: expected {expected}, got {got} of these 4")
         placement = Placement(**{name: tuple(pair) for name, pair in placement_values.items()})
         canvas = tensors["canvas"]
-        for axis in (0, 1):
-            room = canvas.shape[2 - axis]
-            side = placement.size[axis] * placement.scale[axis]
-            lies_inside = round(side) >= 1 and placement.offset[axis] + round(side) <= room
-            check(lies_inside, "placement", f"the photograph on a canvas of {room} px", f"{side:g} px")
+        height, width = canvas.shape[1:]
+        _check_on_canvas(placement, 0, width)
+        _check_on_canvas(placement, 1, height)
         return cls(canvas, placement, settings)
 
     def views(self, fixations: Tensor) -> list[Tensor]:
@@ -72,32 +73,54 @@ class Stimulus:
         check_shape(fixations, "fixations", None, 2)
         settings = self.settings["sensor"]
         sensor = sensor_of(settings) if self.sensor is None else self.sensor
-        left, top = self.placement.offset
-        width, height = (round(n * s) for n, s in zip(self.placement.size, self.placement.scale, strict=True))
-        larger = max(self.placement.size) / settings["reference"]
+        placement = self.placement
+        # The sensor's blur is set for photographs of a reference size; a larger one is seen at more pixels a degree.
+        magnification = max(placement.size) / settings["reference"]
+        left, top = placement.offset
+        width = round(placement.size[0] * placement.scale[0])
+        height = round(placement.size[1] * placement.scale[1])
+        views = []
         with torch.no_grad():
             canvas = (self.canvas[None].double() / 255).to(sensor.like)
-            state = sensor.open(canvas, canvas.new_tensor(self.placement.scale) * larger)
+            state = sensor.open(canvas, canvas.new_tensor(placement.scale) * magnification)
             # One at a time: all views of a large canvas at once would take gigabytes.
-            return [
-                sensor.picture(state, point[None])[0, :, top : top + height, left : left + width].float().cpu().clone()
-                for point in self.placement.points_to_canvas(fixations.to(canvas))
-            ]
+            for point in placement.points_to_canvas(fixations.to(canvas)):
+                picture = sensor.picture(state, point[None])[0]
+                view = picture[:, top : top + height, left : left + width]
+                views.append(view.float().cpu().clone())
+        return views
+
+
+def _check_on_canvas(placement: Placement, axis: int, length: int) -> None:
+    """Raise `InputError` unless a photograph lies on a canvas, of this length, along x (0) or y (1)."""
+    side = placement.size[axis] * placement.scale[axis]
+    lies_inside = round(side) >= 1 and placement.offset[axis] + round(side) <= length
+    check(lies_inside, "placement", f"the photograph on a canvas of {length} px", f"{side:g} px")
 
 
 def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
-    """Reduce a picture to the bytes that a record keeps for its drawings, `(3, h, w)`."""
+    """Reduce a picture to the bytes that a record keeps for its drawings.
+
+    Args:
+        picture: the opened picture, or pixels `(3, H, W)` in [0, 1].
+
+    Returns:
+        `(3, h, w)`, with at most `LONGEST` pixels along the longer side.
+    """
     if isinstance(picture, Tensor):
         height, width = picture.shape[-2:]
     else:
         width, height = picture.size
     scale = min(1.0, LONGEST / max(width, height))
-    reduced_size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    reduced_width = max(1, round(width * scale))
+    reduced_height = max(1, round(height * scale))
     if isinstance(picture, Tensor):
-        return in_bytes(picture if scale == 1 else resize(picture[None], reduced_size)[0])
+        if scale == 1:
+            return in_bytes(picture)
+        return in_bytes(resize(picture[None], (reduced_width, reduced_height))[0])
     pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
     # Frames may share the memory of a camera; a copy in the order of memory is made ten times faster than another.
-    return resized(pixels, reduced_size[::-1])[0].clone()
+    return resized(pixels, (reduced_height, reduced_width))[0].clone()
 
 
 def in_bytes(image: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -16,7 +16,8 @@ from semfov.errors import check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
 from semfov.kinds import WINDOWS
 from semfov.paths.base import Moment, Record
-from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format
+from semfov.paths.conversion import Values
+from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, SharedFields
 from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import Box, RecordedLook
 from semfov.paths.words import MomentWords, Words
@@ -86,7 +87,6 @@ class WindowWords(Words):
         "closer absent": "No closer look was sure enough, and the target is probably absent.",
         "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
     }
-    # `unseen` is for a photograph in which no look shows a place that may hold the target.
 
     @property
     def decided_by(self) -> str:
@@ -104,13 +104,16 @@ class WindowWords(Words):
 
     def why_it_ended(self) -> str:
         """Explain in one sentence why it ended, or what a decision without candidates says."""
+        return self._sentences["unseen"] if self._lacked_candidates() else super().why_it_ended()
+
+    def _lacked_candidates(self) -> bool:
+        """Tell whether a search of a photograph decided although no look shows a place that may hold the target."""
         record = self.record
-        decided_in_photograph = record.ending == "decision" and record.lattice.levels == 1 and not record.closer
-        if decided_in_photograph and record.target is not None:
-            shown = [float(look.show[record.target - 1]) for look in record.window_looks]
-            if all(chance < PhotographPlaces.least for chance in shown):
-                return self._sentences["unseen"]
-        return super().why_it_ended()
+        is_photograph = record.lattice.levels == 1
+        if record.target is None or not is_photograph or record.ending != "decision" or record.closer:
+            return False
+        chances = [float(look.show[record.target - 1]) for look in record.window_looks]
+        return all(chance < PhotographPlaces.least for chance in chances)
 
     @property
     def objects(self) -> str:
@@ -119,13 +122,15 @@ class WindowWords(Words):
         Such as `36 people found; expect 36 to 54 in all`, or `No cup found`. Without a class to search for no number in
         all is given, since the small rests of all classes add up to many.
         """
-        text = super().objects
+        record = self.record
         expected = []
-        for label in self.record.sought:
+        for label in record.sought:
             limits = self._range(label)
-            if limits is not None:
-                name = f" {plural(self.record.classes[label])}" if len(self.record.sought) > 1 else ""
-                expected.append(f"{_range_in_words(*limits)}{name}")
+            if limits is None:
+                continue
+            number = _range_in_words(*limits)
+            expected.append(f"{number} {plural(record.classes[label])}" if len(record.sought) > 1 else number)
+        text = super().objects
         return f"{text}; expect {', '.join(expected)} in all" if expected else text
 
     def _number_in_all(self, label: int) -> str:
@@ -159,11 +164,12 @@ class WindowWords(Words):
     @property
     def value(self) -> str:
         """What the values of looks are (`semfov.zoom.policy`); slices are chosen by scores (`semfov.zoom.slices`)."""
-        searched = self.record.decision is not None
-        by_score = (self.decided_by if searched else self.measure) == "score"
-        if by_score or (self.record.lattice.levels == 1 and not searched):
+        is_search = self.record.decision is not None
+        is_photograph = self.record.lattice.levels == 1
+        measure = self.decided_by if is_search else self.measure
+        if measure == "score" or (is_photograph and not is_search):
             return "the sum of the scores that the first look has in it"
-        if searched:
+        if is_search:
             return "the probability that it finds the target, also of what closer looks in it would find"
         return "the expected number of new objects in it, with a share of those that closer looks would then show"
 
@@ -172,8 +178,10 @@ class WindowWords(Words):
         """The windows of the lattice and of the closer looks."""
         lattice = self.record.lattice
         width, height = lattice.canvas
-        magnifications = {*lattice.magnifications, *(look.window.fixation[2] for look in self.record.window_looks)}
-        names = list(dict.fromkeys(f"{magnification:.2g}" for magnification in sorted(magnifications)))
+        closer_ones = {look.window.fixation[2] for look in self.record.window_looks}
+        magnifications = sorted({*lattice.magnifications, *closer_ones})
+        # Magnifications that read the same are named once.
+        names = list(dict.fromkeys(f"{magnification:.2g}" for magnification in magnifications))
         listed = ", ".join(names) if len(names) <= 6 else f"from {names[0]} to {names[-1]}"
         return f"windows of {width} × {height} px at magnification{'s' if len(names) > 1 else ''} {listed}"
 
@@ -190,6 +198,7 @@ class WindowWords(Words):
 
 
 def _range_in_words(low: int, high: int) -> str:
+    """Write limits of a number, or one number where they are the same."""
     return f"{low} to {high}" if low < high else str(low)
 
 
@@ -234,8 +243,10 @@ def looks_at_windows(
 ) -> tuple[LookAtWindow, ...]:
     """Make the looks at windows from their columns (`look_at_window`); without `seconds` their times are not known."""
     times: Sequence[float | None] = seconds or [None] * len(shown)
-    columns = enumerate(zip(shown, times, values, strict=True))
-    return tuple(look_at_window(one, lattice, number, time, value) for number, (one, time, value) in columns)
+    looks = []
+    for number, (window_look, time, value) in enumerate(zip(shown, times, values, strict=True)):
+        looks.append(look_at_window(window_look, lattice, number, time, value))
+    return tuple(looks)
 
 
 def _has_found(record: "ZoomPath") -> bool:
@@ -316,21 +327,28 @@ class ZoomPath(Record):
     def _numbers(self) -> dict[int, tuple[float, float]]:
         """Mean and variance of the number of objects of each class; NaN where none is estimated.
 
-        Where the detector hardly reacts to a class, one is estimated in pictures that are like those of the fit alone.
+        The objects that no look has shown are shared among the classes by the sums of their probabilities.
         """
-        more, spread = self.unseen or (0.0, 0.0)
-        sought = self.sought or tuple(self.candidates.labels.unique().tolist())
-        counted = {*self.sought, *self.objects.labels.tolist()} if self._familiar else set[int]()
-        chances = {label: self.candidates.of([label]).scores for label in sought}
-        sums = {label: float(each.double().sum()) + 1e-9 for label, each in chances.items()}
+        labels = self.sought or tuple(self.candidates.labels.unique().tolist())
+        chances = {label: self.candidates.of([label]).scores for label in labels}
+        sums = {label: float(chances[label].double().sum()) + 1e-9 for label in labels}  # not 0, to divide by it
+        mean_unseen, variance_unseen = self.unseen or (0.0, 0.0)
         numbers = {}
-        for label, each in chances.items():
-            share = sums[label] / sum(sums.values())
+        for label in labels:
             if self._reacts_to([label]):
-                numbers[label] = number_of(each, (share * more, share * spread), self.spread)
+                share = sums[label] / sum(sums.values())
+                unseen = (share * mean_unseen, share * variance_unseen)
+                numbers[label] = number_of(chances[label], unseen, self.spread)
+            elif label in self._countable_if_faint:
+                numbers[label] = number_of_faint(chances[label])
             else:
-                numbers[label] = number_of_faint(each) if label in counted else (math.nan, math.nan)
+                numbers[label] = (math.nan, math.nan)
         return numbers
+
+    @cached_property
+    def _countable_if_faint(self) -> set[int]:
+        """Classes that have a number where the detector hardly reacts to them: in pictures like those of the fit."""
+        return {*self.sought, *self.objects.labels.tolist()} if self._familiar else set()
 
     @cached_property
     def _familiar(self) -> bool:
@@ -346,41 +364,59 @@ class ZoomPath(Record):
         """`(width, height)` of the picture in pixels."""
         return self.lattice.size
 
-    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], Values]:
+        looks = self.window_looks
         tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
         if self.candidates.track_ids is not None:
             tensors["object_track_ids"] = self.candidates.track_ids
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
-        tensors["cut"] = torch.cat([look.cut for look in self.window_looks])
-        tensors["show"] = torch.stack([look.show for look in self.window_looks])
-        windows = [{name: getattr(look.window, name) for name in _WINDOW_VALUES} for look in self.window_looks]
-        unseen = None if self.unseen is None else list(self.unseen)
-        lattice = {name: getattr(self.lattice, name) for name in _LATTICE}
-        numbers = {"unseen": unseen, "spread": self.spread, "seconds": list(self.seconds)}
-        return tensors, {"lattice": lattice, "windows": windows, **numbers}
+        tensors["cut"] = torch.cat([look.cut for look in looks])
+        tensors["show"] = torch.stack([look.show for look in looks])
+        record = {
+            "lattice": {name: getattr(self.lattice, name) for name in _LATTICE},
+            "windows": [_values_of(look.window) for look in looks],
+            "unseen": None if self.unseen is None else list(self.unseen),
+            "spread": self.spread,
+            "seconds": list(self.seconds),
+        }
+        return tensors, record
 
     @classmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
         lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
-        boxes, scores, labels, passes = (tensors[f"object_{name}"] for name in _OBJECTS)
-        objects = Objects(boxes, scores, labels, passes, track_ids=tensors.get("object_track_ids"))
-        unseen = record.get("unseen") and tuple(record["unseen"])
-        looks, classes = shared["detections"], shared["classes"]
-        check(len(record["seconds"]) in (0, len(looks)), "seconds", f"{len(looks)} times, or none", record["seconds"])
-        for name, values, most in (("labels", objects.labels, len(classes)), ("passes", objects.passes, len(looks))):
-            fits = not len(values) or int(values.max()) < most
-            check(fits, f"object_{name}", f"numbers below {most}", values.tolist())
-        windows = [_window_from(each, lattice) for each in record["windows"]]
+        detections = shared["detections"]
+        seconds = record["seconds"]
+        check(len(seconds) in (0, len(detections)), "seconds", f"{len(detections)} times, or none", seconds)
+        _check_below("object_labels", tensors, len(shared["classes"]))
+        _check_below("object_passes", tensors, len(detections))
+        windows = [_window_from(values, lattice) for values in record["windows"]]
         cuts = tensors["cut"].split(record["lengths"])
-        columns = zip(windows, looks, cuts, tensors["show"], strict=True)
-        shown = [WindowLook(window, detections, cut, show, None) for window, detections, cut, show in columns]
+        shown = [
+            WindowLook(window, seen, cut, show, None)
+            for window, seen, cut, show in zip(windows, detections, cuts, tensors["show"], strict=True)
+        ]
+        boxes, scores, labels, passes = (tensors[f"object_{name}"] for name in _OBJECTS)
+        unseen = record.get("unseen")
+        spread = record.get("spread")
         return {
             "lattice": lattice,
-            "looks": looks_at_windows(shown, lattice, tensors["values"].tolist(), record["seconds"]),
-            "candidates": objects,
-            "unseen": unseen,
-            "spread": SPREAD if record.get("spread") is None else record["spread"],
+            "looks": looks_at_windows(shown, lattice, tensors["values"].tolist(), seconds),
+            "candidates": Objects(boxes, scores, labels, passes, track_ids=tensors.get("object_track_ids")),
+            "unseen": None if unseen is None else tuple(unseen),
+            "spread": SPREAD if spread is None else spread,
         }
+
+
+def _check_below(name: str, tensors: Mapping[str, Tensor], limit: int) -> None:
+    """Raise `InputError` unless all numbers of a tensor of a file are below a limit."""
+    numbers = tensors[name]
+    is_below = not len(numbers) or int(numbers.max()) < limit
+    check(is_below, name, f"numbers below {limit}", numbers.tolist())
+
+
+def _values_of(window: Window) -> Values:
+    """Describe a window by the JSON values from which `_window_from` makes it again."""
+    return {name: getattr(window, name) for name in _WINDOW_VALUES}
 
 
 class WindowMomentWords(WindowWords, MomentWords):
@@ -468,35 +504,35 @@ class WindowMoment(ZoomPath, Moment):
         objects = self.objects
         if objects.track_ids is None:
             return ""
+        columns = (objects.track_ids.tolist(), objects.boxes.tolist(), objects.scores.tolist())
         lines = []
-        for number, box, score in zip(
-            objects.track_ids.tolist(), objects.boxes.tolist(), objects.scores.tolist(), strict=True
-        ):
-            x1, y1, x2, y2 = box
-            place = f"{x1 + 1:.2f},{y1 + 1:.2f},{x2 - x1:.2f},{y2 - y1:.2f}"
-            lines.append(f"{self.number + 1},{number},{place},{score:.4f},-1,-1,-1\n")
+        for number, (x1, y1, x2, y2), score in zip(*columns, strict=True):
+            box = f"{x1 + 1:.2f},{y1 + 1:.2f},{x2 - x1:.2f},{y2 - y1:.2f}"
+            lines.append(f"{self.number + 1},{number},{box},{score:.4f},-1,-1,-1\n")
         return "".join(lines)
 
-    def _contents(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _contents(self) -> tuple[dict[str, Tensor], Values]:
         tensors, record = super()._contents()
-        window = {name: getattr(self.next_window, name) for name in _WINDOW_VALUES}
-        return {**tensors, **track_tensors(self.tracks)}, {
-            **record,
-            "number": self.number,
-            "next_window": window,
-            "lost": self.lost,
-        }
+        record["number"] = self.number
+        record["next_window"] = _values_of(self.next_window)
+        record["lost"] = self.lost
+        return {**tensors, **track_tensors(self.tracks)}, record
 
     @classmethod
-    def _fields(cls, tensors: dict[str, Tensor], record: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-        made = super()._fields(tensors, record, shared)
-        window = _window_from(record["next_window"], made["lattice"])
-        known = {"number": record["number"], "lost": record.get("lost", False), "tracks": tracks_of(tensors)}
-        return {**made, **known, "next_window": window}
+    def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
+        fields = super()._fields(tensors, record, shared)
+        return {
+            **fields,
+            "number": record["number"],
+            "lost": record.get("lost", False),
+            "tracks": tracks_of(tensors),
+            "next_window": _window_from(record["next_window"], fields["lattice"]),
+        }
 
 
-def _window_from(values: Mapping[str, Any], lattice: Lattice) -> Window:
+def _window_from(values: Values, lattice: Lattice) -> Window:
     """Make the window with these JSON values; raise `InputError` where the picture has no such level."""
-    check(values["level"] < lattice.levels, "windows", f"levels below {lattice.levels}", values["level"])
-    within = values["within"] and tuple(values["within"])
-    return Window(tuple(values["fixation"]), values["level"], tuple(values["cells"]), within)
+    level = values["level"]
+    check(level < lattice.levels, "windows", f"levels below {lattice.levels}", level)
+    within = None if values["within"] is None else tuple(values["within"])
+    return Window(tuple(values["fixation"]), level, tuple(values["cells"]), within)
