@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.errors import check, printable
+from semfov.errors import InputError, check, printable
 from semfov.io.files import read_json
 
 Area = tuple[float, float, float, float]
@@ -51,13 +51,19 @@ def read_areas(areas: AreasLike, size: tuple[int, int], names: Sequence[str] = (
     """
     boxes: Mapping[str, object] = boxes_of(areas)
     if boxes and all(isinstance(value, Mapping) for value in boxes.values()):
-        boxes_here = next((boxes[name] for name in names if name in boxes), None)
-        got = f"those of {', '.join(map(repr, boxes))}"
-        check(boxes_here is not None, "areas", f"boxes for {' or '.join(dict.fromkeys(names))}", got)
-        assert isinstance(boxes_here, Mapping)
-        boxes = boxes_here
+        boxes = _boxes_in_picture(boxes, names)
     check(0 < len(boxes) <= _MOST, "areas", f"1 to {_MOST} areas by name", len(boxes))
     return {name: _checked(name, box, size) for name, box in boxes.items()}
+
+
+def _boxes_in_picture(boxes_by_picture: Mapping[str, object], names: Sequence[str]) -> Mapping[str, object]:
+    """Find the boxes of the picture with one of these names."""
+    for name in names:
+        boxes = boxes_by_picture.get(name)
+        if isinstance(boxes, Mapping):
+            return boxes
+    expected = f"boxes for {' or '.join(dict.fromkeys(names))}"
+    raise InputError(f"areas: expected {expected}, got those of {', '.join(map(repr, boxes_by_picture))}")
 
 
 def boxes_of(areas: AreasLike) -> Boxes | Mapping[str, Boxes]:
@@ -97,22 +103,35 @@ def _parsed(text: str) -> dict[str, Sequence[float]]:
 
 
 def _checked(name: object, box: object, size: tuple[int, int]) -> Area:
-    """Check name and edges of an area."""
+    """Check name and edges of an area.
+
+    Args:
+        name: a short text that can be printed.
+        box: left, top, right and bottom edge in pixels.
+        size: `(width, height)` of the picture in pixels.
+    """
     is_named = isinstance(name, str) and 0 < len(name) <= _LONGEST and name == printable(name)
     check(is_named, "areas", f"names of 1 to {_LONGEST} letters", repr(name)[:80])
     argument = f"areas[{name!r}]"
-    expected = "four numbers: left, top, right and bottom edge in pixels"
-    check(isinstance(box, Sequence) and not isinstance(box, str) and len(box) == 4, argument, expected, box)
-    assert isinstance(box, Sequence)
-    try:
-        left, top, right, bottom = (float(edge) for edge in box)
-    except (TypeError, ValueError):
-        check(False, argument, expected, box)
+    edges = _numbers_of(box)
+    if edges is None or len(edges) != 4:
+        raise InputError(f"{argument}: expected four numbers: left, top, right and bottom edge in pixels, got {box}")
+    left, top, right, bottom = edges
     width, height = size
     lies_inside = 0 <= left < right <= width and 0 <= top < bottom <= height
     inside = f"left < right and top < bottom in a picture of {width} × {height} px (right = left + width)"
     check(lies_inside, argument, inside, f"{left:g},{top:g},{right:g},{bottom:g}")
     return left, top, right, bottom
+
+
+def _numbers_of(box: object) -> list[float] | None:
+    """Convert what should be a sequence of numbers; None if it is something else."""
+    if not isinstance(box, Sequence) or isinstance(box, str):
+        return None
+    try:
+        return [float(edge) for edge in box]
+    except (TypeError, ValueError):
+        return None
 
 
 def share_in(density: Tensor, area: Area) -> float:

@@ -21,8 +21,8 @@ from semfov.detection.exchange import CocoResult, category_ids, coco_results, na
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
 from semfov.io.tables import csv_text, digits, pixels
-from semfov.paths.georeference import PlaceOnEarth, box_on_earth, georeference
-from semfov.paths.look import confident_detections
+from semfov.paths.georeference import Geometry, PlaceOnEarth, box_on_earth, georeference
+from semfov.paths.look import RecordedLook, confident_detections
 from semfov.paths.outcome import Outcome
 from semfov.paths.words import Words
 from semfov.words import RECORD, OtherWords
@@ -97,19 +97,15 @@ class Conversion(Outcome, OtherWords):
         Returns:
             One dictionary for each look.
         """
-        # Of several closer looks after one look, the surest counts.
+        # Of several closer looks after one look, the surest counts: it comes last.
         closer = {look.of_look: look.place for look in sorted(self.closer, key=lambda look: look.place)}
         brought = Counter(self.objects.passes.tolist())
         rows: list[Values] = []
         for look in self:
-            detections = confident_detections(look.detections)
-            count = int(detections.count)
             row: Values = {
                 "look": look.number,
                 **_rounded_place(*look.fixation, *look.region),
-                "detections": count,
-                "seen": self.classes[int(detections.labels[0, 0])] if count else None,
-                "score": digits(float(detections.confidence[0, 0])) if count else None,
+                **self._detection_columns(look),
                 "seconds": None if look.seconds is None else round(look.seconds, 3),
                 "value": digits(look.value),
                 "closer": digits(closer.get(look.index)),
@@ -119,6 +115,18 @@ class Conversion(Outcome, OtherWords):
                 row[name] = digits(value) if isinstance(value, float) else value
             rows.append(row)
         return rows
+
+    def _detection_columns(self, look: RecordedLook) -> Values:
+        """Count the detections of a look from score 0.1 on, with class and confidence of the most confident one."""
+        detections = confident_detections(look.detections)
+        count = int(detections.count)
+        if count == 0:
+            return {"detections": 0, "seen": None, "score": None}
+        return {
+            "detections": count,
+            "seen": self.classes[int(detections.labels[0, 0])],
+            "score": digits(float(detections.confidence[0, 0])),
+        }
 
     def to_dict(self) -> Values:
         """Convert the outcome, the objects (`object_rows`) and the looks (`rows`) to JSON values.
@@ -302,22 +310,18 @@ class Conversion(Outcome, OtherWords):
     def _check_classes_in(self, categories: Sequence[Mapping[str, Any]]) -> None:
         """Raise `InputError` unless all classes are among COCO's own categories."""
         names_in_coco = {canonical_name(str(category["name"])) for category in categories}
-        strange = [name for name in self.classes[1:] if canonical_name(name) not in names_in_coco]
-        check(
-            not strange,
-            "categories",
-            "those of the annotation file, for classes that COCO has not",
-            f"None with the class {', '.join(strange[:3])}",
-        )
+        unknown = [name for name in self.classes[1:] if canonical_name(name) not in names_in_coco]
+        expected = "those of the annotation file, for classes that COCO has not"
+        check(not unknown, "categories", expected, f"None with the class {', '.join(unknown[:3])}")
 
     def _category_ids(self, categories: Sequence[int | str] | Sequence[Mapping[str, Any]]) -> dict[int, int | str]:
         """Find the category id of each class 1..K, or in categories of a file of each class that an object has."""
         names = self.classes[1:]
         if any(isinstance(category, Mapping) for category in categories):
             # A file may lack classes of the detector, of which there is no object.
-            present = sorted(set(self.objects.labels.tolist()))
-            numbers = category_ids(categories, [names[label - 1] for label in present])
-            return dict(zip(present, numbers, strict=True))
+            labels = sorted(set(self.objects.labels.tolist()))
+            ids = category_ids(categories, [names[label - 1] for label in labels])
+            return dict(zip(labels, ids, strict=True))
         check(len(categories) == len(names), "categories", f"{len(names)} ids", len(categories))
         return dict(enumerate(category_ids(categories), 1))
 
@@ -339,8 +343,9 @@ class Conversion(Outcome, OtherWords):
         width, height = self.size
         lines = []
         for label, (x1, y1, x2, y2) in zip(self.objects.labels.tolist(), self._boxes_inside(), strict=True):
-            shares = ((x1 + x2) / 2 / width, (y1 + y2) / 2 / height, (x2 - x1) / width, (y2 - y1) / height)
-            lines.append(f"{label - 1} {' '.join(f'{share:.6f}' for share in shares)}\n")
+            middle = f"{(x1 + x2) / 2 / width:.6f} {(y1 + y2) / 2 / height:.6f}"
+            extent = f"{(x2 - x1) / width:.6f} {(y2 - y1) / height:.6f}"
+            lines.append(f"{label - 1} {middle} {extent}\n")
         return _written("".join(lines), path)
 
     def crops(self, picture: LargePicture | ImageLike | None = None) -> list[Tensor]:
@@ -427,13 +432,14 @@ class Conversion(Outcome, OtherWords):
         return collection
 
 
-def _geometry(row: Mapping[str, Any], place: PlaceOnEarth | None) -> Values:
+def _geometry(row: Values, place: PlaceOnEarth | None) -> Geometry:
     """Make the GeoJSON geometry of an object's box, on earth or in pixels."""
+    x1, y1, x2, y2 = (row[name] for name in ("x1", "y1", "x2", "y2"))
     # Outer rings are counterclockwise (RFC 7946, 3.1.6), as seen with y down in the picture and with north up on earth.
-    corners = [(row["x1"], row["y2"]), (row["x2"], row["y2"]), (row["x2"], row["y1"]), (row["x1"], row["y1"])]
+    corners = [[x1, y2], [x2, y2], [x2, y1], [x1, y1]]
     if place is not None:
         return box_on_earth(np.array(corners), place)
-    return {"type": "Polygon", "coordinates": [[[x, y] for x, y in (*corners, corners[0])]]}
+    return {"type": "Polygon", "coordinates": [[*corners, corners[0]]]}
 
 
 def _rounded_place(*edges: float | None) -> dict[str, float | None]:

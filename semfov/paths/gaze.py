@@ -130,8 +130,9 @@ class GazePrediction(OtherWords):
             if seen is None:
                 terms, unlikeness = picture_terms(detector, image, converted, quality=quality, panorama=panorama)
             elif isinstance(looking, Eye):
-                for is_asked, asked in ((panorama, "a panorama"), (quality == "best", "quality='best'")):
-                    check(not is_asked, "seen", f"None for {asked}, which a fovea does not show", "fixations")
+                check(not panorama, "seen", "None for a panorama, which a fovea does not show", "fixations")
+                is_quick = quality != "best"
+                check(is_quick, "seen", "None for quality='best', which a fovea does not show", "fixations")
                 fixations = fixations_of(seen, "seen", size, source)
                 number = len(fixations)
                 terms = converted.terms(_foveal_features(looking, image, fixations, fitted), size[::-1])
@@ -239,8 +240,8 @@ class GazePrediction(OtherWords):
         while len(self._first) < count:
             cells = self.given(viewers, len(self._first) + 1)
             places = places_of(cells, self.size, around=self.panorama)
-            apart = (place for place in places if are_apart(place, self._first, self.size, around=self.panorama))
-            self._first.append(next(apart, places[0]))
+            new = [place for place in places if are_apart(place, self._first, self.size, around=self.panorama)]
+            self._first.append(new[0] if new else places[0])
         return [{**place} for place in self._first[:count]]
 
     @cached_property
@@ -338,13 +339,15 @@ class GazePrediction(OtherWords):
         Returns:
             `(people, n)`, and the number of each viewer's fixations, `(people,)`.
         """
-        count = min(_MOST_FIXATIONS, math.ceil(seconds * 1000 / _SHORTEST) + 1)
-        spans = self.model.duration.cpu().float()
-        spans = torch.cat([spans, spans[-1:].expand(max(count - len(spans), 0), -1)])[:count]
-        durations = (spans[:, 0] + spans[:, 1] * torch.randn(people, count, generator=generator)).exp()
+        milliseconds = seconds * 1000
+        count = min(_MOST_FIXATIONS, math.ceil(milliseconds / _SHORTEST) + 1)
+        distributions = self.model.duration.cpu().float()
+        later = distributions[-1:].expand(max(count - len(distributions), 0), -1)
+        mean, spread = torch.cat([distributions, later])[:count].unbind(1)
+        durations = (mean + spread * torch.randn(people, count, generator=generator)).exp()
         ends = (durations + self.model.pause.cpu().float()).cumsum(1)
-        lengths = ((ends < seconds * 1000).sum(1) + 1).clamp(max=count)
-        return durations, lengths
+        ended_in_time = (ends < milliseconds).sum(1)
+        return durations, (ended_in_time + 1).clamp(max=count)  # the last one begins in the time and ends after it
 
     @property
     def name(self) -> str:
@@ -547,14 +550,14 @@ class GazePrediction(OtherWords):
         """Interpolate a log density over the cells, up to a constant, to the probability in each pixel, `(H, W)`."""
         width, height = self.size
         if self.panorama:
-            columns = log.shape[1]
+            columns = log.shape[1] + 2
             # Beyond an edge lie the cells of the other one.
             round_the_seam = torch.cat([log[:, -1:], log, log[:, :1]], 1)
-            log = F.interpolate(round_the_seam[None, None], (height, columns + 2), mode="bilinear")[0, 0]
-            log = log @ interpolation(width, 1, columns + 1, columns + 2, log.dtype, log.device).mT
+            rows = F.interpolate(round_the_seam[None, None], (height, columns), mode="bilinear")[0, 0]
+            pixels = rows @ interpolation(width, 1, columns - 1, columns, log.dtype, log.device).mT
         else:
-            log = F.interpolate(log[None, None], (height, width), mode="bilinear", align_corners=False)[0, 0]
-        return (log - log.logsumexp((0, 1))).exp()
+            pixels = F.interpolate(log[None, None], (height, width), mode="bilinear", align_corners=False)[0, 0]
+        return (pixels - pixels.logsumexp((0, 1))).exp()
 
     def _log(self) -> Tensor:
         """Sum the terms to the log density over the cells, `(rows, columns)`, up to a constant."""

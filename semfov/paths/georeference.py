@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,20 @@ from semfov.io.files import check_regular
 PlaceOnEarth = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Longitude and latitude `(N, 2)` of points `(N, 2)` in pixels."""
 
-_GEO_TEXTS = 34737  # tag of the texts of a GeoTIFF, of which some programs make a reference system
+_Ring = list[list[float]]  # longitude and latitude, or x and y, of its corners, of which the last is the first again
+
+
+class Geometry(TypedDict):
+    """Geometry of GeoJSON: one polygon, or several."""
+
+    type: Literal["Polygon", "MultiPolygon"]
+    coordinates: list[_Ring] | list[list[_Ring]]
+
+
+# Tags of a GeoTIFF (OGC GeoTIFF 1.1, section 7.1): the directory of its keys, which each has, and the texts, of which
+# some programs make a reference system.
+_GEO_KEYS = 34735
+_GEO_TEXTS = 34737
 
 
 def georeference(source: str) -> PlaceOnEarth | None:
@@ -34,8 +47,7 @@ def georeference(source: str) -> PlaceOnEarth | None:
         InputError: the picture has a georeference, and rasterio is not installed.
         DataError: the file cannot be read.
     """
-    kind = Path(source).suffix.lower()
-    if kind not in RASTERS and not (kind in (".tif", ".tiff") and _is_referenced(source)):
+    if not _may_have_place(source):
         return None
     with needing("rasterio", f"source: {source}", '"semfov[geo]"'):
         from rasterio import warp
@@ -43,21 +55,28 @@ def georeference(source: str) -> PlaceOnEarth | None:
     system, affine = _system_and_transform(source)
     if system is None or affine.is_identity:  # a system alone does not say where the picture lies
         return None
-    try:
-        longitude, latitude = warp.transform(system, "EPSG:4326", [affine.c], [affine.f])
-    except Exception:  # a system of its own, such as that of a building site, has no place on earth; of any error
-        return None
-    if not np.isfinite([*longitude, *latitude]).all():
-        return None
 
     def place(points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert pixels to longitude and latitude."""
         column, row = points.T
         x = affine.a * column + affine.b * row + affine.c
         y = affine.d * column + affine.e * row + affine.f
-        return np.stack(warp.transform(system, "EPSG:4326", x, y)[:2], -1)
+        longitude, latitude = warp.transform(system, "EPSG:4326", x, y)[:2]
+        return np.stack([longitude, latitude], -1)
 
-    return place
+    try:
+        corner = warp.transform(system, "EPSG:4326", [affine.c], [affine.f])
+    except Exception:  # a system of its own, such as that of a building site, has no place on earth; of any error
+        return None
+    return place if np.isfinite(corner).all() else None
+
+
+def _may_have_place(source: str) -> bool:
+    """Tell whether a file is a GeoTIFF, or by its name another raster that can have a place on earth."""
+    suffix = Path(source).suffix.lower()
+    if suffix in RASTERS:
+        return True
+    return suffix in (".tif", ".tiff") and _is_referenced(source)
 
 
 def _system_and_transform(source: str) -> tuple[Any, Any]:
@@ -83,7 +102,7 @@ def _system_and_transform(source: str) -> tuple[Any, Any]:
 _STEPS = 4  # along a side of a box, each shorter than half the way round the globe
 
 
-def box_on_earth(corners: NDArray[np.float64], place: PlaceOnEarth) -> dict[str, Any]:
+def box_on_earth(corners: NDArray[np.float64], place: PlaceOnEarth) -> Geometry:
     """Make the GeoJSON geometry of a box.
 
     Args:
@@ -94,11 +113,12 @@ def box_on_earth(corners: NDArray[np.float64], place: PlaceOnEarth) -> dict[str,
         A polygon, or two where the box crosses the antimeridian.
     """
     share = np.arange(_STEPS)[:, None] / _STEPS
-    sides = corners[:, None] + (np.roll(corners, -1, 0) - corners)[:, None] * share
+    to_next = np.roll(corners, -1, 0) - corners
+    sides = corners[:, None] + to_next[:, None] * share
     return polygon_on_earth(place(sides.reshape(-1, 2)), _STEPS)
 
 
-def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> dict[str, Any]:
+def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> Geometry:
     """Make the GeoJSON geometry of a ring, cut at the antimeridian (RFC 7946, 3.1.9).
 
     Args:
@@ -111,20 +131,36 @@ def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> dict[str, Any
     >>> polygon_on_earth(np.array([[200.0, 1], [201, 1], [201, 2], [200, 2]]))["coordinates"][0][0]
     [-160.0, 1.0]
     """
-    # A step from one corner to the next is the shorter way round the globe.
-    steps = np.diff(ring[:, 0], append=ring[0, 0])
-    east = ring[0, 0] + np.concatenate([[0.0], np.cumsum((steps + 180) % 360 - 180)])
-    if abs(east[-1] - east[0]) > 180:
-        corners = _with_pole(east, ring[:, 1])
+    longitude = _unwrapped(ring[:, 0])
+    latitude = ring[:, 1]
+    if abs(longitude[-1] - longitude[0]) > 180:
+        corners = _with_pole(longitude, latitude)
     else:
-        corners = np.stack([east[:-1], ring[:, 1]], -1)[::every]
-    corners[:, 0] -= 360 * np.floor((corners[:, 0].min() + 180) / 360)
-    area = np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - np.roll(corners[:, 0], -1) * corners[:, 1])
-    corners = corners if area >= 0 else corners[::-1]  # outer rings are counterclockwise
+        corners = np.stack([longitude[:-1], latitude], -1)[::every]
+    # The westernmost corner from -180 to 180 degrees; the others may lie beyond the antimeridian.
+    westernmost = corners[:, 0].min()
+    corners[:, 0] -= 360 * np.floor((westernmost + 180) / 360)
+    if _signed_area(corners) < 0:
+        corners = corners[::-1]  # outer rings are counterclockwise
     if corners[:, 0].max() <= 180:
         return {"type": "Polygon", "coordinates": [_closed(corners)]}
-    parts = _cut(corners, 1.0), _cut(corners, -1.0) - [360.0, 0.0]
-    return {"type": "MultiPolygon", "coordinates": [[_closed(part)] for part in parts]}
+    west = _cut(corners, 1.0)
+    east = _cut(corners, -1.0) - [360.0, 0.0]
+    return {"type": "MultiPolygon", "coordinates": [[_closed(west)], [_closed(east)]]}
+
+
+def _unwrapped(longitudes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Follow the longitudes of a ring of N corners without a jump of 360 degrees, back to the first one, `(N + 1,)`."""
+    steps = np.diff(longitudes, append=longitudes[0])
+    # A step from one corner to the next is the shorter way round the globe.
+    shorter_steps = (steps + 180) % 360 - 180
+    return longitudes[0] + np.concatenate([[0.0], np.cumsum(shorter_steps)])
+
+
+def _signed_area(corners: NDArray[np.float64]) -> float:
+    """Compute twice the area of a ring `(N, 2)`, positive if it goes counterclockwise."""
+    x, y = corners.T
+    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
 def _with_pole(east: NDArray[np.float64], north: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -144,15 +180,19 @@ def _closed(corners: NDArray[np.float64]) -> list[list[float]]:
 def _cut(corners: NDArray[np.float64], side: float) -> NDArray[np.float64]:
     """Cut the part of a ring `(N, 2)` that lies west (1) or east (-1) of the antimeridian."""
     part: list[NDArray[np.float64]] = []
-    for corner, following in zip(corners, np.roll(corners, -1, 0), strict=True):
-        # Distances to the antimeridian in degrees, positive on the wanted side.
-        distance = side * (180.0 - corner[0])
-        following_distance = side * (180.0 - following[0])
+    # Distances to the antimeridian in degrees, positive on the wanted side.
+    distances = side * (180.0 - corners[:, 0])
+    next_corners = np.roll(corners, -1, 0)
+    next_distances = np.roll(distances, -1)
+    for corner, next_corner, distance, next_distance in zip(
+        corners, next_corners, distances, next_distances, strict=True
+    ):
         if distance >= 0:
             part.append(corner)
-        if distance * following_distance < 0:
-            share = distance / (distance - following_distance)
-            part.append(np.array([180.0, corner[1] + (following[1] - corner[1]) * share]))
+        if distance * next_distance < 0:
+            share = distance / (distance - next_distance)
+            latitude = corner[1] + (next_corner[1] - corner[1]) * share
+            part.append(np.array([180.0, latitude]))
     return np.array(part)
 
 
@@ -164,11 +204,12 @@ def _is_referenced(source: str) -> bool:
     try:
         with quiet_decoders, Path(source).open("rb") as file:
             head = file.read(8)
-            # The head of a BigTIFF is twice as long.
-            tags = ImageFileDirectory_v2(head + file.read(8) if head[2:3] == b"+" or head[3:4] == b"+" else head)
+            if b"+" in head[2:4]:  # 43, the version of a BigTIFF, whose head is twice as long
+                head += file.read(8)
+            tags = ImageFileDirectory_v2(head)
             file.seek(tags.next)
             tags.load(file)
             check_system(str(tags.get(_GEO_TEXTS, "")), source)
-            return 34735 in tags  # the directory of GeoKeys, which every GeoTIFF has (OGC GeoTIFF 1.1, section 7.1.2)
+            return _GEO_KEYS in tags
     except (OSError, SyntaxError, struct.error) as error:
         raise DataError(f"{source}: expected a readable TIFF, got: {error}") from None

@@ -35,27 +35,33 @@ def merge_fixations(
     Returns:
         The objects from score 0.05 on, most confident first.
     """
-    rows = []
-    for place, (detections, distance) in enumerate(zip(looks, distances, strict=True)):
-        number = place if numbers is None else numbers[place]
-        chosen = detections.mask[0] & (detections.confidence[0] >= FAINTEST)
-        columns = (
-            detections.boxes[0],
-            detections.confidence[0],
-            detections.labels[0],
-            torch.full_like(chosen, number, dtype=torch.int64),
-            torch.zeros_like(chosen) if cut is None else cut[place],
-            -distance,
-        )
-        rows.append([column[chosen].detach().cpu() for column in columns])
-    for look in closer:
-        # No distance is above 0, so that a closer look is nearer than all fixations.
-        values = (look.place, look.target, look.of_look, False, 1.0)
-        rows.append([look.box[None].detach().cpu(), *(torch.tensor([value]) for value in values)])
+    if numbers is None:
+        numbers = range(len(looks))
+    if cut is None:
+        cut = [torch.zeros_like(detections.mask[0]) for detections in looks]
+    columns = zip(looks, distances, cut, numbers, strict=True)
+    rows = [_columns_of_fixation(*fixation) for fixation in columns]
+    rows += [_columns_of_closer_look(look) for look in closer]
     if not rows:
         return Objects.none()
     merged = [_single(torch.cat(column)) for column in zip(*rows, strict=True)]
     return merge_looks(*merged, score=0.0, around=around).above(FAINTEST)
+
+
+def _columns_of_fixation(detections: Detections, distances: Tensor, cut: Tensor, number: int) -> list[Tensor]:
+    """Make the columns that `merge_looks` takes of the detections of a fixation, the nearer the sharper."""
+    confidence = detections.confidence[0]
+    chosen = detections.mask[0] & (confidence >= FAINTEST)
+    numbers = torch.full_like(chosen, number, dtype=torch.int64)
+    columns = (detections.boxes[0], confidence, detections.labels[0], numbers, cut, -distances)
+    return [column[chosen].detach().cpu() for column in columns]
+
+
+def _columns_of_closer_look(look: CloseUp) -> list[Tensor]:
+    """Make the columns of the box of a closer look, which is sharper than all fixations."""
+    # The sharpness of a fixation is a distance with a minus, at most 0.
+    values = (look.place, look.target, look.of_look, False, 1.0)
+    return [look.box[None].detach().cpu(), *(torch.tensor([value]) for value in values)]
 
 
 def _single(column: Tensor) -> Tensor:

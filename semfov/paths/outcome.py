@@ -271,18 +271,25 @@ class Outcome(ABC):
     @property
     def _confirmed_places(self) -> list[_ConfirmedPlace]:
         """The places that closer looks confirmed, and last the one of the decision."""
+        found_place = self._found_place
+        places = []
+        for look in self.closer:
+            # The box of the decision is often that of a closer look, and is listed once.
+            is_found_place = found_place is not None and look.box.equal(found_place.box)
+            if look.place >= _CONFIRMING and not is_found_place:
+                places.append(_ConfirmedPlace(look.box, look.target, look.place, look.of_look))
+        return places if found_place is None else [*places, found_place]
+
+    @property
+    def _found_place(self) -> _ConfirmedPlace | None:
+        """The place where the decision found the target; None if it did not, or shows no box."""
         decision = self.decision
-        box = decision.box if decision is not None and decision.outcome == "found" else None
-        places = [
-            _ConfirmedPlace(look.box, look.target, look.place, look.of_look)
-            for look in self.closer
-            if look.place >= _CONFIRMING and (box is None or not look.box.equal(box))
-        ]
-        if box is not None and decision is not None and self.target is not None:
-            number = next((look.of_look for look in self.closer if look.box.equal(box)), len(self) - 1)
-            probability = decision.probability if decision.place is None else decision.place
-            places.append(_ConfirmedPlace(box, self.target, probability, number))
-        return places
+        if decision is None or decision.outcome != "found" or decision.box is None or self.target is None:
+            return None
+        probability = decision.probability if decision.place is None else decision.place
+        looks = [look.of_look for look in self.closer if look.box.equal(decision.box)]
+        # A box of no closer look is of the look by which the search decided, its last one.
+        return _ConfirmedPlace(decision.box, self.target, probability, looks[0] if looks else len(self) - 1)
 
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:

@@ -26,27 +26,39 @@ def places_of(cells: Tensor, size: tuple[int, int], *, around: bool = False) -> 
     Returns:
         The places, by their shares.
     """
+    centres = _cell_centres(cells, size)
+    distance = _distances(centres, size[0] if around else None) / (REACH * max(size))
+    density = cells.flatten()
+    share = (distance <= 1).to(cells) @ density
+    weighted_share = (1 - distance).clamp(min=0).to(cells) @ density
+    places: list[Place] = []
+    is_free = torch.ones(len(centres), dtype=torch.bool)
+    while bool(is_free.any()):  # all of them, since a later place can have a larger share
+        best = int(torch.where(is_free, weighted_share, -1.0).argmax())
+        x, y = centres[best].tolist()
+        places.append({"x": pixels(x - 0.5), "y": pixels(y - 0.5), "share": digits(float(share[best]))})
+        is_free &= distance[best] > 2
+    return sorted(places, key=lambda place: -place["share"])
+
+
+def _cell_centres(cells: Tensor, size: tuple[int, int]) -> Tensor:
+    """Compute the centres of cells `(rows, columns)` in pixels, edges at integers, `(rows · columns, 2)`."""
     rows, columns = cells.shape
     width, height = size
     x = (torch.arange(columns) + 0.5) * (width / columns)
     y = (torch.arange(rows) + 0.5) * (height / rows)
-    centres = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
-    distance = torch.cdist(centres, centres)
-    if around:
-        seam = centres.new_tensor([width, 0.0])
-        for other_side in (centres - seam, centres + seam):
-            distance = torch.minimum(distance, torch.cdist(centres, other_side))
-    distance = distance / (REACH * max(size))
-    share = (distance <= 1).to(cells) @ cells.flatten()
-    value = (1 - distance).clamp(min=0).to(cells) @ cells.flatten()
-    free = torch.ones(len(centres), dtype=torch.bool)
-    places: list[Place] = []
-    while bool(free.any()):  # all of them, since a later place can have a larger share
-        best = int(torch.where(free, value, -1.0).argmax())
-        x_best, y_best = centres[best].tolist()
-        places.append({"x": pixels(x_best - 0.5), "y": pixels(y_best - 0.5), "share": digits(float(share[best]))})
-        free &= distance[best] > 2
-    return sorted(places, key=lambda place: -place["share"])
+    return torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
+
+
+def _distances(points: Tensor, around: float | None) -> Tensor:
+    """Compute the distances between points `(N, 2)`, `(N, N)`; the shorter way round a panorama of width `around`."""
+    distance = torch.cdist(points, points)
+    if around is None:
+        return distance
+    turn = points.new_tensor([around, 0.0])
+    distance_left = torch.cdist(points, points - turn)
+    distance_right = torch.cdist(points, points + turn)
+    return distance.minimum(distance_left).minimum(distance_right)
 
 
 def are_apart(place: Place, others: list[Place], size: tuple[int, int], *, around: bool = False) -> bool:
@@ -56,6 +68,7 @@ def are_apart(place: Place, others: list[Place], size: tuple[int, int], *, aroun
         across = abs(place["x"] - other["x"])
         if around:
             across = min(across, size[0] - across)
-        if across**2 + (place["y"] - other["y"]) ** 2 <= least**2:
+        down = place["y"] - other["y"]
+        if across**2 + down**2 <= least**2:
             return False
     return True

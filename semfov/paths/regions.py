@@ -40,14 +40,15 @@ def named_regions(grid: Grid, probabilities: Tensor, classes: Sequence[str]) -> 
         The regions, the largest first.
     """
     probabilities = probabilities.detach().cpu()
-    objects, label = probabilities[:, 1:].max(-1)
+    background = probabilities[:, 0]
+    highest, label = probabilities[:, 1:].max(-1)
     least = min(0.5, 3 / len(classes))
-    best = torch.where(objects > probabilities[:, 0].clamp(min=least), label + 1, 0)
+    named = torch.where(highest > background.clamp(min=least), label + 1, 0)
     regions = []
-    for cells in _regions(best.reshape(grid.rows, grid.columns)):
-        peak = cells[int(objects[cells].argmax())]
+    for cells in _regions(named.reshape(grid.rows, grid.columns)):
+        peak = cells[int(highest[cells].argmax())]
         x, y = grid.centres[peak].tolist()
-        regions.append(Region(classes[int(best[peak])], cells, float(objects[peak]), (x, y)))
+        regions.append(Region(classes[int(named[peak])], cells, float(highest[peak]), (x, y)))
     return sorted(regions, key=lambda region: -len(region.cells))
 
 
@@ -61,21 +62,23 @@ def _regions(labels: Tensor) -> list[list[int]]:
         The cells of each region in their order.
     """
     rows, columns = labels.shape
-    flat = labels.flatten().tolist()
+    label_of = labels.flatten().tolist()
     visited: set[int] = set()
     regions = []
-    for first, label in enumerate(flat):
+    for first, label in enumerate(label_of):
         if label == 0 or first in visited:
             continue
+        # From the first cell the region grows by neighbours with its label, until it has none.
         region = []
-        waiting = [first]
+        border = [first]
         visited.add(first)
-        while waiting:
-            cell = waiting.pop()
+        while border:
+            cell = border.pop()
             region.append(cell)
-            new = {other for other in _neighbours(cell, rows, columns) - visited if flat[other] == label}
-            visited |= new
-            waiting += new
+            unvisited = _neighbours(cell, rows, columns) - visited
+            alike = {neighbour for neighbour in unvisited if label_of[neighbour] == label}
+            visited |= alike
+            border += alike
         regions.append(sorted(region))
     return regions
 
@@ -83,5 +86,13 @@ def _regions(labels: Tensor) -> list[list[int]]:
 def _neighbours(cell: int, rows: int, columns: int) -> set[int]:
     """List the cells that share a side with a cell."""
     row, column = divmod(cell, columns)
-    places = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
-    return {y * columns + x for y, x in places if 0 <= y < rows and 0 <= x < columns}
+    neighbours = set()
+    if row > 0:
+        neighbours.add(cell - columns)
+    if row < rows - 1:
+        neighbours.add(cell + columns)
+    if column > 0:
+        neighbours.add(cell - 1)
+    if column < columns - 1:
+        neighbours.add(cell + 1)
+    return neighbours

@@ -30,17 +30,29 @@ def fixations_of(given: object, argument: str, size: tuple[int, int], source: st
     """
     from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
 
-    expected = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
+    fixations = _as_fixations(given, argument, size, source)
+    check_viewed(fixations, argument, size, source)
+    return warn_of_frames(argument, [fixations], stacklevel=4)[0].resized(size)
+
+
+def _as_fixations(given: object, argument: str, size: tuple[int, int], source: str | None) -> Fixations:
+    """Convert what a caller gave for the fixations of one viewer, in pixels of any frame, or refuse it."""
+    if isinstance(given, Fixations):
+        return given
     if isinstance(given, Record):
-        given = given.as_fixations(given.source or source or "")
-    elif isinstance(given, list | tuple) and any(isinstance(entry, Fixations | Record) for entry in given):
-        check(False, argument, expected, f"a {type(given).__name__} of {len(given)}; take one: {argument}=scanpaths[0]")
-    elif isinstance(given, list | tuple | np.ndarray | Tensor):
-        try:
-            given = Fixations(source or "", "viewer", given, size)  # type: ignore[arg-type]  # which makes an array
-        except InputError as error:
-            raise InputError(f"{argument}: expected {expected}, got a {type(given).__name__} ({error})") from None
-    if not isinstance(given, Fixations):
-        raise InputError(f"{argument}: expected {expected}, got {type(given).__name__}")
-    check_viewed(given, argument, size, source)
-    return warn_of_frames(argument, [given], stacklevel=4)[0].resized(size)
+        return given.as_fixations(given.source or source or "")
+    expected = "Fixations of one viewer, a record of an agent, or points (n, 2) in pixels of the picture"
+    got = type(given).__name__
+    if not isinstance(given, list | tuple | np.ndarray | Tensor):
+        raise InputError(f"{argument}: expected {expected}, got {got}")
+    if _holds_viewers(given):
+        check(False, argument, expected, f"a {got} of {len(given)}; take one: {argument}=scanpaths[0]")
+    try:
+        return Fixations(source or "", "viewer", given, size)  # type: ignore[arg-type]  # which makes an array
+    except InputError as error:
+        raise InputError(f"{argument}: expected {expected}, got a {got} ({error})") from None
+
+
+def _holds_viewers(given: Sequence[object] | np.ndarray | Tensor) -> bool:
+    """Tell whether a sequence has the fixations of viewers instead of points."""
+    return isinstance(given, list | tuple) and any(isinstance(entry, Fixations | Record) for entry in given)

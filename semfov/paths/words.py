@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from semfov.data.classes import counted
+from semfov.decision import Decision
 from semfov.detection.objects import box_text
 from semfov.paths.outcome import Outcome
 
@@ -167,22 +168,27 @@ class Words(ABC):
         if record.closer and record.found:
             return self._why_found_closely()
         if record.ending == "decision" and record.decision is not None:
-            outcome = record.decision.outcome
-            looked_closer = any(look.number != 0 for look in record.closer)
-            name = f"closer {outcome}" if looked_closer else outcome
-            return self._sentences.get(name, self._sentences[outcome])
+            return self._why_decided(record.decision)
         if record.ending == "shifts":
             return f"All {len(record.fixated) - 1} gaze shifts were made."
         if record.ending == "passes":
             return f"All {record.passes} passes were used." if record.passes != 1 else "The only pass was used."
         return self._sentences.get(record.ending or "", "")
 
+    def _why_decided(self, decision: Decision) -> str:
+        """Say on what evidence the search decided: closer looks have sentences of their own in some kinds of look."""
+        # Look 0 shows the whole picture; a search that looked at it alone has looked at nothing closer.
+        looked_closer = any(look.number != 0 for look in self.record.closer)
+        name = f"closer {decision.outcome}" if looked_closer else decision.outcome
+        return self._sentences.get(name, self._sentences[decision.outcome])
+
     def _why_found_closely(self) -> str:
         """Say that a closer look found the target; with windows as large as the picture the first look is one."""
         decision = self.record.decision
-        box = None if decision is None else decision.box
-        numbers = [look.number for look in self.record.closer if box is not None and look.box.equal(box)]
         sentence = self._sentences["closer found"]
+        if decision is None or decision.box is None:
+            return sentence
+        numbers = [look.number for look in self.record.closer if look.box.equal(decision.box)]
         return self._sentences.get("first found", sentence) if numbers == [0] else sentence
 
     def assumption(self, option: str = "prior=0.5") -> str:
