@@ -218,14 +218,17 @@ def soft_fixation(
     check_shape(centres, "centres", logits.shape[-1], 2)
     # At 0 and 1 the noise would be infinite, and choose a cell whatever its value.
     limits = torch.finfo(noise.dtype)
-    gumbel = -(-noise.clamp(min=limits.tiny, max=1 - limits.eps).log()).log()
-    weights = ((logits + gumbel.to(logits)).masked_fill(visited, -torch.inf) / temperature).softmax(-1)
+    uniform = noise.clamp(min=limits.tiny, max=1 - limits.eps)
+    gumbel = -(-uniform.log()).log()
+    perturbed = (logits + gumbel.to(logits)).masked_fill(visited, -torch.inf)
+    weights = (perturbed / temperature).softmax(-1)
     cell = weights.argmax(-1)
-    soft = weights @ centres.to(weights)
+    centres = centres.to(weights)
+    soft = weights @ centres
     if not hard:
         return soft, cell
     # The value is the centre, and the gradient is that of the soft point.
-    return centres.to(weights)[cell] + (soft - soft.detach()), cell
+    return centres[cell] + (soft - soft.detach()), cell
 
 
 def drawn_from(noise: Tensor) -> _Noise:

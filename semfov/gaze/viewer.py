@@ -51,14 +51,21 @@ class Viewer(Choice):
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the centre of the drawn cell and the cell; any cell where all were visited."""
-        size = int(self.grid.size[1]), int(self.grid.size[0])
-        rows = episodes.to(self.path.device)
-        free = ~visited.to(self.path.device)
-        log = torch.stack([*self.model.given(self.terms, size, self.path[rows]).values()]).sum(0)
-        density = cell_saliency(log.flatten(1).double().softmax(1).view_as(log), self.grid.columns, self.grid.rows)
+        height_and_width = int(self.grid.size[1]), int(self.grid.size[0])
+        device = self.path.device
+        rows = episodes.to(device)
+        terms = self.model.given(self.terms, height_and_width, self.path[rows])
+        log_density = torch.stack([*terms.values()]).sum(0)
+        pixel_density = log_density.flatten(1).double().softmax(1).view_as(log_density)
+        density = cell_saliency(pixel_density, self.grid.columns, self.grid.rows)
+
         # Where all cells were visited, or those that were not have no probability, all of them are alike.
-        weights = (density + torch.finfo(density.dtype).tiny) * (free | ~free.any(-1, keepdim=True))
+        free = ~visited.to(device)
+        may_be_drawn = free | ~free.any(-1, keepdim=True)
+        weights = (density + torch.finfo(density.dtype).tiny) * may_be_drawn
+        # On the CPU, so that a seed draws the same fixations on every device.
         cell = weights.cpu().multinomial(1, generator=self.generator)[:, 0].to(visited.device)
+
         following = self.path[:, -1].clone()
         following[rows] = centres[cell].to(following)
         self.path = torch.cat([self.path, following[:, None]], 1)

@@ -106,11 +106,15 @@ class Fovea:
         width = widths.index_select(-1, lattice.width)[:, None]
         distance = (lattice.place - centre) / width
         weights = distance.square().mul(-0.5).exp().to(dtype)[:, :, None]
+
         lengths: list[int] = []
-        for rows_of_band, columns_of_band in sizes:
-            lengths += [columns_of_band, rows_of_band]
+        for height_of_band, width_of_band in sizes:
+            lengths += [width_of_band, height_of_band]
         lines = weights.split(lengths, -1)
-        return tuple(FovealWindow(columns, rows) for columns, rows in zip(lines[0::2], lines[1::2], strict=True))
+        columns_of_bands = lines[0::2]
+        rows_of_bands = lines[1::2]
+        pairs = zip(columns_of_bands, rows_of_bands, strict=True)
+        return tuple(FovealWindow(columns, rows) for columns, rows in pairs)
 
 
 @dataclass(frozen=True, eq=False)

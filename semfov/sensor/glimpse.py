@@ -53,17 +53,11 @@ def glimpse(
     torch.Size([1, 2, 3, 20, 30])
     """
     check_shape(image, "image", None, None, None, None)
-    check_shape(boxes, "boxes", 4)
-    batch = image.shape[0]
-    by_image = boxes.ndim in (2, 3) and boxes.shape[0] == batch
-    check(by_image, "boxes", f"shape ({batch}, G, 4) or ({batch}, 4)", tuple(boxes.shape))
     check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
-    lookup(padding_mode, get_args(_Padding), "padding mode")
     check(image.is_floating_point(), "image", "floating-point pixels", image.dtype)
-    if values_known(boxes):
-        check_finite(boxes.detach(), "boxes")
-        sides = boxes[..., 2:] - boxes[..., :2]
-        check(bool((sides > 0).all()), "boxes", "windows with a positive width and height", "an empty window")
+    lookup(padding_mode, get_args(_Padding), "padding mode")
+    batch = image.shape[0]
+    _check_windows(boxes, batch)
     # Windows stay where they are: their corners are read, and a GPU would be waited for.
     windows = as_positions(boxes if boxes.ndim == 3 else boxes[:, None], image.dtype)
     value = 0.0 if padding_mode == "zeros" else fill_value
@@ -74,6 +68,17 @@ def glimpse(
     no_canvas = image.new_empty(image.shape[1], size[1], size[0])
     canvases = stacked_views(canvas, batch, windows.shape[1], no_canvas)
     return canvases if boxes.ndim == 3 else canvases[:, 0]
+
+
+def _check_windows(boxes: Tensor, batch: int) -> None:
+    """Raise `InputError` unless boxes are windows of a batch of images, finite and with an area where that is known."""
+    check_shape(boxes, "boxes", 4)
+    by_image = boxes.ndim in (2, 3) and boxes.shape[0] == batch
+    check(by_image, "boxes", f"shape ({batch}, G, 4) or ({batch}, 4)", tuple(boxes.shape))
+    if values_known(boxes):
+        check_finite(boxes.detach(), "boxes")
+        sides = boxes[..., 2:] - boxes[..., :2]
+        check(bool((sides > 0).all()), "boxes", "windows with a positive width and height", "an empty window")
 
 
 def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> Tensor:
@@ -136,7 +141,18 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
 
 
 def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding, value: float) -> Tensor:
-    """Resample one window of an image `(C, H, W)`: two matrix products, over the pixels that the window shows."""
+    """Resample one window of an image: two matrix products, over the pixels that the window shows.
+
+    Args:
+        image: `(C, H, W)`.
+        box: the window `(4,)`, edges between pixels.
+        size: `(width, height)` of the canvas.
+        padding: what is outside the image.
+        value: the value there, unless it is the nearest border.
+
+    Returns:
+        The canvas, `(C, height, width)`.
+    """
     border = padding == "border"
     columns, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=border)
     rows, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=border)
@@ -144,17 +160,18 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
     columns = columns.to(part)
     rows = rows.to(part)
     # Weights end at the image, as if 0 followed; another value is subtracted before and added after.
-    part = part - value if value else part
+    if value:
+        part = part - value
     is_recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
     can_fill = image.device.type == "cpu" and part.numel() > 0 and not is_recorded and values_known(image, box)
-    if not can_fill:
-        canvas = rows @ part @ columns.mT
-    else:
+    if can_fill:
         x1, y1, x2, y2 = box.tolist()
         between = part.new_empty(len(part), size[1], part.shape[-1])
         canvas = part.new_empty(len(part), size[1], size[0])
         _fill(between, rows, part, y1 - top, y2 - top)
         _fill(canvas.mT, columns, between.mT, x1 - left, x2 - left)
+    else:
+        canvas = rows @ part @ columns.mT
     return canvas + value if value else canvas
 
 
@@ -203,36 +220,64 @@ def _weights(start: Tensor, end: Tensor, count: int, length: int, *, border: boo
     middle = start + (torch.arange(count).to(start) + 0.5) * step
     if not values_known(start, end):
         return _weights_of_all(middle, reach, length, border=border), (0, length)
-    first, last = torch.stack([(start - reach).floor(), (end + reach).ceil() + 1]).detach().long().tolist()
+
+    # The pixels that some triangle reaches, also outside the picture: all weights of a canvas pixel sum to 1.
+    first_reached = (start - reach).floor()
+    last_reached = (end + reach).ceil()
+    first, last = torch.stack([first_reached, last_reached + 1]).detach().long().tolist()
     pixel = torch.arange(first, last, device=start.device)
-    weight = (1 - (middle[:, None] - (pixel.to(start) + 0.5)).abs() / reach).clamp(min=0)
-    weight = weight / weight.sum(-1, keepdim=True)
+    centre = pixel.to(start) + 0.5
+    triangle = (1 - (middle[:, None] - centre).abs() / reach).clamp(min=0)
+    weight = triangle / triangle.sum(-1, keepdim=True)
     if border:
         begin = min(max(first, 0), length - 1)
         stop = max(min(last, length), 1)
-        place = pixel.clamp(0, length - 1) - begin
-        return weight.new_zeros(count, stop - begin).index_add(1, place, weight), (begin, stop)
+        nearest = pixel.clamp(0, length - 1) - begin
+        return weight.new_zeros(count, stop - begin).index_add(1, nearest, weight), (begin, stop)
     begin = min(max(first, 0), length)
     stop = max(min(max(last, 0), length), begin)
     return weight[:, begin - first : stop - first], (begin, stop)
 
 
 def _weights_of_all(middle: Tensor, reach: Tensor, length: int, *, border: bool) -> Tensor:
-    """Compute the weights `(count, length)` of all pixels of a picture, in a graph of one shape for all windows."""
+    """Compute the weights of all pixels of a picture, in a graph of one shape for all windows.
+
+    Args:
+        middle: middles of the canvas pixels, `(count,)` in picture pixels, edges between pixels.
+        reach: half the base of the triangles, `()`.
+        length: number of picture pixels.
+        border: continue the picture by its outer pixels, instead of black.
+
+    Returns:
+        `(count, length)`.
+    """
     place = middle - 0.5
-    weight = (1 - (place[:, None] - torch.arange(length).to(place)).abs() / reach).clamp(min=0)
+    pixel = torch.arange(length)
+    weight = (1 - (place[:, None] - pixel.to(place)).abs() / reach).clamp(min=0)
     fraction = place - place.floor()
     total = _beyond(fraction, reach) + _beyond(1 - fraction, reach)
     if border:
-        outside = []
-        for inwards in (place, length - 1 - place):
-            # Of a triangle whose middle is inside or outside the picture, the part that is outside.
-            from_inside = _beyond((inwards + 1).clamp(min=0), reach)
-            from_outside = total - _beyond((-inwards).clamp(min=0), reach)
-            outside.append(torch.where(inwards >= -1, from_inside, from_outside)[:, None])
-        pixel = torch.arange(length, device=place.device)
-        weight = weight + outside[0] * (pixel == 0) + outside[1] * (pixel == length - 1)
+        pixel = pixel.to(place.device)
+        before_first = _outside(place, reach, total)[:, None]
+        after_last = _outside(length - 1 - place, reach, total)[:, None]
+        weight = weight + before_first * (pixel == 0) + after_last * (pixel == length - 1)
     return weight / total[:, None]
+
+
+def _outside(inwards: Tensor, reach: Tensor, total: Tensor) -> Tensor:
+    """Sum the part of each triangle that is beyond a border of the picture.
+
+    Args:
+        inwards: distance of the triangle's middle from the outermost pixel, `(count,)`, negative outside the picture.
+        reach: half the base of the triangles, `()`.
+        total: sum of each whole triangle, `(count,)`.
+
+    Returns:
+        `(count,)`.
+    """
+    from_inside = _beyond((inwards + 1).clamp(min=0), reach)
+    from_outside = total - _beyond((-inwards).clamp(min=0), reach)
+    return torch.where(inwards >= -1, from_inside, from_outside)
 
 
 def _beyond(distance: Tensor, reach: Tensor) -> Tensor:

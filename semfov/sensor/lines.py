@@ -118,31 +118,41 @@ def banded(
     index = taps.index
     weight = taps.weight
     length = len(index)
-    before = -(-reach // shift)  # tiles that would reach beyond the first pixel
-    tiles = min((count - reach) // shift, length // tile) - before
+    skipped = -(-reach // shift)  # tiles that would reach beyond the first pixel
+    tiles = min((count - reach) // shift, length // tile) - skipped
     if max(count, length) <= _SMALL or tiles < 1:
         dense = _dense(index, weight, count).to(device, dtype)
         return Lines(count, length, dense, dense[None], dense[None])
-    start = before * shift - reach
-    rows = before * tile
+
+    start = skipped * shift - reach
+    rows = skipped * tile
     stop = rows + tiles * tile
     first_pixels = start + shift * torch.arange(tiles)[:, None, None]
-    inner = index[rows:stop].reshape(tiles, tile, -1) - first_pixels
-    middle = _dense(inner, weight[rows:stop].reshape(inner.shape), shift + 2 * reach).to(device, dtype)
-    # Usually all tiles are equal, and a single one stays in the fastest cache. Tracers other than the compiler, which
-    # keeps the matrix as a constant, make tensors of another type, whose values are not known.
-    readable = type(middle) is Tensor and not middle.is_meta
-    if readable and bool((middle == middle[0]).all()):
+    index_in_window = index[rows:stop].reshape(tiles, tile, -1) - first_pixels
+    weight_in_window = weight[rows:stop].reshape(index_in_window.shape)
+    middle = _dense(index_in_window, weight_in_window, shift + 2 * reach).to(device, dtype)
+    # A single tile stays in the fastest cache.
+    if _are_equal(middle):
         middle = middle[:1].expand(tiles, -1, -1)
+
     # Both ends have the same size, so that one product computes them; the longer one decides.
     edge = max(rows, length - stop)
     span_of_head = -(-edge // tile) * shift
     span_of_tail = count - (length - edge) // tile * shift
     span = min(count, max(span_of_head, span_of_tail) + reach)
+    first_of_tail = length - edge
     head = _dense(index[:edge], weight[:edge], span)
-    tail = _dense(index[length - edge :] - (count - span), weight[length - edge :], span)
+    tail = _dense(index[first_of_tail:] - (count - span), weight[first_of_tail:], span)
     ends = torch.stack([head, tail]).to(device, dtype)
     return Lines(count, length, None, ends, middle, rows, start, shift)
+
+
+def _are_equal(tiles: Tensor) -> bool:
+    """Tell whether all tiles `(tiles, tile, window)` are known to be equal, as they usually are."""
+    # Tracers other than the compiler, which keeps the matrix as a constant, make tensors of another type, whose values
+    # are not known.
+    readable = type(tiles) is Tensor and not tiles.is_meta
+    return readable and bool((tiles == tiles[0]).all())
 
 
 def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
@@ -313,25 +323,31 @@ def _products(
     if lines.dense is not None:
         multiply(lines.dense.expand(number, -1, -1), planes, (0, 0))
         return products
+
     tiles, tile, _ = lines.middle.shape
     step = offsets(lines.shift, tile)
     first = offsets(lines.start, lines.rows)
     tiles_of_plane = lines.count // lines.shift
     divides = (lines.count, lines.length) == (tiles_of_plane * lines.shift, tiles_of_plane * tile)
     one_tile = lines.middle.stride(0) == 0
-    if number > 1 and one_tile and divides and planes == offsets(lines.count, lines.length):
+    follow_each_other = planes == offsets(lines.count, lines.length)
+    if number > 1 and one_tile and divides and follow_each_other:
         # Tiles of all planes at once. Those that lie across two planes are written over by the ends.
-        multiply(lines.middle[:1].expand(tiles + (number - 1) * tiles_of_plane, -1, -1), step, first)
+        tiles_of_all = tiles + (number - 1) * tiles_of_plane
+        multiply(lines.middle[:1].expand(tiles_of_all, -1, -1), step, first)
     else:
         for n in range(number):
-            multiply(lines.middle, step, (first[0] + n * planes[0], first[1] + n * planes[1]))
-    _, edge, span = lines.ends.shape
+            begin = first[0] + n * planes[0], first[1] + n * planes[1]
+            multiply(lines.middle, step, begin)
+
+    edge, span = lines.ends.shape[1:]
     last = offsets(lines.count - span, lines.length - edge)
     if number == 1:
         multiply(lines.ends, last, (0, 0))
         return products
-    for end, begin in zip(lines.ends, ((0, 0), last), strict=True):
-        multiply(end.expand(number, -1, -1), planes, begin)
+    head, tail = lines.ends
+    multiply(head.expand(number, -1, -1), planes, (0, 0))
+    multiply(tail.expand(number, -1, -1), planes, last)
     return products
 
 
@@ -345,12 +361,16 @@ def _product(image: Tensor, lines: Lines) -> Tensor:
     if lines.dense is not None:
         return lines.dense @ image
     tiles, tile, window = lines.middle.shape
-    _, edge, span = lines.ends.shape
-    top = lines.ends[0, : lines.rows] @ image[..., :span, :]
-    stop = lines.start + (tiles - 1) * lines.shift + window
+    edge, span = lines.ends.shape[1:]
+    first_pixels = image[..., :span, :]
+    last_pixels = image[..., image.shape[-2] - span :, :]
+    top = lines.ends[0, : lines.rows] @ first_pixels
+
     # The overlapping input windows of the tiles, `(..., tiles, window, w)`.
+    stop = lines.start + (tiles - 1) * lines.shift + window
     windows = image[..., lines.start : stop, :].unfold(-2, window, lines.shift).mT
     inner = (lines.middle @ windows).flatten(-3, -2)
-    rest = lines.length - lines.rows - tiles * tile  # output pixels below the last tile
-    bottom = lines.ends[1, edge - rest :] @ image[..., image.shape[-2] - span :, :]
+
+    below = lines.length - lines.rows - tiles * tile  # output pixels after the last tile
+    bottom = lines.ends[1, edge - below :] @ last_pixels
     return torch.cat([top, inner, bottom], -2)

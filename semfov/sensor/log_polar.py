@@ -253,18 +253,21 @@ def _sample(levels: _Levels, fixation: Tensor, retina: _Retina) -> Tensor:
     finest = levels[0]
     size = _size(finest)
     offset = _places(retina.numbers, size, fixation.dtype, finest.device)
-    # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
-    place = (2 * (fixation[:, :, None, None] + offset) + 1) / fixation.new_tensor(size) - 1
     rings = offset.shape[0]
+    receptors = fixation[:, :, None, None] + offset
+    # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
+    place = (2 * receptors + 1) / fixation.new_tensor(size) - 1
     by_level = []
     for level, first, weight in _shares(retina.numbers, size, finest.dtype, finest.device):
         if level >= len(levels):
             break
         last = first + len(weight)
         points = place[:, :, first:last].flatten(1, 2)
-        responses = F.grid_sample(levels[level].to(points), points, "bicubic", "border", align_corners=False)
-        responses = responses.to(finest).unflatten(2, (fixation.shape[1], last - first)) * weight[:, None]
-        by_level.append(F.pad(responses, (0, 0, first, rings - last)))
+        image = levels[level].to(points)
+        responses = F.grid_sample(image, points, "bicubic", "border", align_corners=False).to(finest)
+        by_ring = responses.unflatten(2, (fixation.shape[1], last - first))
+        weighted = by_ring * weight[:, None]
+        by_level.append(F.pad(weighted, (0, 0, first, rings - last)))
     return torch.stack(by_level).sum(0).transpose(1, 2)
 
 
@@ -284,17 +287,24 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
     radius, angle = _polar(fixation, size, retina.scale)
     ring = retina.fovea * torch.log1p(radius / retina.fovea) / retina.spacing - 0.5
     wedge = angle.remainder(2 * pi) * (wedges / (2 * pi))
-    # Bicubic interpolation needs neighbours: those of the innermost ring lie on the opposite side of the fixation, and
-    # the last wedge is next to the first.
-    opposite_rings = cortical[..., :2, :].flip(-2).roll(wedges // 2, -1)
-    extended = torch.cat([opposite_rings, cortical], -2)
-    extended = torch.cat([extended[..., -1:], extended, extended[..., :2]], -1).flatten(0, 1)
     # Places in the extended image from -1 to 1: two more rings lie before the first, a wedge before and two behind.
     columns = 2 * (wedge + 1) / (wedges + 2) - 1
     rows = 2 * (ring + 2) / (rings + 1) - 1
     points = torch.stack([columns, rows], -1).flatten(0, 1)
-    images = F.grid_sample(extended.to(points), points, "bicubic", "border", align_corners=True)
+    receptors = _extended(cortical).flatten(0, 1).to(points)
+    images = F.grid_sample(receptors, points, "bicubic", "border", align_corners=True)
     return images.to(cortical).unflatten(0, (batch, number))
+
+
+def _extended(cortical: Tensor) -> Tensor:
+    """Continue cortical images by the neighbours that bicubic interpolation needs, `(…, M + 2, N + 3)`.
+
+    Those of the innermost ring lie on the opposite side of the fixation, and the last wedge is next to the first.
+    """
+    half_turn = cortical.shape[-1] // 2
+    opposite_rings = cortical[..., :2, :].flip(-2).roll(half_turn, -1)
+    rings = torch.cat([opposite_rings, cortical], -2)
+    return torch.cat([rings[..., -1:], rings, rings[..., :2]], -1)
 
 
 def _polar(fixation: Tensor, size: tuple[int, int], scale: tuple[float, float]) -> tuple[Tensor, Tensor]:

@@ -139,7 +139,9 @@ class MultiScaleFovea(Sensor):
             # Places in the crop from -1 to 1.
             columns = 2 * (x - corner[:, :1]) / side - 1
             rows = 2 * (y - corner[:, 1:]) / side - 1
-            places = torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
+            columns_of_pixels = columns[:, None, :]
+            rows_of_pixels = rows[:, :, None]
+            places = torch.stack(torch.broadcast_tensors(columns_of_pixels, rows_of_pixels), -1)
             crop = crops[:, scale].to(places)
             shown = F.grid_sample(crop, places, "bilinear", "border", align_corners=False).to(crops)
             is_inside = (places.abs() <= 1).all(-1)[:, None]
@@ -168,27 +170,45 @@ class MultiScaleFovea(Sensor):
         return [cls.width(settings) * 2**scale for scale in range(int(settings["scales"]))]
 
     def _crop(self, plane: Tensor, fixation: Tensor, scale: int) -> Tensor:
-        """Cut crops `(B, G, C, side, side)` of one scale from the means of its squares, `(B, C, h, w)`."""
-        step = 2**scale
-        height, width = plane.shape[-2:]
-        # Squares that start before 1 - step or after the last pixel show nothing: they are the border of the plane.
-        first = fixation + 0.5 - self.side * step / 2 + step
-        farthest = [float(width + self.side * step), float(height + self.side * step)]
-        reach = torch.tensor(farthest, dtype=first.dtype, device=first.device)
-        first = torch.minimum(torch.maximum(first, -reach), reach)
+        """Cut the crops of one scale from the means of its squares.
+
+        Args:
+            plane: means of all squares of 2^l pixels, `(B, C, h, w)` with the black border (`means`).
+            fixation: `(B, G, 2)` in pixels of the image.
+            scale: l.
+
+        Returns:
+            Crops `(B, G, C, side, side)`, interpolated linearly between the squares.
+        """
+        first = self._first_square(plane, fixation, scale)
         square = first.detach().floor()
-        x, y = (first - square)[..., None, None, None].unbind(2)  # shares of the next square
-        offsets = torch.arange(self.side, device=plane.device) * step
+        # Shares of the next square, for planes `(B, G, side, C, side)`.
+        x, y = (first - square)[..., None, None, None].unbind(2)
+        offsets = torch.arange(self.side, device=plane.device) * 2**scale
         column = square[..., 0, None].long() + offsets
         row = square[..., 1, None].long() + offsets
+
         # Rows first: they are contiguous in memory.
-        planes = plane.transpose(1, 2)
+        height, width = plane.shape[-2:]
+        rows = plane.transpose(1, 2)
         image = torch.arange(len(plane), device=plane.device)[:, None, None]
-        upper = planes[image, row.clamp(0, height - 1)]
-        lower = planes[image, (row + 1).clamp(0, height - 1)]
+        upper = rows[image, row.clamp(0, height - 1)]
+        lower = rows[image, (row + 1).clamp(0, height - 1)]
         lines = upper * (1 - y) + lower * y
+
         columns = column[..., None, None, :].expand(*lines.shape[:-1], self.side)
         left = lines.gather(-1, columns.clamp(0, width - 1))
         right = lines.gather(-1, (columns + 1).clamp(0, width - 1))
         crops = left * (1 - x) + right * x
         return crops.transpose(-3, -2).to(plane.dtype)
+
+    def _first_square(self, plane: Tensor, fixation: Tensor, scale: int) -> Tensor:
+        """Compute the place `(B, G, 2)` of a crop's first square in a plane of means, between two squares of it."""
+        step = 2**scale
+        height, width = plane.shape[-2:]
+        # Squares that start before 1 - step or after the last pixel show nothing: they are the border of the plane.
+        first = fixation + 0.5 - self.side * step / 2 + step
+        # A crop that is farther away is all black; a number that fits an integer is enough for it.
+        farthest = [float(width + self.side * step), float(height + self.side * step)]
+        reach = torch.tensor(farthest, dtype=first.dtype, device=first.device)
+        return torch.minimum(torch.maximum(first, -reach), reach)

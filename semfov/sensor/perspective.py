@@ -86,22 +86,25 @@ def _even_rows(panorama: Tensor) -> Tensor:
     exact for any width.
     """
     rows, columns = panorama.shape[-2:]
-    latitude = (torch.arange(rows, dtype=torch.float64, device=panorama.device) + 0.5) / rows - 0.5
-    width = (1 / (latitude * torch.pi).cos()).clamp(max=columns)
     # In float64, because a mean is a small difference of long sums.
+    row = torch.arange(rows, dtype=torch.float64, device=panorama.device)
+    column = torch.arange(columns, dtype=torch.float64, device=panorama.device)
+    half_turns = (row + 0.5) / rows - 0.5  # of latitude
+    width = (1 / (half_turns * torch.pi).cos()).clamp(max=columns)[:, None]
+    # Two rounds of each row: a mean around a pixel of the middle of them never leaves them.
     twice = torch.cat([panorama, panorama], -1).double()
     total = F.pad(twice.cumsum(-1), (1, 0))
-    middle = torch.arange(columns, dtype=torch.float64, device=panorama.device) + columns / 2 + 0.5
+    middle = column + columns / 2 + 0.5
 
     def integral(place: Tensor) -> Tensor:
         """Integrate each row from its begin to the places `(H, W)`."""
         pixel = place.floor().long().clamp(0, 2 * columns - 1)
         index = pixel.expand(*panorama.shape[:-2], rows, columns)
-        return total.gather(-1, index) + (place - pixel) * twice.gather(-1, index)
+        whole_pixels = total.gather(-1, index)
+        last_pixel = (place - pixel) * twice.gather(-1, index)
+        return whole_pixels + last_pixel
 
-    width = width[:, None]
-    sums = integral(middle + width / 2) - integral(middle - width / 2)
-    means = sums / width
+    means = (integral(middle + width / 2) - integral(middle - width / 2)) / width
     return means.roll(columns // 2, -1).to(panorama)
 
 
@@ -127,9 +130,10 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
     directions = camera.directions(grid.flatten(0, 1))
     points = panorama_points(directions, (width, height)).unflatten(0, grid.shape[:2])
     # Places in the source from -1 to 1, beyond its border of one pixel.
-    place = (2 * points + 3) / points.new_tensor([width + 2, height + 2]) - 1
-    place = as_positions(place, source)
-    view = F.grid_sample(source[None].to(place.dtype), place[None], mode="bilinear", align_corners=False)
+    sides = points.new_tensor([width + 2, height + 2])
+    place = as_positions((2 * points + 3) / sides - 1, source)
+    image = source.to(place.dtype)
+    view = F.grid_sample(image[None], place[None], mode="bilinear", align_corners=False)
     if samples > 1:
         view = F.avg_pool2d(view, samples)
     return view[0].to(source.dtype)

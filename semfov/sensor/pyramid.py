@@ -289,8 +289,10 @@ def _stuff_and_blur(count: int, length: int) -> Taps:
     is_even = place % 2 == 0
     index_at_even = half + torch.tensor([-1, 0, 1])
     index_at_odd = half + torch.tensor([0, 1, 1])
+    weight_at_even = torch.tensor([1 / 8, 6 / 8, 1 / 8])
+    weight_at_odd = torch.tensor([1 / 2, 1 / 2, 0])
     index = torch.where(is_even, index_at_even, index_at_odd)
-    weight = torch.where(is_even, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
+    weight = torch.where(is_even, weight_at_even, weight_at_odd)
     mirrored = torch.where(index < 0, min(1, count - 1), index.clamp(max=count - 1))
     return Taps(mirrored, weight.double())
 
@@ -306,8 +308,9 @@ def _blur(place: Tensor, count: int) -> Taps:
 def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
     """Make the taps of linear interpolation from `count` pixels to `length`, as areas, without antialiasing."""
     # Positions are rounded in the same way as in `torch.nn.functional.interpolate`.
-    place = torch.arange(length, dtype=torch.promote_types(dtype, torch.float32)) + 0.5
-    place = (place * (torch.tensor(count).to(place) / length) - 0.5).clamp(0, count - 1).double()
+    centre = torch.arange(length, dtype=torch.promote_types(dtype, torch.float32)) + 0.5
+    ratio = torch.tensor(count).to(centre) / length
+    place = (centre * ratio - 0.5).clamp(0, count - 1).double()
     before = place.floor()
     index = before.long()[:, None] + torch.arange(2)
     weight = torch.stack([1 - place + before, place - before], -1)

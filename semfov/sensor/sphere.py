@@ -50,19 +50,21 @@ def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
         Points `(..., 2)`; x is from -½ to W - ½. At a pole x is arbitrary, and no gradient flows through it.
     """
     check_shape(directions, "directions", 3)
+    width, height = size
     x, y, z = directions.unbind(-1)
     squared = x.square() + z.square()
     pole = squared <= 1e-12 * (squared + y.square())
     zero = torch.zeros_like(x)
     unit = torch.ones_like(x)
-    longitude = torch.atan2(torch.where(pole, zero, x), torch.where(pole, unit, z))
     # The inner choice keeps the gradient of the root finite where the outer one does not take it.
     radius = torch.where(pole, zero, torch.where(pole, unit, squared).sqrt())
+    longitude = torch.atan2(torch.where(pole, zero, x), torch.where(pole, unit, z))
     latitude = torch.atan2(-y, radius)
-    column = (longitude + torch.pi) * (size[0] / (2 * torch.pi)) - 0.5
+
+    column = (longitude + torch.pi) * (width / (2 * torch.pi)) - 0.5
+    row = (torch.pi / 2 - latitude) * (height / torch.pi) - 0.5
     # A longitude that is rounded up to half a turn belongs to the other end of the row.
-    column = torch.where(column >= size[0] - 0.5, column - size[0], column)
-    row = (torch.pi / 2 - latitude) * (size[1] / torch.pi) - 0.5
+    column = torch.where(column >= width - 0.5, column - width, column)
     return torch.stack([column, row], -1)
 
 
@@ -133,12 +135,15 @@ class Camera:
         """
         check_shape(directions, "directions", None, 3)
         rays = _turn(self.rotation.mT, directions)
-        ahead = rays[..., 2] > 0
-        depth = torch.where(ahead, rays[..., 2], torch.ones_like(rays[..., 2]))[..., None]
-        middle = rays.new_tensor(self.size) / 2 - 0.5
+        forward = rays[..., 2]
+        in_front = forward > 0
+        # Behind the camera any depth does: the point is replaced below, and no gradient may divide by 0.
+        depth = torch.where(in_front, forward, torch.ones_like(forward))[..., None]
+        size = rays.new_tensor(self.size)
+        middle = size / 2 - 0.5
         points = rays[..., :2] / depth * self.focal[..., None, None] + middle
-        inside = (points >= -0.5) & (points <= points.new_tensor(self.size) - 0.5)
-        return torch.where(ahead[..., None], points, torch.inf), ahead & inside.all(-1)
+        inside = ((points >= -0.5) & (points <= size - 0.5)).all(-1)
+        return torch.where(in_front[..., None], points, torch.inf), in_front & inside
 
 
 def _turn(rotation: Tensor, rays: Tensor) -> Tensor:
@@ -213,19 +218,22 @@ class Regions(Boxes):
         box that crosses the seam begins inside the panorama and ends beyond its right border. A box that holds a pole
         is as wide as the panorama.
         """
-        points = panorama_points(self.outlines(257), size)
-        x, y = points.unbind(-1)
         width = float(size[0])
-        # Neighbouring points of an outline are less than half a turn apart.
+        height = float(size[1])
+        outline = panorama_points(self.outlines(257), size)
+        x, y = outline.unbind(-1)
+        # Neighbouring points of an outline are less than half a turn apart: so it goes on across the seam.
         step = (x.diff(dim=-1) + width / 2) % width - width / 2
-        unrolled = torch.cat([x[:, :1], x[:, :1] + step.cumsum(-1)], -1)
+        first = x[:, :1]
+        unrolled = torch.cat([first, first + step.cumsum(-1)], -1)
         leftmost = unrolled.amin(-1)
         rightmost = unrolled.amax(-1)
+
         poles = x.new_tensor([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
         zenith, nadir = self.contain(poles).unbind(-1)
         any_pole = zenith | nadir
         x1 = torch.where(any_pole, torch.zeros_like(leftmost), (leftmost + 0.5) % width)
-        y1 = torch.where(zenith, 0.0, y.amin(-1) + 0.5)
         x2 = torch.where(any_pole, torch.full_like(x1, width), x1 + rightmost - leftmost)
-        y2 = torch.where(nadir, float(size[1]), y.amax(-1) + 0.5)
+        y1 = torch.where(zenith, 0.0, y.amin(-1) + 0.5)
+        y2 = torch.where(nadir, height, y.amax(-1) + 0.5)
         return torch.stack([x1, y1, x2, y2], -1)

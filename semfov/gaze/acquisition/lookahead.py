@@ -132,13 +132,16 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
     components = beta.shape[-1]
     check_shape(likelihoods, "likelihoods", components, None, None, components)
     total, mean = _total_and_mean(beta)
-    number = torch.arange(likelihoods.shape[2], device=beta.device)
+    sample = torch.arange(likelihoods.shape[2], device=beta.device)
+    # Multiples of the golden ratio fill the unit interval evenly, whatever the number of looks.
     start = (visited.sum(-1).to(beta) * _GOLDEN).frac()[..., None, None]
-    point = (number + start) / len(number)
-    above = point[..., None] >= mean.cumsum(-1)[..., None, :]
-    drawn = above.sum(-1).clamp(max=components - 1)
-    likelihood = likelihoods.to(beta)[drawn, :, number].transpose(-2, -3).flatten(-3, -2)
-    return _outlook(beta, total, mean, likelihood)
+    point = (sample + start) / len(sample)
+    cumulative = mean.cumsum(-1)[..., None, :]
+    # The class of a point is the number of classes whose cumulative probability lies below it.
+    drawn = (point[..., None] >= cumulative).sum(-1).clamp(max=components - 1)
+    likelihood = likelihoods.to(beta)[drawn, :, sample]
+    by_level_and_sample = likelihood.transpose(-2, -3).flatten(-3, -2)
+    return _outlook(beta, total, mean, by_level_and_sample)
 
 
 def sampled_likelihoods(

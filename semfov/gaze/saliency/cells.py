@@ -38,14 +38,26 @@ def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reductio
     check(saliency.is_floating_point(), "saliency", "floating-point values", saliency.dtype)
     check(columns >= 1 and rows >= 1, "columns, rows", "at least 1", (columns, rows))
     lookup(reduction, get_args(Reduction), "reduction")
+    if reduction == "max":
+        return _maximum_along(_maximum_along(saliency, rows), columns).flatten(1)
     height, width = saliency.shape[-2:]
-    if reduction == "mean":
-        return (_shares(height, rows, saliency) @ saliency @ _shares(width, columns, saliency).mT).flatten(1)
-    for pixels, cells in ((height, rows), (width, columns)):
-        # For each cell, the first and the end index of the pixels that overlap it.
-        ends = [(cell * pixels // cells, -(-(cell + 1) * pixels // cells)) for cell in range(cells)]
-        saliency = torch.stack([saliency[:, start:stop].amax(1) for start, stop in ends], -1)
-    return saliency.flatten(1)
+    vertical = _shares(height, rows, saliency)
+    horizontal = _shares(width, columns, saliency)
+    return (vertical @ saliency @ horizontal.mT).flatten(1)
+
+
+def _maximum_along(saliency: Tensor, cells: int) -> Tensor:
+    """Take the maximum of `(B, N, M)` over the pixels that overlap each of the cells along N: `(B, M, cells)`.
+
+    The axes change places, so that two calls reduce both.
+    """
+    pixels = saliency.shape[1]
+    maxima = []
+    for cell in range(cells):
+        start = cell * pixels // cells
+        stop = -(-(cell + 1) * pixels // cells)  # rounded up
+        maxima.append(saliency[:, start:stop].amax(1))
+    return torch.stack(maxima, -1)
 
 
 def _shares(pixels: int, cells: int, like: Tensor) -> Tensor:

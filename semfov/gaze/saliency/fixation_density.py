@@ -262,14 +262,20 @@ class FixationDensity(Pretrained):
             InputError: a feature map is missing or has another number of channels.
         """
         cells = cells_of(size)
+        units_by_shape = self._units(features, self.read if read is None else read)
         hidden: Tensor | None = None
-        for shape, units in self._units(features, self.read if read is None else read).items():
+        for shape, units in units_by_shape.items():
             on_cells = on_picture(units, features, shape, cells)
-            hidden = on_cells + self.shift[:, None, None] if hidden is None else hidden.add_(on_cells)
+            if hidden is None:
+                hidden = on_cells + self.shift[:, None, None]
+            else:
+                hidden.add_(on_cells)
         assert hidden is not None
-        hidden = F.relu_(hidden).flatten(2).unflatten(1, (-1, self.mix.shape[-1]))
-        hidden = F.relu_(self.mix @ hidden + self.mix_shift[..., None])
-        return (self.out[:, None] @ hidden)[:, :, 0].unflatten(-1, cells)
+        units_of_readout = self.mix.shape[-1]
+        first_layer = F.relu_(hidden).flatten(2).unflatten(1, (-1, units_of_readout))
+        second_layer = F.relu_(self.mix @ first_layer + self.mix_shift[..., None])
+        readouts = self.out[:, None] @ second_layer
+        return readouts[:, :, 0].unflatten(-1, cells)
 
     def _units(self, features: FeatureMaps | Mapping[str, Tensor], read: Tensor) -> dict[tuple[int, int], Tensor]:
         """Convolve each map, where the picture is, and sum the results of maps of one shape.
@@ -287,13 +293,17 @@ class FixationDensity(Pretrained):
         for (name, channels), weight in zip(self.layers.items(), weights, strict=True):
             if name not in maps:
                 raise InputError(f"features: expected the map {name!r}, got {', '.join(maps)}")
-            check_shape(maps[name], f"features[{name!r}]", None, channels, None, None)
-            shape = (int(maps[name].shape[-2]), int(maps[name].shape[-1]))
+            layer = maps[name]
+            check_shape(layer, f"features[{name!r}]", None, channels, None, None)
+            shape = (int(layer.shape[-2]), int(layer.shape[-1]))
             rows, columns = sides_of(features, shape)
-            part = maps[name][..., rows.first : rows.stop, columns.first : columns.stop]
+            part = layer[..., rows.first : rows.stop, columns.first : columns.stop].to(weight)
             # Before the interpolation, which is then of a few units and not of hundreds of channels.
-            units = F.conv2d(part.to(weight), weight[..., None, None])
-            by_shape[shape] = by_shape[shape].add_(units) if shape in by_shape else units
+            units = F.conv2d(part, weight[..., None, None])
+            if shape in by_shape:
+                by_shape[shape].add_(units)
+            else:
+                by_shape[shape] = units
         return by_shape
 
     def centre_bias(self, size: tuple[int, int]) -> Tensor:
@@ -327,19 +337,23 @@ class FixationDensity(Pretrained):
         Returns:
             The terms of `terms` with a scanpath.
         """
+        height, width = size
         longer = max(size)
         path = (scanpath.to(self.read) + 0.5) / longer
         rows, columns = cells_of(size)
         top, left, step = corner
-        x = (torch.arange(left, columns, step).to(path) + 0.5) * (size[1] / columns / longer)
-        y = (torch.arange(top, rows, step).to(path) + 0.5) * (size[0] / rows / longer)
-        places = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1).flatten(0, 1)
-        gains = self.oculomotor.gains((~path[..., 0].isnan()).sum(1))
-        bias = self.oculomotor(path, places).unflatten(-1, (len(y), len(x)))
+        # Centres of the cells, in longer sides of the picture as the path is.
+        x = (torch.arange(left, columns, step).to(path) + 0.5) * (width / columns / longer)
+        y = (torch.arange(top, rows, step).to(path) + 0.5) * (height / rows / longer)
+        cells = (len(y), len(x))
+        places = torch.stack([x.expand(cells), y[:, None].expand(cells)], -1).flatten(0, 1)
+
+        fixations = (~path[..., 0].isnan()).sum(1)
+        gain_of_map, gain_of_centre = self.oculomotor.gains(fixations)[..., None, None].unbind(1)
         return {
-            "map": gains[:, 0, None, None] * terms["map"][:, top::step, left::step],
-            "centre bias": gains[:, 1, None, None] * terms["centre bias"][:, top::step, left::step],
-            "oculomotor biases": bias,
+            "map": gain_of_map * terms["map"][:, top::step, left::step],
+            "centre bias": gain_of_centre * terms["centre bias"][:, top::step, left::step],
+            "oculomotor biases": self.oculomotor(path, places).unflatten(-1, cells),
         }
 
     @torch.no_grad()
@@ -369,14 +383,16 @@ class FixationDensity(Pretrained):
         torch.Size([5, 4, 2])
         """
         rows, columns = cells_of(size)
-        cell = torch.tensor([size[1] / columns, size[0] / rows]).to(start)
+        cell_size = torch.tensor([size[1] / columns, size[0] / rows]).to(start)
         path = start[:, None]
         for _ in range(fixations - 1):
-            log = torch.stack([*self.given(terms, size, path).values()]).sum(0)
-            drawn = log.flatten(1).double().softmax(1).multinomial(1, generator=generator)[:, 0]
-            corner = torch.stack([drawn % columns, drawn // columns], 1).to(start)
-            within = torch.rand(corner.shape, generator=generator).to(start)
-            path = torch.cat([path, ((corner + within) * cell - 0.5)[:, None]], 1)
+            log_density = torch.stack([*self.given(terms, size, path).values()]).sum(0)
+            density = log_density.flatten(1).double().softmax(1)
+            cell = density.multinomial(1, generator=generator)[:, 0]
+            corner = torch.stack([cell % columns, cell // columns], 1).to(start)
+            within_cell = torch.rand(corner.shape, generator=generator).to(start)
+            fixation = (corner + within_cell) * cell_size - 0.5
+            path = torch.cat([path, fixation[:, None]], 1)
         return path
 
     def extra_repr(self) -> str:

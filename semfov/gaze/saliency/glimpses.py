@@ -40,19 +40,42 @@ def features_so_far(views: FeatureMaps, fixations: Tensor, scanpath: Tensor) -> 
     check_shape(scanpath, "scanpath", None, None, 2)
     fixated = ~scanpath[..., 0].isnan()
     check(bool(fixated.any(-1).all()), "scanpath", "at least one fixation in each", "none")
-    place = views.placement
+
+    # A distance to NaN would be NaN: what is not fixated is put at 0, and ruled out below.
     points = torch.where(fixated[..., None], scanpath, 0.0).to(fixations)
     nearest_view = torch.cdist(points, fixations.expand(len(points), -1, -1)).argmin(-1)
+    view_fixations = fixations[nearest_view]
+
     joined = {}
     for name, maps in views.maps.items():
         height, width = maps.shape[-2:]
-        # Centres of the pixels of the map, in pixels of the picture.
-        x = ((torch.arange(width).to(fixations) + 0.5) * (views.canvas[0] / width) - place.offset[0]) / place.scale[0]
-        y = ((torch.arange(height).to(fixations) + 0.5) * (views.canvas[1] / height) - place.offset[1]) / place.scale[1]
-        pixels = torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], -1).flatten(0, 1) - 0.5
-        distance = torch.cdist(pixels.expand(len(points), -1, -1), fixations[nearest_view])
-        closest = distance.masked_fill(~fixated[:, None], torch.inf).argmin(-1)
-        view = nearest_view.gather(1, closest)
-        features = maps.flatten(2).transpose(1, 2)[view, torch.arange(height * width, device=view.device)]
+        pixels = _pixels_on_picture(views, height, width, fixations)
+        distance = torch.cdist(pixels.expand(len(points), -1, -1), view_fixations)
+        closest_look = distance.masked_fill(~fixated[:, None], torch.inf).argmin(-1)
+        closest_view = nearest_view.gather(1, closest_look)
+        pixel = torch.arange(height * width, device=closest_view.device)
+        features_by_pixel = maps.flatten(2).transpose(1, 2)
+        features = features_by_pixel[closest_view, pixel]
         joined[name] = features.transpose(1, 2).unflatten(2, (height, width))
     return replace(views, maps=joined)
+
+
+def _pixels_on_picture(views: FeatureMaps, height: int, width: int, like: Tensor) -> Tensor:
+    """Compute where the pixels of a feature map lie in the picture.
+
+    Args:
+        views: the feature maps, whose canvas and placement say where the picture is.
+        height: rows of the map.
+        width: columns of the map.
+        like: tensor of the dtype and device wanted.
+
+    Returns:
+        Centres of the pixels row by row, `(height · width, 2)`, in pixels of the picture.
+    """
+    place = views.placement
+    columns = (torch.arange(width).to(like) + 0.5) * (views.canvas[0] / width)
+    rows = (torch.arange(height).to(like) + 0.5) * (views.canvas[1] / height)
+    x = (columns - place.offset[0]) / place.scale[0]
+    y = (rows - place.offset[1]) / place.scale[1]
+    centres = torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], -1)
+    return centres.flatten(0, 1) - 0.5

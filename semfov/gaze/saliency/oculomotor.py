@@ -84,33 +84,49 @@ class OculomotorBias(nn.Module):
         sin2 = 2 * cos * sin
         cos4 = cos2.square() - sin2.square()
         sin4 = 2 * cos2 * sin2
+        directions = (torch.ones_like(cos), cos, sin, cos2, sin2, cos4, sin4)
+
+        # The turn τ from the saccade before, of which a path of one fixation has none.
         step = torch.where(before.isnan(), 0.0, last - before)
         unit = step / _norm(step)[:, None].clamp(min=1e-9)
-        turn = cos * unit[:, None, 0] + sin * unit[:, None, 1]  # cos τ
-        turns = (~before[:, :1].isnan()).to(turn)  # 0 without an earlier saccade
-        angles = [
-            *(torch.ones_like(cos), cos, sin, cos2, sin2, cos4, sin4),
-            *(turns * turn, turns * (2 * turn.square() - 1), turns * (4 * turn**3 - 3 * turn)),
-        ]
+        cos_turn = cos * unit[:, None, 0] + sin * unit[:, None, 1]
+        cos_2_turn = 2 * cos_turn.square() - 1
+        cos_3_turn = 4 * cos_turn**3 - 3 * cos_turn
+        has_turn = (~before[:, :1].isnan()).to(cos_turn)
+        turns = (has_turn * cos_turn, has_turn * cos_2_turn, has_turn * cos_3_turn)
+
         tables = torch.cat([self.saccade, self.turn])
         # A table that is interpolated linearly is its first value and the shares of its steps that were passed.
         by_length = tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)
-        return by_length.mul(torch.stack(angles, -2)).sum(-2)
+        angles = torch.stack([*directions, *turns], -2)
+        return by_length.mul(angles).sum(-2)
 
     def _refixation_bias(self, path: Tensor, places: Tensor, bias: Tensor) -> Tensor:
-        """Add to a bias `(B, N)` that of the distance of every place `(N, 2)` to the fixations before the last one."""
-        earlier = path[:, :-1].flip(1)[:, :_MEMORY]
+        """Add to a bias that of the distance of every place to the fixations before the last one.
+
+        Args:
+            path: fixations so far, `(B, n, 2)`.
+            places: `(N, 2)`.
+            bias: `(B, N)`.
+
+        Returns:
+            `(B, N)`.
+        """
+        earlier = path[:, :-1].flip(1)[:, :_MEMORY]  # the latest first
         fixated = (~earlier[..., 0].isnan()).to(bias)
-        distance = torch.cdist(
-            torch.where(fixated[..., None] > 0, earlier, 0.0),
-            places.expand(len(earlier), -1, -1),
-            compute_mode="donot_use_mm_for_euclid_dist",
-        )
+        points = torch.where(fixated[..., None] > 0, earlier, 0.0)
+        # Products of matrices would lose the digits of short distances.
+        distance = torch.cdist(points, places.expand(len(earlier), -1, -1), compute_mode="donot_use_mm_for_euclid_dist")
         ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
-        back = F.pad(self.back, (0, 1))[ages]
-        weights = back.diff(dim=1).flatten() * fixated[..., None].expand(-1, -1, len(_NEAR) - 1).flatten(1)
-        returns = weights[:, None] @ _passed(_NEAR, distance).flatten(1, 2)
-        return bias + returns[:, 0] + (back[:, 0] * fixated).sum(1)[:, None]
+        tables = F.pad(self.back, (0, 1))[ages]  # 0 from the last knot on
+        # As in `_saccade_bias`, a table is its first value and its steps; those of a fixation that is not there are 0.
+        intervals = len(_NEAR) - 1
+        steps = tables.diff(dim=1).flatten()
+        weights = steps * fixated[..., None].expand(-1, -1, intervals).flatten(1)
+        passed = _passed(_NEAR, distance).flatten(1, 2)
+        by_distance = (weights[:, None] @ passed)[:, 0]
+        at_fixations = (tables[:, 0] * fixated).sum(1)
+        return bias + by_distance + at_fixations[:, None]
 
     def gains(self, number: Tensor) -> Tensor:
         """Look up the gains of the map and of the centre bias.
