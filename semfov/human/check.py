@@ -161,6 +161,17 @@ def _sizes(options: CheckOptions, keep: Callable[[Path], bool] | None = None) ->
 def _report(
     path: Path, options: CheckOptions, arguments: dict[str, Any], sizes: _PictureSizes | None
 ) -> FixationReport:
+    """Read one file of fixations, and say what is suspicious.
+
+    Args:
+        path: the file.
+        options: what the file does not tell itself.
+        arguments: the same, as arguments of a reader.
+        sizes: sizes of the pictures; None where there are none.
+
+    Returns:
+        The report.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what the lines below say
         reader = reader_of(path, arguments.get("columns"))
@@ -168,14 +179,16 @@ def _report(
     if sizes is not None and "picture" in arguments:  # a single one is compared with what was looked at in it
         records = [record for record in records if record.picture in sizes] or records
     suspicious = suspicions(records, sizes)
-    # Where points look like those of another frame or unit, that is said by the rules alone, in one way.
-    by_content = sizes is not None and not options.rules_alone and records and other_frame_of(records) is None
-    if sizes is not None and by_content:
-        suspicious += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
+    if sizes is not None and records and not options.rules_alone:
+        # Where points look like those of another frame or unit, that is said by the rules alone, in one way.
+        is_own_frame = other_frame_of(records) is None
+        if is_own_frame:
+            suspicious += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
     data_set = DATA_SETS.get(reader)
-    has_usual_frames = data_set in ("OSIE", "COCO-Search18") and "size" not in arguments
-    usual = f" (those of {data_set}, or give --size)" if has_usual_frames else ""
-    return FixationReport(_content(records, usual), suspicious, was_compared=sizes is not None)
+    usual_frames = ""
+    if data_set in ("OSIE", "COCO-Search18") and "size" not in arguments:
+        usual_frames = f" (those of {data_set}, or give --size)"
+    return FixationReport(_content(records, usual_frames), suspicious, was_compared=sizes is not None)
 
 
 def _records(

@@ -60,16 +60,20 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
     low = int(classes.min())
     high = int(classes.max())
     check(low >= 0 and high <= last, "labels", f"numbers of classes from 0 to {last}", f"{low} to {high}")
-    true = p.gather(1, classes[:, None])[:, 0]
+
+    p_true = p.gather(1, classes[:, None])[:, 0]
+    # Σ_k (p_k - y_k)², with y = 1 for the true class and 0 for all others.
+    brier = p.square().sum(1) - 2 * p_true + 1
     confidence, predicted = p.max(1)
-    by_class = [calibration_error(p[:, k], classes == k, bins) for k in range(p.shape[1])]
+    is_right = predicted == classes
+    error_by_class = [calibration_error(p[:, k], classes == k, bins) for k in range(p.shape[1])]
     return Calibration(
         count=len(classes),
-        nll=float(surprisal(true).mean()),
-        brier=float((p.square().sum(1) - 2 * true + 1).mean()),
-        ece=float(calibration_error(confidence, predicted == classes, bins)),
-        classwise_ece=float(torch.stack(by_class).mean()),
-        accuracy=float((predicted == classes).double().mean()),
+        nll=float(surprisal(p_true).mean()),
+        brier=float(brier.mean()),
+        ece=float(calibration_error(confidence, is_right, bins)),
+        classwise_ece=float(torch.stack(error_by_class).mean()),
+        accuracy=float(is_right.double().mean()),
     )
 
 

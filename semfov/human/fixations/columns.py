@@ -153,13 +153,23 @@ def _text_of(value: object) -> str:
 
 
 def _table_of_file(path: Path, name: str) -> Table:
+    """Read a table from a file of text, whose first line has the names of the columns.
+
+    Args:
+        path: the file.
+        name: name of the table, for messages.
+
+    Returns:
+        The table.
+    """
     _check_text_file(path)
     text = read_text(path)
     preamble = _PREAMBLE.match(text)
     if preamble is not None:
         text = text[preamble.end() :]
     # The separator is what the names of the columns have most of.
-    separator = max(",;\t|", key=text.partition("\n")[0].count)
+    first_line = text.partition("\n")[0]
+    separator = max(",;\t|", key=first_line.count)
     try:
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
         columns = [column.strip() for column in next(reader, [])]
@@ -170,8 +180,8 @@ def _table_of_file(path: Path, name: str) -> Table:
     for place, line in lines:
         if len(line) > len(columns):
             raise DataError(f"{path}: {place}: expected {len(columns)} fields, got more; quote them with {separator!r}")
-        # A line may end early.
-        texts = [_field(field, separator) for field in line] + [""] * (len(columns) - len(line))
+        texts = [_field(field, separator) for field in line]
+        texts += [""] * (len(columns) - len(line))  # a line may end early
         rows.append(Row(name, place, dict(zip(columns, texts, strict=True))))
     return Table(name, columns, rows, _repeated(columns))
 

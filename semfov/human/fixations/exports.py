@@ -84,7 +84,7 @@ def read_export(
     >>> record.subject, record.points.tolist(), record.durations.tolist()
     ('ann', [[639.5, 179.5]], [240.0])
     """
-    named = named_columns(columns, _NAMED)
+    user_columns = named_columns(columns, _NAMED)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
     stored = table_of(source)
     table = unfolded(stored)
@@ -92,10 +92,11 @@ def read_export(
     program = program_of(table_columns)
     if program is None:
         raise DataError(f"{table.name}: {_of_no_program(stored)}")
-    layout = _Layout.of(program, table_columns, named, table.name)
+    layout = _Layout.of(program, table_columns, user_columns, table.name)
     if layout.unread:
         warnings.warn(f"{table.name}: {layout.unread}", stacklevel=2)
     table.check_different([*layout.names.values(), layout.filter])
+
     rows = layout.fixations_of(table)
     _name_people(rows, subject, table)
     _name_pictures(rows, picture, table.name)
@@ -103,7 +104,8 @@ def read_export(
     rows = _of_one_eye(_viewings(rows), eye)
     check_data(bool(rows), table.name, f"fixations of the {eye} eye", "those of the other one")
     rows = _with_picture(rows, layout, table.name)
-    if size is None and not all(row.fields["width"] and row.fields["height"] for row in rows):
+    have_frames = all(row.fields["width"] and row.fields["height"] for row in rows)
+    if size is None and not have_frames:
         expected = f"the size of the frame, which {program.name} does not give"
         raise FrameError(f"{table.name}: expected {expected}; give size=")
     coordinates = Coordinates(units or layout.units, origin or program.origin)
@@ -221,14 +223,27 @@ def _duration_column(program: Program, columns: Sequence[Column], name: str | No
 
 
 def _point_columns(program: Program, columns: Sequence[Column], table: str) -> tuple[Column, Column]:
-    """Find the columns of x and y in a unit that is read; fractions, which are not rounded, before pixels."""
+    """Find the columns of x and y in a unit that is read; fractions, which are not rounded, before pixels.
+
+    Args:
+        program: the program, which knows the columns of points.
+        columns: of the table.
+        table: its name, for messages.
+
+    Returns:
+        The first pair in one frame and unit.
+    """
     x_columns, y_columns = (program.of_point(key, columns) for key in program.point)
-    pairs = [(x, y) for x in x_columns for y in y_columns if (x.frame, x.unit) == (y.frame, y.unit)]
-    read = [(x, y) for x, y in pairs if not x.unit or x.unit in LENGTHS]
-    got = ", ".join(repr(column.name) for column in (*x_columns, *y_columns))
-    check_data(bool(read), table, f"points of {program.name} in px or norm", f"the columns {got}; export them in px")
-    # The first of several pairs in one unit.
-    return min(read, key=lambda pair: LENGTHS.get(pair[0].unit) != "fractions")
+    pairs = []
+    for x in x_columns:
+        is_read = not x.unit or x.unit in LENGTHS
+        if is_read:
+            pairs += [(x, y) for y in y_columns if (x.frame, x.unit) == (y.frame, y.unit)]
+    names = ", ".join(repr(column.name) for column in (*x_columns, *y_columns))
+    expected = f"points of {program.name} in px or norm"
+    check_data(bool(pairs), table, expected, f"the columns {names}; export them in px")
+    in_fractions = [(x, y) for x, y in pairs if LENGTHS.get(x.unit) == "fractions"]
+    return in_fractions[0] if in_fractions else pairs[0]
 
 
 def _unread(program: Program, columns: Sequence[Column]) -> str:

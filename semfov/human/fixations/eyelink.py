@@ -129,13 +129,20 @@ def read_eyelink(
     _share_out(fixations, views)
     viewed = [view for view in views if view.fixations]
     check_data(bool(viewed), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials, lines))
+
     screen = _screen(path, lines, size)
     person = path.stem if subject is None else subject
-    records = [record for view in viewed if (record := _record(view, screen, person, eye)) is not None]
+    records = []
+    for view in viewed:
+        record = _record(view, screen, person, eye)
+        if record is not None:
+            records.append(record)
     check_data(bool(records), path, f"fixations of the {eye} eye", "those of the other one")
+
     remarks = [*_lost(lines), *_outside_views(trials, fixations)]
-    if len(records) < len(viewed):
-        remarks.append(f"{len(viewed) - len(records)} of {len(viewed)} pictures have no fixation of the {eye} eye")
+    of_other_eye = len(viewed) - len(records)
+    if of_other_eye:
+        remarks.append(f"{of_other_eye} of {len(viewed)} pictures have no fixation of the {eye} eye")
     if remarks:
         warnings.warn(f"{path}: {'; '.join(remarks)}", stacklevel=2)
     return warn_of_frames(path, records)

@@ -104,20 +104,28 @@ def other_frame_of(fixations: Sequence[Fixations], *, units: bool = True) -> str
         return None
     if units and _are_fractions(points) and sides.min() > 8:
         return "fractions of the sides (units='fractions')"
-    negative = (points < -0.5).mean(0)
-    in_middle = (np.abs(points) <= sides / 2).all(1).mean()
-    if negative.min() >= 0.2 and in_middle > 0.95:
+    if _are_from_centre(points, sides):
         are_degrees = bool((np.abs(points) < _DEGREES * sides.min()).all())
+        degrees = "degrees from the centre (multiply them by the pixels of a degree)"
         pixels = "pixels from the centre (origin='centre', or 'centre, y up')"
-        return "degrees from the centre (multiply them by the pixels of a degree)" if are_degrees else pixels
+        return degrees if are_degrees else pixels
     inside = 1 - _outside(points, sides).mean()
     inside_if_swapped = 1 - _outside(points[:, ::-1], sides).mean()
     if inside < 0.9 and inside_if_swapped > max(0.98, inside + 0.1):
         return "y before x (swap the two columns)"
-    if len(points) >= _MANY and bool((points.max(0) < 0.5 * sides.min(0)).all()):
-        corner = " × ".join(f"{side:g}" for side in np.ceil(points.max(0) + 1))
+    farthest = points.max(0)
+    in_first_quarter = bool((farthest < 0.5 * sides.min(0)).all())
+    if len(points) >= _MANY and in_first_quarter:
+        corner = " × ".join(f"{side:g}" for side in np.ceil(farthest + 1))
         return f"fixations of a frame of {corner} or little more (give its size)"
     return None
+
+
+def _are_from_centre(points: _Array, sides: _Array) -> bool:
+    """Tell whether points lie on all sides of the origin, and not farther from it than a frame around it reaches."""
+    negative = (points < -0.5).mean(0)
+    in_middle = (np.abs(points) <= sides / 2).all(1).mean()
+    return bool(negative.min() >= 0.2 and in_middle > 0.95)
 
 
 def _are_fractions(points: _Array) -> bool:
@@ -144,13 +152,14 @@ def _letterbox(points: _Array, sides: _Array) -> list[str]:
     share = (points + 0.5) / sides
     # Empty shares at the left and the top, and at the right and the bottom; single points may lie in a bar.
     before = np.quantile(share, 0.002, axis=0)
-    behind = 1 - np.quantile(share, 0.998, axis=0)
+    after = 1 - np.quantile(share, 0.998, axis=0)
+    wider = np.maximum(before, after)
+    narrower = np.minimum(before, after)
+    are_bars = (narrower > _BAR) & (wider < _MOST_BAR) & (wider - narrower < _LEVEL)
+    reaches_borders = wider < _LEVEL
     for axis, (borders, coordinate) in enumerate([("left and right", "x"), ("top and bottom", "y")]):
-        bars = before[axis], behind[axis]
-        others = before[1 - axis], behind[1 - axis]
-        are_bars = min(bars) > _BAR and max(bars) < _MOST_BAR and abs(bars[0] - bars[1]) < _LEVEL
-        if are_bars and max(others) < _LEVEL:
-            width = f"{100 * min(bars):.0f} % of the frame at the {borders}"
+        if are_bars[axis] and reaches_borders[1 - axis]:
+            width = f"{100 * narrower[axis]:.0f} % of the frame at the {borders}"
             return [f"no {coordinate} lies in {width}: was the picture letterboxed? (Fixations.in_picture)"]
     return []
 
@@ -173,23 +182,29 @@ def _middle(records: Sequence[Fixations], points: _Array, sides: _Array) -> list
 
 def _own_size(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
     """Find fixations that keep to their pictures' own size in frames that would hold them much larger."""
-    smaller = [
-        record
-        for record in records
-        if record.picture in sizes and Letterbox(record.size, sizes[record.picture]).scale >= _ENLARGED
-    ]
-    count = sum(map(len, smaller))
+    enlarging = [record for record in records if _would_enlarge(record, sizes)]
+    count = sum(map(len, enlarging))
     if count < _ENOUGH or count < 0.5 * sum(map(len, records)):
         return []
-    within = sum(int(record.in_picture(sizes[record.picture], scale=1).inside.sum()) for record in smaller)
+    within = 0
+    for record in enlarging:
+        at_own_size = record.in_picture(sizes[record.picture], scale=1)
+        within += int(at_own_size.inside.sum())
     if within < 0.99 * count:
         return []
-    first = smaller[0]
+    first = enlarging[0]
     width, height = sizes[first.picture]
     return [
         f"fixations keep to the middle of their frames, such as {width} × {height} in {first.size[0]} × "
         f"{first.size[1]} of {first.picture}: was it shown at its own size? (Fixations.in_picture with scale=1)"
     ]
+
+
+def _would_enlarge(record: Fixations, sizes: Mapping[str, tuple[int, int]]) -> bool:
+    """Tell whether a record's frame, filled by its picture, would show it much larger than it is."""
+    if record.picture not in sizes:
+        return False
+    return Letterbox(record.size, sizes[record.picture]).scale >= _ENLARGED
 
 
 def _of_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
@@ -244,16 +259,23 @@ def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
 def _of_repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
     """Say what repeats: points, records, one place, and scanpaths of a single fixation."""
     lines = []
-    repeats = np.concatenate([(record.points[1:] == record.points[:-1]).all(1) for record in records])
-    if len(repeats) >= _MANY and repeats.mean() > _MOST_REPEATED:
-        share = f"{100 * repeats.mean():.0f} %"
-        lines.append(f"{share} of the fixations repeat the point before (are these samples of the tracker?)")
+    repeats = np.concatenate([_repeats_point(record.points) for record in records])
+    share = repeats.mean() if len(repeats) >= _MANY else 0.0
+    if share > _MOST_REPEATED:
+        lines.append(
+            f"{100 * share:.0f} % of the fixations repeat the point before (are these samples of the tracker?)"
+        )
     lines += _twice(records)
     lines += _at_one_place(records, points)
     single = sum(len(record) == 1 for record in records)
     if len(records) >= _MANY and single > 0.5 * len(records):
         lines.append(f"{single} of {len(records)} scanpaths have one fixation (is a column a trial that is none?)")
     return lines
+
+
+def _repeats_point(points: _Array) -> NDArray[np.bool_]:
+    """Tell which points `(n, 2)` after the first are equal to the one before, `(n - 1,)`."""
+    return np.asarray((points[1:] == points[:-1]).all(1))
 
 
 def _twice(records: Sequence[Fixations]) -> list[str]:
@@ -269,9 +291,11 @@ def _twice(records: Sequence[Fixations]) -> list[str]:
 
 def _at_one_place(records: Sequence[Fixations], points: _Array) -> list[str]:
     """Find many fixations at one same point, but for those at which scanpaths begin."""
-    place, count = Counter(map(tuple, points.tolist())).most_common(1)[0]
-    first = sum(tuple(record.points[0].tolist()) == place for record in records)
-    if len(points) < _MANY or count - first <= max(5.0, _MOST_ALIKE * len(points)):
+    places = Counter(map(tuple, points.tolist()))
+    place, count = places.most_common(1)[0]
+    beginnings = sum(tuple(record.points[0].tolist()) == place for record in records)
+    usual = max(5.0, _MOST_ALIKE * len(points))
+    if len(points) < _MANY or count - beginnings <= usual:
         return []
     numbers = ", ".join(f"{value:g}" for value in place)
     return [f"{count} of {len(points)} fixations lie at ({numbers}): does the tracker write it during blinks?"]
@@ -284,22 +308,24 @@ def _of_durations(records: Sequence[Fixations]) -> list[str]:
         return []
     values = np.concatenate(durations)
     median = float(np.median(values))
-    least, most = (f"{value:g}" for value in (values.min(), values.max()))
-    if median < 2 and values.max() < 20 and (values % 1 != 0).any():
-        return [f"durations from {least} to {most} look like seconds (multiply them by 1000)"]
+    least = values.min()
+    most = values.max()
+    have_fractions = bool((values % 1 != 0).any())
+    if median < 2 and most < 20 and have_fractions:
+        return [f"durations from {least:g} to {most:g} look like seconds (multiply them by 1000)"]
     if median > 20_000:
         return [f"durations of {median:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"]
     lines = []
     short = (values < _SHORT).mean()
-    if len(values) >= _MANY and (values == values[0]).all():
-        lines.append(f"all durations are {least} ms (are these samples of the tracker?)")
+    if len(values) >= _MANY and least == most:
+        lines.append(f"all durations are {least:g} ms (are these samples of the tracker?)")
     elif median < _SHORT:
         lines.append(f"durations of {median:g} ms in the median are those of samples, not of fixations")
     elif short > _MOST_SHORT:
         lines.append(f"{100 * short:.0f} % of the fixations take less than {_SHORT:g} ms")
     long = int((values > _LONG).sum())
     if long:
-        lines.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most} ms")
+        lines.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most:g} ms")
     return lines
 
 

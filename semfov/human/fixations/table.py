@@ -3,6 +3,7 @@
 import csv
 import io
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -86,22 +87,23 @@ def read_table(
     if units is not None:
         lookup(units, get_args(Units), "unit")
     lookup(origin, get_args(Origin), "origin")
-    named = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
+    user_columns = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
     table = table_of(source)
     needed = _COLUMNS if size is not None else (*_COLUMNS, *_SIZE)
-    theirs = _column_names(table, named)
-    _check_columns(table, [theirs[name] for name in needed], needed)
-    table.check_different(theirs.values())
+    names = _column_names(table, user_columns)
+    _check_columns(table, [names[field] for field in needed], needed)
+    table.check_different(names.values())
     if size is None:
-        _check_sides(table.name, theirs)
+        _check_sides(table.name, names)
     if units is None:
-        units = _stated_units(table.name, theirs)
-    milliseconds = _stated_milliseconds(table.name, theirs["duration"])
+        units = _stated_units(table.name, names)
+    milliseconds = _stated_milliseconds(table.name, names["duration"])
     rows = []
     for row in table.rows:
-        fields = {name: row.fields.get(theirs[name], "") for name in (*needed, *_MORE)}
-        for name in ("duration", *_EDGES):
-            fields[name] = "" if fields[name].lower() in LOST else fields[name]
+        fields = {field: row.fields.get(names[field], "") for field in (*needed, *_MORE)}
+        for field in ("duration", *_EDGES):
+            if fields[field].lower() in LOST:
+                fields[field] = ""
         fields["duration"] = scaled(fields["duration"], milliseconds)
         rows.append(row._replace(fields=fields))
     return records_of(table.name, _with_place(table.name, rows), size, Coordinates(units, origin))
@@ -138,12 +140,22 @@ def _check_sides(table: str, names: Mapping[str, str]) -> None:
 
 
 def _stated_units(table: str, names: Mapping[str, str]) -> Units:
-    """Read the unit of points and boxes from the names of their columns: pixels where those of points have none."""
-    x, y = (Column.of(names[name]) for name in ("x", "y"))
-    is_read = x.unit == y.unit and (not x.unit or x.unit in LENGTHS)
-    check_data(is_read, table, "x and y in px or norm", f"the columns {x.name!r} and {y.name!r}")
+    """Read the unit of points and boxes from the names of their columns.
+
+    Args:
+        table: name of the table, for messages.
+        names: of the columns, by ours.
+
+    Returns:
+        The unit; pixels where the columns of points state none.
+    """
+    x = Column.of(names["x"])
+    y = Column.of(names["y"])
+    is_read = not x.unit or x.unit in LENGTHS
+    check_data(x.unit == y.unit and is_read, table, "x and y in px or norm", f"the columns {x.name!r} and {y.name!r}")
     units = LENGTHS.get(x.unit, "pixels")
-    for edge in (Column.of(names[name]) for name in _EDGES):
+    for name in _EDGES:
+        edge = Column.of(names[name])
         is_same = not edge.unit or LENGTHS.get(edge.unit) == units
         check_data(is_same, table, f"a box in {units}, as {x.name!r}", f"the column {edge.name!r}")
     return units
@@ -297,17 +309,18 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow([*_COLUMNS, *_SIZE, *_MORE])
-    viewings: dict[tuple[str, str, str | None], int] = {}
+    viewings: Counter[tuple[str, str, str | None]] = Counter()
     for record in fixations:
-        times = [""] * len(record) if record.durations is None else record.durations.tolist()
+        # A person may see a picture more than once: the number of the viewing tells the scanpaths apart.
+        scanpath = record.picture, record.subject, record.target
+        viewings[scanpath] += 1
+        durations = [""] * len(record) if record.durations is None else record.durations.tolist()
         box = [""] * 4 if record.box is None else record.box
         found = "" if record.found is None else str(record.found).lower()
-        scanpath = record.picture, record.subject, record.target
-        trial = viewings.get(scanpath, 0) + 1
-        viewings[scanpath] = trial
-        shared = [*box, found, trial]
-        for (x, y), time in zip(record.points.tolist(), times, strict=True):
-            rows.writerow([record.picture, record.subject, x, y, *record.size, record.target or "", time, *shared])
+        before = [record.picture, record.subject]
+        after = [*box, found, viewings[scanpath]]
+        for (x, y), duration in zip(record.points.tolist(), durations, strict=True):
+            rows.writerow([*before, x, y, *record.size, record.target or "", duration, *after])
     write_text(Path(path), text.getvalue())
 
 

@@ -86,36 +86,44 @@ def multimatch(
     >>> multimatch(path, path, (300, 400)).mean
     1.0
     """
-    a = as_path(ours, "ours")
-    b = as_path(theirs, "theirs")
+    p = as_path(ours, "ours")
+    q = as_path(theirs, "theirs")
     check_sides("size", size)
-    if len(a) < 3 or len(b) < 3:
+    if len(p) < 3 or len(q) < 3:
         return MultiMatch(*[float("nan")] * 5)
     diagonal = float(np.hypot(*size))
-    spread = float(np.hypot(*np.ptp(np.concatenate([a, b]), axis=0)))
-    got = f"fixations over {spread:g}, {spread / diagonal:.0f} of its diagonals"
-    check(spread <= _MOST_SCREENS * diagonal, "size", "the screen in the unit of the fixations", got)
-    u = np.diff(a, axis=0)
-    v = np.diff(b, axis=0)
+    _check_spread(np.concatenate([p, q]), diagonal)
+
+    u = np.diff(p, axis=0)
+    v = np.diff(q, axis=0)
     i, j = _aligned(_distances(u, v))
     u = u[i]
     v = v[j]
-    turn = np.abs(_directions(u) - _directions(v))
-    angle = np.minimum(turn, 2 * np.pi - turn)
-    shift = np.linalg.norm(u - v, axis=1)
-    stretch = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
-    distance = np.linalg.norm(a[i] - b[j], axis=1)
     duration = float("nan")
     if durations is not None:
-        s, t = _checked_durations(durations, len(a), len(b))
+        s, t = _checked_durations(durations, len(p), len(q))
         duration = _duration_similarity(s[i], t[j])
+
+    difference = np.linalg.norm(u - v, axis=1)
+    turn = np.abs(_directions(u) - _directions(v))
+    angle = np.minimum(turn, 2 * np.pi - turn)
+    stretch = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
+    distance = np.linalg.norm(p[i] - q[j], axis=1)
     return MultiMatch(
-        shape=max(0.0, 1 - float(np.median(shift)) / (2 * diagonal)),
+        shape=max(0.0, 1 - float(np.median(difference)) / (2 * diagonal)),
         direction=1 - float(np.median(angle)) / np.pi,
         length=max(0.0, 1 - float(np.median(stretch)) / diagonal),
         position=max(0.0, 1 - float(np.median(distance)) / diagonal),
         duration=duration,
     )
+
+
+def _check_spread(points: _Array, diagonal: float) -> None:
+    """Raise `InputError` for points `(n, 2)` that spread over many diagonals of a screen: they are in another unit."""
+    extent = np.ptp(points, axis=0)
+    spread = float(np.hypot(*extent))
+    got = f"fixations over {spread:g}, {spread / diagonal:.0f} of its diagonals"
+    check(spread <= _MOST_SCREENS * diagonal, "size", "the screen in the unit of the fixations", got)
 
 
 def _directions(vectors: _Array) -> _Array:
@@ -130,11 +138,14 @@ def _distances(first: NDArray[np.number], second: NDArray[np.number]) -> _Array:
 
 def _checked_durations(durations: tuple[ArrayLike, ArrayLike], first: int, second: int) -> tuple[_Array, _Array]:
     """Take the durations of two scanpaths of some numbers of fixations, and check them."""
-    s, t = (as_array(values, "durations") for values in _pair(durations, "durations", "those of both scanpaths"))
+    ours, theirs = _pair(durations, "durations", "those of both scanpaths")
+    s = as_array(ours, "durations")
+    t = as_array(theirs, "durations")
     expected = f"{first} and {second} numbers, one for each fixation"
     check(s.shape == (first,) and t.shape == (second,), "durations", expected, (s.shape, t.shape))
-    is_usable = bool((s >= 0).all() and (t >= 0).all() and np.isfinite([s.sum(), t.sum()]).all())
-    check(is_usable, "durations", "finite numbers of 0 or more", "others")
+    are_positive = bool((s >= 0).all() and (t >= 0).all())
+    are_finite = bool(np.isfinite([s.sum(), t.sum()]).all())
+    check(are_positive and are_finite, "durations", "finite numbers of 0 or more", "others")
     return s, t
 
 
@@ -154,20 +165,31 @@ def _duration_similarity(s: _Array, t: _Array) -> float:
 
 
 def _aligned(cost: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find the rows and columns of the cheapest path through a matrix, from its end to its start."""
+    """Find the cheapest path through a matrix from its first to its last corner, by dynamic programming.
+
+    Args:
+        cost: `(n, m)`, what each pair on the path costs.
+
+    Returns:
+        Rows and columns of the pairs, from the last corner to the first.
+    """
     rows, columns = cost.shape
     # total[i, j] is the least sum of a path through the first i rows and j columns; a border of infinity spares checks.
     total = np.full((rows + 1, columns + 1), np.inf)
     total[0, 0] = 0
     for i in range(rows):
         for j in range(columns):
-            total[i + 1, j + 1] = cost[i, j] + min(total[i, j], total[i, j + 1], total[i + 1, j])
-    path = [(rows - 1, columns - 1)]
-    while path[-1] != (0, 0):
-        i, j = path[-1]
+            cheapest = min(total[i, j], total[i, j + 1], total[i + 1, j])
+            total[i + 1, j + 1] = cost[i, j] + cheapest
+
+    i = rows - 1
+    j = columns - 1
+    path = [(i, j)]
+    while (i, j) != (0, 0):
         # `total` has one more row and column in front: its entry (i, j) belongs to the pair (i - 1, j - 1).
-        steps = {(i - 1, j - 1): total[i, j], (i - 1, j): total[i, j + 1], (i, j - 1): total[i + 1, j]}
-        path.append(min(steps, key=lambda step: steps[step]))
+        total_before = {(i - 1, j - 1): total[i, j], (i - 1, j): total[i, j + 1], (i, j - 1): total[i + 1, j]}
+        i, j = min(total_before, key=lambda pair: total_before[pair])
+        path.append((i, j))
     first, second = np.array(path).T
     return first, second
 
@@ -219,14 +241,22 @@ def scanmatch(
     columns, rows = _pair(cells, "cells", "(columns, rows)")
     for count in (columns, rows):
         check_whole(count, "cells", 1, 1000)
-    paths = as_path(ours, "ours", least=1), as_path(theirs, "theirs", least=1)
-    words = [cell_labels(path, columns, rows, size) for path in paths]
+    path = as_path(ours, "ours", least=1)
+    other_path = as_path(theirs, "theirs", least=1)
+    word = cell_labels(path, columns, rows, size)
+    other_word = cell_labels(other_path, columns, rows, size)
     if durations is not None:
-        lasting = _pair(durations, "durations", "those of both scanpaths")
-        words = [_repeated(word, milliseconds, bin_ms) for word, milliseconds in zip(words, lasting, strict=True)]
-    a, b = (np.stack([word % columns, word // columns], 1) for word in words)
-    best = _best_alignment(threshold - _distances(a, b), gap)
-    return float(best / (threshold * max(len(a), len(b))))
+        milliseconds, other_milliseconds = _pair(durations, "durations", "those of both scanpaths")
+        word = _repeated(word, milliseconds, bin_ms)
+        other_word = _repeated(other_word, other_milliseconds, bin_ms)
+    gain = threshold - _distances(_cells_of(word, columns), _cells_of(other_word, columns))
+    longer = max(len(word), len(other_word))
+    return float(_best_alignment(gain, gap) / (threshold * longer))
+
+
+def _cells_of(word: NDArray[np.int64], columns: int) -> NDArray[np.int64]:
+    """Find column and row `(n, 2)` of each letter `(n,)` in a grid that is numbered row by row."""
+    return np.stack([word % columns, word // columns], 1)
 
 
 def _repeated(word: NDArray[np.int64], durations: ArrayLike, bin_ms: float) -> NDArray[np.int64]:
@@ -256,7 +286,10 @@ def _best_alignment(gain: _Array, gap: float) -> float:
     best[0] = gap * np.arange(columns + 1)
     for i in range(rows):
         for j in range(columns):
-            best[i + 1, j + 1] = max(best[i, j] + gain[i, j], best[i, j + 1] + gap, best[i + 1, j] + gap)
+            pair = best[i, j] + gain[i, j]
+            first_alone = best[i, j + 1] + gap
+            second_alone = best[i + 1, j] + gap
+            best[i + 1, j + 1] = max(pair, first_alone, second_alone)
     return float(best[-1, -1])
 
 

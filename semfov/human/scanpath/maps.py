@@ -36,13 +36,15 @@ def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
     got = values.shape, fixated.shape
     check(values.ndim == 2 and fixated.size > 0, "saliency", "one map and at least one fixation", got)
     is_free = np.ones(values.shape, dtype=bool)
-    is_free[_pixels(y).astype(int), _pixels(x).astype(int)] = False
-    others = np.sort(values[is_free])
-    check(len(others) > 0, "saliency", "at least one pixel that nobody fixated", "none")
+    row = _pixels(y).astype(int)
+    column = _pixels(x).astype(int)
+    is_free[row, column] = False
+    background = np.sort(values[is_free])
+    check(len(background) > 0, "saliency", "at least one pixel that nobody fixated", "none")
     ascending = np.sort(fixated)
     thresholds = ascending[::-1]
     hits = 1 - np.searchsorted(ascending, thresholds) / len(fixated)
-    alarms = 1 - np.searchsorted(others, thresholds) / len(others)
+    alarms = 1 - np.searchsorted(background, thresholds) / len(background)
     return float(np.trapezoid([0, *hits, 1], [0, *alarms, 1]))
 
 
@@ -128,9 +130,11 @@ def correlation(first: ArrayLike, second: ArrayLike) -> _Array:
         check(missing == 0, "maps", "finite numbers", got)
     one = one - one.mean(-1, keepdims=True)
     other = other - other.mean(-1, keepdims=True)
-    spread = np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
     covariance = (one * other).sum(-1)
-    return np.asarray(np.where(spread > 0, covariance / np.where(spread > 0, spread, 1), 0.0))
+    spread = np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
+    has_spread = spread > 0
+    ratio = covariance / np.where(has_spread, spread, 1)
+    return np.asarray(np.where(has_spread, ratio, 0.0))
 
 
 def similarity(first: ArrayLike, second: ArrayLike) -> _Array:
@@ -289,12 +293,14 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     check_number(floor, "floor", 0, 1)
     values = _as_maps(maps)
     total = values.sum((-1, -2), keepdims=True)
-    is_usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
+    is_positive = bool((values >= 0).all() and (total > 0).all())
+    is_finite = bool(np.isfinite(total).all())
     got = f"values from {values.min():g} to {values.max():g}, with sums from {total.min():g} to {total.max():g}"
-    check(is_usable, "maps", "finite numbers of 0 or more, not all 0 in a map", got)
+    check(is_positive and is_finite, "maps", "finite numbers of 0 or more, not all 0 in a map", got)
     uniform = floor / _pixel_count(values)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log((1 - floor) * values / total + uniform))
+    density = (1 - floor) * values / total + uniform
+    with np.errstate(divide="ignore"):  # a probability of 0 is -inf, as documented
+        return np.asarray(np.log(density))
 
 
 def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
@@ -373,7 +379,16 @@ def _pixels(coordinate: ArrayLike) -> _Array:
 
 
 def _looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Array]:
-    """Read maps at the pixels of fixations; maps `(..., H, W)`, x `(..., n)`, y `(..., n)` → `(..., n)`."""
+    """Read maps at the pixels of fixations, and check both.
+
+    Args:
+        maps: `(..., H, W)`.
+        x: `(..., n)`, of fixations, in pixels of the map.
+        y: `(..., n)`, of the same fixations.
+
+    Returns:
+        The maps as an array, and their values at the fixations, `(..., n)`.
+    """
     values = _as_maps(maps)
     column = _pixels(x)
     row = _pixels(y)
@@ -382,9 +397,14 @@ def _looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Ar
     check(is_row, "x, y", f"arrays of shape {(*leading, 'n')}, one row for each map", (column.shape, row.shape))
     missing = int(np.isnan(values).sum())
     check(not missing, "maps", "numbers", f"NaN in {missing} of {values.size} pixels; replace them (numpy.nan_to_num)")
+
     height, width = values.shape[-2:]
-    outside = ~((column >= 0) & (column < width) & (row >= 0) & (row < height))
+    inside_columns = (column >= 0) & (column < width)
+    inside_rows = (row >= 0) & (row < height)
+    outside = ~(inside_columns & inside_rows)  # also of NaN, which no comparison holds for
     got = f"{int(outside.sum())} of {outside.size} outside it; remove them, or scale them to pixels of the map"
     check(not bool(outside.any()), "x, y", f"points inside a map of {width} × {height} pixels", got)
+
     flat = values.reshape(*leading, -1)
-    return values, np.take_along_axis(flat, (row * width + column).astype(np.int64), axis=-1)
+    pixel = (row * width + column).astype(np.int64)
+    return values, np.take_along_axis(flat, pixel, axis=-1)

@@ -86,14 +86,18 @@ def direction_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     >>> direction_distance([3.0], [-3.0]).__round__(3)
     0.283
     """
-    a = np.sort((_sample(ours, "ours") + np.pi) % (2 * np.pi))
-    b = np.sort((_sample(theirs, "theirs") + np.pi) % (2 * np.pi))
-    if not (len(a) and len(b)):
+    f_sample = np.sort((_sample(ours, "ours") + np.pi) % (2 * np.pi))
+    g_sample = np.sort((_sample(theirs, "theirs") + np.pi) % (2 * np.pi))
+    if not (len(f_sample) and len(g_sample)):
         return float("nan")
-    angles = np.concatenate([[0.0], np.sort(np.concatenate([a, b])), [2 * np.pi]])
+    # F - G is constant between one direction and the next.
+    directions = np.sort(np.concatenate([f_sample, g_sample]))
+    angles = np.concatenate([[0.0], directions, [2 * np.pi]])
     spans = np.diff(angles)
-    gap = _distribution(a, angles[:-1]) - _distribution(b, angles[:-1])
-    # The best c is the median of the gap, weighted by the spans.
+    starts = angles[:-1]
+    gap = _distribution(f_sample, starts) - _distribution(g_sample, starts)
+    # The best c is the median of the gap, weighted by the spans, which sum to 2π.
     order = np.argsort(gap)
-    median = gap[order][np.searchsorted(spans[order].cumsum(), np.pi)]
+    middle = np.searchsorted(spans[order].cumsum(), np.pi)
+    median = gap[order][middle]
     return float((np.abs(gap - median) * spans).sum())

@@ -38,10 +38,13 @@ def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, f
     check_whole(rows, "rows", 1, _MOST_CELLS)
     check_sides("size", size)
     shares = (as_path(points, "points") + 0.5) / size  # of the picture's width and height
-    outside = int((~((shares >= 0) & (shares <= 1))).any(-1).sum())
+    is_inside = ((shares >= 0) & (shares <= 1)).all(-1)
+    outside = int((~is_inside).sum())
     check(outside == 0, "points", f"points inside a picture of {size} pixels", f"{outside} outside it; remove them")
     # A point on the last edge belongs to the last cell.
-    column, row = np.minimum(shares * (columns, rows), (columns - 1e-9, rows - 1e-9)).astype(np.int64).T
+    last = (columns - 1e-9, rows - 1e-9)
+    cells = np.minimum(shares * (columns, rows), last).astype(np.int64)
+    column, row = cells.T
     return np.asarray(row * columns + column)
 
 
