@@ -74,7 +74,7 @@ def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, .
     Raises:
         InputError: they are no names, or two classes have one.
     """
-    wrong = [name for name in classes if isinstance(name, bool) or not isinstance(name, str | int | None)]
+    wrong = [name for name in classes if not _may_be_name(name)]
     remedy = "YAML reads no, off, yes and on so: put names in quotes, or give classes="
     check(not wrong, "classes", "names", f"{wrong[:3]}; {remedy}")
     names = [str(name).strip() for name in classes]
@@ -83,6 +83,12 @@ def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, .
     are_distinct = len(set(named)) == len(named)
     check(are_distinct and bool(named), "classes", "at least one name, all different", named)
     return named, places
+
+
+def _may_be_name(name: object) -> bool:
+    """Tell whether a value of a list of names is a text, a whole number, or None for a gap."""
+    # True and False are whole numbers for Python.
+    return isinstance(name, str | int | None) and not isinstance(name, bool)
 
 
 def keep_classes(candidates: Candidates, places: Sequence[int], count: int) -> Candidates:

@@ -41,22 +41,37 @@ def merge_crops(
 def _merge_fixation(
     detections: Detections, windows: Tensor, side: int, size: tuple[int, int], limit: int
 ) -> Detections:
-    """Merge the detections in the crops `(L, 4)` of one fixation."""
+    """Merge the detections in the crops of one fixation.
+
+    Args:
+        detections: the detections in each of L crops, the finest first, in picture pixels.
+        windows: the crops, `(L, 4)` in picture pixels.
+        side: side of the detector's input in pixels.
+        size: `(width, height)` of the picture.
+        limit: largest number of detections.
+
+    Returns:
+        One image of detections.
+    """
     crop, row = detections.mask.nonzero(as_tuple=True)
     rows = detections[crop, row]
     picture = rows.boxes.new_tensor([*size, *size], dtype=rows.boxes.dtype)
     rows = replace(rows, boxes=torch.minimum(rows.boxes.clamp(min=0), picture))
     boxes = rows.boxes.detach()
+
+    # A box stays unless a finer crop shows it in full, or it has no area inside the picture.
     in_full = _shown_in_full(boxes, windows, picture[:2], side)
-    finer = torch.arange(len(windows), device=crop.device) < crop[:, None]
-    sharper_elsewhere = (in_full & finer).any(-1)
+    is_finer = torch.arange(len(windows), device=crop.device) < crop[:, None]
+    sharper_elsewhere = (in_full & is_finer).any(-1)
     has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
     index = (has_area & ~sharper_elsewhere).nonzero()[:, 0]
+
+    crop = crop[index]
     score, label = rows.scores[index, 1:].detach().max(-1)
-    cut = ~in_full[index, crop[index]]
-    sharpness = -crop[index]
-    columns = (boxes[index], score, label, crop[index], cut, sharpness)
-    distinct = unlike(*(column.cpu() for column in columns))
+    is_cut = ~in_full[index, crop]
+    distinct = unlike(
+        boxes[index].cpu(), score.cpu(), label.cpu(), looks=crop.cpu(), cut=is_cut.cpu(), sharpness=-crop.cpu()
+    )
     objects = index[distinct[:limit].to(index)]
     return rows.take(objects)[None]
 

@@ -256,16 +256,18 @@ class _Builder:
         return nn.Upsample(scale_factor=float(stride), mode="nearest")
 
     def _route(self, section: Section) -> nn.Module:
+        """Note the channels of several layers, or one of equal groups of the channels of each."""
         sources = self._layers(section, "layers")
         groups = section.integer("groups", 1)
         group = section.integer("group_id", 0, minimum=0)
         shapes = [self.shapes[source] for source in sources]
-        section.check(len({shape.step for shape in shapes}) == 1, "layers of one size", section.text("layers"))
-        counts = [shape.channels for shape in shapes]
-        divided = group < groups and not any(count % groups for count in counts)
-        parts = f"a group_id below groups, and groups that divide the channels {excerpt(counts)}"
-        section.check(divided, parts, f"group_id={excerpt(group)} and groups={excerpt(groups)}")
-        self._note(_Shape(sum(counts) // groups, shapes[0].step), *sources)
+        steps = {shape.step for shape in shapes}
+        section.check(len(steps) == 1, "layers of one size", section.text("layers"))
+        channels = [shape.channels for shape in shapes]
+        divided = group < groups and not any(count % groups for count in channels)
+        expected = f"a group_id below groups, and groups that divide the channels {excerpt(channels)}"
+        section.check(divided, expected, f"group_id={excerpt(group)} and groups={excerpt(groups)}")
+        self._note(_Shape(sum(channels) // groups, shapes[0].step), *sources)
         return Route(groups, group)
 
     def _shortcut(self, section: Section) -> nn.Module:
@@ -276,6 +278,7 @@ class _Builder:
         return Shortcut(_activation(section, "linear"))
 
     def _yolo(self, section: Section) -> nn.Module:
+        """Note a head with the anchors that its mask selects, for a map with its channels."""
         numbers = section.numbers("anchors")
         anchors = list(zip(numbers[::2], numbers[1::2], strict=False))
         every_anchor = ",".join(map(str, range(len(anchors))))
@@ -287,7 +290,8 @@ class _Builder:
         scale = section.numbers("scale_x_y", "1")
         section.check(len(scale) == 1, "one number", excerpt(section.text("scale_x_y", "1")), "scale_x_y")
         anchors_of_head = tuple(anchors[index] for index in mask)
-        head = Head(anchors_of_head, section.integer("classes", 20), scale[0])
+        classes = section.integer("classes", 20)
+        head = Head(anchors_of_head, classes, scale[0])
         section.check(head.channels == self._here.channels, f"{head.channels} channels", self._here.channels)
         self._note(self._here, self._previous)
         return head
@@ -421,14 +425,14 @@ class Darknet(nn.Module):
         steps = []
         origins: dict[int, int] = {}  # of layers that hand on the map of another one
         for index, (layer, sources) in enumerate(zip(self.layers, self.sources, strict=True)):
-            reads = [origins.get(source, source) for source in sources]
-            takes_all = isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)
-            if takes_all and len(reads) == 1:
-                origins[index] = reads[0]
+            read = [origins.get(source, source) for source in sources]
+            hands_on = isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)
+            if hands_on and len(read) == 1:
+                origins[index] = read[0]
                 continue
-            names = tuple(str(read) for read in reads if read >= 0)  # without the image, -1
+            maps = tuple(str(number) for number in read if number >= 0)  # without the image, -1
             stride = round(float(self.steps[index]))
-            steps.append(NetworkStep(str(index), stride, names, isinstance(layer, Convolution)))
+            steps.append(NetworkStep(str(index), stride, maps, isinstance(layer, Convolution)))
         return {name: int(layer) for name, layer in landmarks(steps).items()}
 
     def cfg_digest(self) -> str:
@@ -473,11 +477,12 @@ class Darknet(nn.Module):
         """
         layers = [layer for layer in self.layers if isinstance(layer, Convolution)]
         name = f"weights {str(path)!r}"
-        data = _read_data(Path(path), name, sum(layer.stored_numbers for layer in layers))
+        lengths = [layer.stored_numbers for layer in layers]
+        data = _read_data(Path(path), name, sum(lengths))
         numbers = torch.frombuffer(data, dtype=torch.float32, offset=_header_length(data))
         got = "NaN or infinite ones; the file is damaged or not a weights file"
         check_data(bool(numbers.isfinite().all()), name, "finite numbers", got)
-        for layer, part in zip(layers, numbers.split([layer.stored_numbers for layer in layers]), strict=True):
+        for layer, part in zip(layers, numbers.split(lengths), strict=True):
             vectors, kernel = part.split([layer.out_channels * layer.stored_vectors, layer.weight.numel()])
             weight = kernel.view(layer.weight.shape).double()
             bias, *batch_norm = vectors.view(-1, layer.out_channels).double()

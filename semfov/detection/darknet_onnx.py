@@ -243,26 +243,16 @@ def network_model(
         from onnx import TensorProto, helper
     except ImportError as error:
         raise ModuleNotFoundError("exporting to ONNX needs the package onnx: pip install onnx") from error
-    graph = _NetworkGraph()
-    names = {-1: "images"}
-    heads = []
-    for index, (layer, sources) in enumerate(zip(network.layers, network.sources, strict=True)):
-        names[index] = graph.layer(layer, *(names[source] for source in sources))
-        if isinstance(layer, Head):
-            heads.append(graph.decode(layer, names[index], float(network.steps[index])))
-    for output, levels in zip(_OUTPUTS, zip(*heads, strict=True), strict=True):
-        graph.add("Concat", *levels, output=output, axis=1)
-    for number in layers:
-        graph.add("Identity", names[number], output=f"layer_{number}")
+    graph = _network_graph(network, layers)
 
     # Words are names of sizes that are open.
     batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
     boxes = "boxes" if size is None else None
     classes = network.heads[0].classes
     shapes = {"boxes": [batch, boxes, 4], "objectness": [batch, boxes], "classes": [batch, boxes, classes]}
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])
     outputs = [helper.make_tensor_value_info(output, TensorProto.FLOAT, shapes[output]) for output in _OUTPUTS]
     outputs += [helper.make_tensor_value_info(f"layer_{number}", TensorProto.FLOAT, None) for number in layers]
-    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])
     constants = list(graph.constants.values())
     return helper.make_model(
         helper.make_graph(graph.nodes, name, [images], outputs, constants),
@@ -270,6 +260,24 @@ def network_model(
         opset_imports=[helper.make_opsetid("", _OPSET)],
         ir_version=_IR_VERSION,
     )
+
+
+def _network_graph(network: Darknet, layers: Sequence[int]) -> _NetworkGraph:
+    """Make the nodes of a network from its input `images` to `_OUTPUTS`, and to the maps of layers by number."""
+    graph = _NetworkGraph()
+    tensors = {-1: "images"}
+    decoded_heads = []
+    for index, (layer, sources) in enumerate(zip(network.layers, network.sources, strict=True)):
+        inputs = [tensors[source] for source in sources]
+        tensors[index] = graph.layer(layer, *inputs)
+        if isinstance(layer, Head):
+            step = float(network.steps[index])
+            decoded_heads.append(graph.decode(layer, tensors[index], step))
+    for output, levels in zip(_OUTPUTS, zip(*decoded_heads, strict=True), strict=True):
+        graph.add("Concat", *levels, output=output, axis=1)
+    for number in layers:
+        graph.add("Identity", tensors[number], output=f"layer_{number}")
+    return graph
 
 
 def _has_gradients(tensors: Sequence[Tensor]) -> bool:

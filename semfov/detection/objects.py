@@ -200,17 +200,24 @@ def _checked_boxes(
     classes = numbers.long()
     check(torch.equal(classes.to(numbers), numbers), "labels", "whole numbers of classes", numbers.tolist()[:3])
     if not corners.numel():
-        corners = corners.view(0, 4)
+        corners = corners.view(0, 4)  # an empty list has one dimension
     check_shape(corners, "boxes", None, 4)
-    farthest = float(corners.abs().max()) if corners.numel() else 0.0
-    check(farthest <= _FAR, "boxes", f"edges up to {_FAR:g} pixels", f"{farthest:g}")
     check_shape(confidence, "scores", len(corners))
     check_shape(classes, "labels", len(corners))
-    ordered = bool((corners[:, :2] <= corners[:, 2:]).all())
-    check(ordered, "boxes", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", "others")
+    _check_edges(corners)
     in_range = bool(((confidence >= 0) & (confidence <= 1)).all())
     check(in_range, "scores", "numbers from 0 to 1", confidence.tolist()[:3])
     return corners, confidence, classes
+
+
+def _check_edges(boxes: Tensor) -> None:
+    """Raise `InputError` unless the edges of boxes `(M, 4)` are in order, and so near that areas do not overflow."""
+    if not boxes.numel():
+        return
+    farthest = float(boxes.abs().max())
+    check(farthest <= _FAR, "boxes", f"edges up to {_FAR:g} pixels", f"{farthest:g}")
+    are_ordered = bool((boxes[:, :2] <= boxes[:, 2:]).all())
+    check(are_ordered, "boxes", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", "others")
 
 
 def _numbers_of_windows(windows: Tensor) -> Tensor:
@@ -310,15 +317,16 @@ def unlike(
     Returns:
         Indices of the boxes, most confident first.
     """
-    # Best first: boxes that are not cut, of these the sharpest, of these the most confident. The sorts are stable, so
-    # the last key comes first.
     # The best box first: whole before cut, then sharper, then more confident. Sorts are stable, so the last one leads.
     order = scores.argsort(descending=True, stable=True)
     order = order[sharpness[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
-    corners, classes, look, is_cut = (column[order].numpy() for column in (boxes, labels.double(), looks, cut))
-    better, worse, shared = _overlapping_pairs(corners, classes, around)
+    corners = boxes[order].numpy()
+    classes = labels.double()[order].numpy()
+    look = looks[order].numpy()
+    is_cut = cut[order].numpy()
 
+    better, worse, shared = _overlapping_pairs(corners, classes, around)
     x1, y1, x2, y2 = corners.T
     area = (x2 - x1) * (y2 - y1)
     union = area[better] + area[worse] - shared
@@ -327,9 +335,10 @@ def unlike(
     # Boxes without area share none; equal ones are one object all the same.
     empty = np.flatnonzero(union <= 0)
     is_same[empty] = (corners[better[empty]] == corners[worse[empty]]).all(-1)
+    # The part of an object at the border of a window lies inside the box of the whole object, which another look shows.
     share_of_worse = shared / np.maximum(area, 1e-6)[worse]
-    is_inside = share_of_worse >= np.float32(inside)
-    is_same |= is_inside & is_cut[worse] & (look[better] != look[worse])
+    is_part = (share_of_worse >= np.float32(inside)) & is_cut[worse]
+    is_same |= is_part & (look[better] != look[worse])
 
     survivors = _survivors(len(corners), better[is_same], worse[is_same])
     index = order[torch.from_numpy(survivors)]

@@ -236,9 +236,12 @@ class Budget:
         numbers = sum(math.prod(self.sizes[name]) for name in names)
         if node.op_type in ("MaxPool", "AveragePool") and node.output[0] in self.sizes:
             kernel = math.prod(_attribute(node, "kernel_shape", ()))
-            numbers += math.prod(self.sizes[node.output[0]]) * kernel // 16  # a comparison takes less than a number
+            comparisons = math.prod(self.sizes[node.output[0]]) * kernel
+            numbers += comparisons // 16  # each takes less time than a number
         workspace = self._workspace(node)
-        return numbers + (workspace // self.widths[node.input[0]] if workspace else 0)
+        if workspace:
+            numbers += workspace // self.widths[node.input[0]]
+        return numbers
 
 
 def _forget_stated_sizes(graph: GraphProto, canvas: tuple[int, int]) -> None:

@@ -36,21 +36,29 @@ def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candi
         InputError: there is not a row for each cell, or the rows hold decoded boxes.
     """
     check_shape(raw, "raw", None, None, None)
-    if values_known(raw) and raw.numel():
-        # Exports with boxes as fractions of the canvas have the same shape.
-        # Mostly a few cells tell, and not all need to be read.
-        are_fractions = _lie_in_unit(raw[:, :_FEW, :4]) and _lie_in_unit(raw[..., :4])
-        are_fractions = are_fractions and bool((raw[..., :4] != raw[0, 0, 0]).any())
-        expected = "offsets from cells and logarithms of sizes, some of them below 0"
-        got = "numbers from 0 to 1, as fractions of the canvas"
-        check(not are_fractions, "output of the head", expected, got)
+    # Exports with boxes as fractions of the canvas have the same shape.
+    expected = "offsets from cells and logarithms of sizes, some of them below 0"
+    got = "numbers from 0 to 1, as fractions of the canvas"
+    check(not _are_fractions(raw[..., :4]), "output of the head", expected, got)
     grid = cell_grid(raw.shape[1], canvas, strides, 0.0, raw.dtype, raw.device)
     cell = grid[:, :2]
     stride = grid[:, 2:]
-    centre = (raw[..., 0:2] + cell) * stride
-    size = raw[..., 2:4].exp() * stride
+    offset = raw[..., 0:2]
+    log_size = raw[..., 2:4]
+    centre = (offset + cell) * stride
+    size = log_size.exp() * stride
     boxes = corners(torch.cat([centre, size], -1))
     return Candidates(boxes, classes=raw[..., 5:], objectness=raw[..., 4])
+
+
+def _are_fractions(boxes: Tensor) -> bool:
+    """Tell whether all numbers of boxes `(B, N, 4)` are known to lie from 0 to 1, and are not all the same."""
+    if not values_known(boxes) or not boxes.numel():
+        return False
+    # Mostly a few cells tell, and not all need to be read.
+    if not _lie_in_unit(boxes[:, :_FEW]) or not _lie_in_unit(boxes):
+        return False
+    return bool((boxes != boxes[0, 0, 0]).any())
 
 
 def _lie_in_unit(numbers: Tensor) -> bool:
@@ -167,19 +175,20 @@ def decode_distances(
     """
     check_shape(scores, "classes", None, None, None)
     check_shape(distances, "distances", None, scores.shape[1], None)
-    bins = distances.shape[-1] // 4
-    divisible = bins > 0 and distances.shape[-1] == 4 * bins
     shape = tuple(distances.shape)
-    check(divisible, "distances", "4 · bins channels, the same number of bins for each side", shape)
+    bins, rest = divmod(shape[-1], 4)
+    expected = "4 · bins channels, the same number of bins for each side"
+    check(bins > 0 and rest == 0, "distances", expected, shape)
     grid = cell_grid(distances.shape[1], canvas, strides, offset, distances.dtype, distances.device)
     stride = grid[:, 2:]
     point = grid[:, :2] * stride
     chances = distances.unflatten(-1, (4, bins)).softmax(-1)
-    expected_bin = chances @ torch.arange(bins).to(distances)
-    distance = expected_bin * stride
+    bin_numbers = torch.arange(bins).to(distances)
+    distance = chances @ bin_numbers * stride
     upper_left = point - distance[..., :2]
     lower_right = point + distance[..., 2:]
-    return Candidates(torch.cat([upper_left, lower_right], -1), scores)
+    boxes = torch.cat([upper_left, lower_right], -1)
+    return Candidates(boxes, scores)
 
 
 def decode_detr(logits: Tensor, boxes: Tensor, canvas: Canvas) -> Candidates:

@@ -159,15 +159,18 @@ class OnnxSession:
 
     def _read_inputs(self, inputs: Sequence[Port]) -> _Inputs:
         """Find the input for images, and the others; raises `InputError` for others than detectors have."""
+        descriptions = [f"{port['name']} {port['shape']} {port['type']}" for port in inputs]
+        got = ", ".join(descriptions)
         images = [port for port in inputs if len(port["shape"]) == 4 and port["type"] in _FLOATS]
-        description = ", ".join(f"{port['name']} {port['shape']} {port['type']}" for port in inputs)
-        takes_rgb = len(images) == 1 and _sizes(images[0]["shape"])[1] in (3, None)
-        check(takes_rgb, self.path.name, "one floating-point input (B, 3, H, W)", description)
+        expected = "one floating-point input (B, 3, H, W)"
+        check(len(images) == 1, self.path.name, expected, got)
         image = images[0]
+        shape = _sizes(image["shape"])
+        check(shape[1] in (3, None), self.path.name, expected, got)
         others = tuple(port["name"] for port in inputs if port is not image)
-        expected = f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}"
-        check(set(others) <= set(_EXTRA_INPUTS), self.path.name, expected, description)
-        return _Inputs(image["name"], _sizes(image["shape"]), _FLOATS[image["type"]], others)
+        are_known = set(others) <= set(_EXTRA_INPUTS)
+        check(are_known, self.path.name, f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}", got)
+        return _Inputs(image["name"], shape, _FLOATS[image["type"]], others)
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model on images, without gradients, in parts where its batch size is fixed.
@@ -277,16 +280,16 @@ class OnnxSession:
         graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
         shapes = {value.name: dims(value) for value in [*graph.value_info, *graph.output]}
         steps = []
-        of_image = {self.image}  # tensors that are computed from the image; others are stored weights, and no maps
+        from_image = {self.image}  # tensors that are computed from the image; others are stored weights, and no maps
         for node in graph.node:
-            reads = tuple(node.input)
-            if not of_image.isdisjoint(reads):
-                of_image.update(node.output)
+            inputs = tuple(node.input)
+            if not from_image.isdisjoint(inputs):
+                from_image.update(node.output)
             for output in node.output:
                 shape = shapes.get(output, [])
-                is_map = output in of_image and len(shape) == 4 and min(shape[2:]) > 1
+                is_map = output in from_image and len(shape) == 4 and min(shape[2:]) > 1
                 stride = stride_of(canvas[0], shape[3]) if is_map else None
-                steps.append(NetworkStep(output, stride, reads, node.op_type == "Conv"))
+                steps.append(NetworkStep(output, stride, inputs, node.op_type == "Conv"))
         return steps
 
 

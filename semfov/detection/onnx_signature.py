@@ -110,18 +110,21 @@ class Signature:
         - `levels`: several outputs, a few for each level of cells.
         - `rows`: one output `(1, rows, columns)`.
         """
+        names = self.shapes.keys()
         selected = selected_outputs(self.shapes)
-        if "pred_boxes" in self.shapes and any(name in self.shapes for name in _QUERY_LOGITS):
+        # The order tells apart outputs that fit two layouts: the one with more of its own names comes first.
+        if "pred_boxes" in names and names & {*_QUERY_LOGITS}:
             return "queries"
-        if {"dets", "labels"} <= self.shapes.keys() and len(self.shapes["labels"]) == 3:
+        if {"dets", "labels"} <= names and len(self.shapes["labels"]) == 3:
             return "dets"
         if "boxes" in selected and len(selected.get("labels", ())) == 2:
             return "selection"
-        if "boxes" in self.shapes and self.shapes.keys() & {"classes", "scores"}:
+        if "boxes" in names and names & {"classes", "scores"}:
             return "candidates"
-        if len(self.shapes) > 1:
+        if len(names) > 1:
             return "levels"
-        return "rows" if len(self.outputs[0][1]) == 3 else "unknown"
+        _, shape = self.outputs[0]
+        return "rows" if len(shape) == 3 else "unknown"
 
     @cached_property
     def rows(self) -> Rows:

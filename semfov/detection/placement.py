@@ -108,9 +108,12 @@ def letterbox(
         vertical = -rows % stride
     left = 0 if corner else horizontal // 2
     top = 0 if corner else vertical // 2
-    padding = (left, horizontal - left, top, vertical - top)
-    canvas = F.pad(resize(image, (columns, rows)), padding, value=fill)
-    return canvas, Placement((width, height), (columns / width, rows / height), (left, top))
+    right = horizontal - left
+    bottom = vertical - top
+    resized = resize(image, (columns, rows))
+    canvas = F.pad(resized, (left, right, top, bottom), value=fill)
+    scale = (columns / width, rows / height)
+    return canvas, Placement((width, height), scale, (left, top))
 
 
 def _size_within(size: tuple[int, int], width: int, height: int) -> tuple[int, int]:

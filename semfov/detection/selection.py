@@ -93,7 +93,7 @@ def check_numbers(image: int, low: float, high: float, **named: Tensor | None) -
 def _select_of_image(
     candidates: Candidates, image: int, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
 ) -> Detections:
-    """Select the best boxes of one image."""
+    """Select the best boxes of one image; the arguments are those of `select`, and the image's number."""
     confidence = candidates.confidence[image]
     index = (confidence >= selection.threshold).nonzero()[:, 0]
     boxes = candidates.boxes[image].index_select(0, index)
@@ -103,16 +103,19 @@ def _select_of_image(
     # Labels are read only where boxes suppress those of their own class.
     labels = candidates.classes[image, index].argmax(-1) if selection.per_class else index
     survivors = suppress(boxes, confidence.index_select(0, index), labels, selection)
+
+    # The scores of a few boxes are read after suppression, not those of all cells before.
     rows = candidates.take(image, index[survivors])
     check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
     scores = score_vectors(rows, policy)
     # Suppression ranks by confidence; the shares of a vector can rank otherwise.
-    order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
+    best_score = scores[:, 1:].detach().amax(-1)
+    order = best_score.argsort(descending=True, stable=True)
     boxes = boxes.index_select(0, survivors[order])
     scores = scores.index_select(0, order)
     confidence = rows.confidence.index_select(0, order)
-    every = torch.ones_like(order, dtype=torch.bool)
-    return Detections(boxes[None], scores[None], every[None], confidence[None])
+    mask = torch.ones_like(order, dtype=torch.bool)
+    return Detections(boxes[None], scores[None], mask[None], confidence[None])
 
 
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:

@@ -81,14 +81,18 @@ def decode_yolo(
     """
     batch, channels, rows, columns = raw.shape
     check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))
-    cells = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
-    sizes = tuple((width, height) for width, height in anchors)
-    corner, step, halves = _cells((columns, rows), (canvas[0], canvas[1]), sizes, raw.dtype, raw.device)
-    shift = cells[..., 0:2].sigmoid() * scale - (scale - 1) / 2
-    centre = (shift + corner) * step
-    half = cells[..., 2:4].exp() * halves
+    numbers = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
+    offset = numbers[..., 0:2].sigmoid()
+    growth = numbers[..., 2:4].exp()
+    scores = numbers[..., 4:].sigmoid()
+
+    anchor_sizes = tuple((width, height) for width, height in anchors)
+    cell, step, half_anchors = _cells((columns, rows), (canvas[0], canvas[1]), anchor_sizes, raw.dtype, raw.device)
+    place_in_cell = offset * scale - (scale - 1) / 2
+    centre = (place_in_cell + cell) * step
+    half = growth * half_anchors
     boxes = torch.cat([centre - half, centre + half], -1)
-    scores = cells[..., 4:].sigmoid()
+
     objectness = scores[..., 0].flatten(1)
     classes = scores[..., 1:].flatten(1, 3)
     return Candidates(boxes.reshape(batch, -1, 4), classes, objectness)
@@ -121,16 +125,19 @@ class YoloV3(Detector):
         multiple = f"a multiple of {network.stride}"
         are_multiples = all(_is_multiple(side, network.stride) for side in size)
         check(are_multiples, "input_size", f"{multiple} along both axes", size)
-        can_pad = stride is None or (isinstance(stride, int) and _is_multiple(stride, network.stride))
-        check(can_pad, "stride", f"None or {multiple}", repr(stride))
+        if stride is not None:
+            can_pad = isinstance(stride, int) and _is_multiple(stride, network.stride)
+            check(can_pad, "stride", f"None or {multiple}", repr(stride))
         for head in network.heads:
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
         super().__init__(name, classes, size, stride=stride, digest=digest)
         self.network = network
         self.runtime = runtime
-        # Before the digest is computed, so that a change in between is noticed.
-        versions = parameter_versions([*network.parameters()])
-        self._twin = None if runtime == "torch" else OnnxTwin(network_digest(network), versions)
+        self._twin: OnnxTwin | None = None
+        if runtime != "torch":
+            # Before the digest is computed, so that a change in between is noticed.
+            versions = parameter_versions([*network.parameters()])
+            self._twin = OnnxTwin(network_digest(network), versions)
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
@@ -147,7 +154,15 @@ class YoloV3(Detector):
         return self._compute(canvas, {layer: numbers[layer] for layer in choose_layers(wanted, [*numbers], self.name)})
 
     def _compute(self, canvas: Tensor, layers: Mapping[str, int]) -> tuple[Candidates, dict[str, Tensor]]:
-        """Compute all boxes of all heads, and the maps of layers by name, by the runtime that this canvas allows."""
+        """Compute all boxes of all heads, and the maps of layers, by the runtime that this canvas allows.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1].
+            layers: numbers of layers whose maps are wanted, by name.
+
+        Returns:
+            The boxes, and maps `(B, C, h, w)` by name.
+        """
         check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
         twin = self._twin
         if twin is not None:
@@ -158,6 +173,11 @@ class YoloV3(Detector):
         dtype = next(self.network.parameters()).dtype
         with record_maps(modules) as maps_by_layer:
             raw_maps = self.network(canvas.to(dtype))
+        first_maps = {layer: maps[0] for layer, maps in maps_by_layer.items()}
+        return self._decode(raw_maps, canvas), first_maps
+
+    def _decode(self, raw_maps: Sequence[Tensor], canvas: Tensor) -> Candidates:
+        """Decode the raw maps of all heads, `(B, A (5 + K), h, w)` each, to the boxes of all of them."""
         height, width = canvas.shape[-2:]
         boxes = []
         classes = []
@@ -169,8 +189,7 @@ class YoloV3(Detector):
             boxes.append(candidates.boxes)
             classes.append(candidates.classes)
             objectness.append(cast(Tensor, candidates.objectness))
-        every_box = Candidates(torch.cat(boxes, 1), torch.cat(classes, 1), torch.cat(objectness, 1))
-        return every_box, {layer: maps[0] for layer, maps in maps_by_layer.items()}
+        return Candidates(torch.cat(boxes, 1), torch.cat(classes, 1), torch.cat(objectness, 1))
 
     def head_input(self, canvas: Tensor) -> Tensor:
         """Compute the input of the last convolution before the first head, by torch with any runtime."""
