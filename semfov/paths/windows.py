@@ -119,42 +119,38 @@ class WindowWords(Words):
     def objects(self) -> str:
         """Number of the objects, by class where classes were searched for, and how many to expect in all.
 
-        Such as `36 people found; expect 36 to 54 in all`, or `No cup found`. Without a class to search for no number in
+        Such as `36 people found; expect 45 ± 9 in all`, or `No cup found`. Without a class to search for no number in
         all is given, since the small rests of all classes add up to many.
         """
         record = self.record
         expected = []
         for label in record.sought:
-            limits = self._range(label)
-            if limits is None:
-                continue
-            number = _range_in_words(*limits)
-            expected.append(f"{number} {plural(record.classes[label])}" if len(record.sought) > 1 else number)
+            number = self._expected(label)
+            if number:
+                name = f" {plural(record.classes[label])}" if len(record.sought) > 1 else ""
+                expected.append(f"{number}{name}")
         text = super().objects
         return f"{text}; expect {', '.join(expected)} in all" if expected else text
 
     def _number_in_all(self, label: int) -> str:
-        """Say from how many to how many objects of a class are expected, in brackets; empty where it is not known."""
-        limits = self._range(label)
-        return "" if limits is None else f" ({_range_in_words(*limits)} in all)"
+        """Say in brackets how many objects of a class to expect, such as ` (45 ± 9 in all)`; empty if not known."""
+        number = self._expected(label)
+        return f" ({number} in all)" if number else ""
 
-    def _range(self, label: int) -> tuple[int, int] | None:
-        """Estimate from how many to how many objects of a class are in the picture, by a standard deviation.
+    def _expected(self, label: int) -> str:
+        """Say the expected number of objects of a class and its standard deviation, such as `45 ± 9`.
 
-        It starts with those that are listed, unless fewer are expected. None where no number is estimated, and where
-        none is listed and less than one is expected.
+        Empty where no number is estimated, and where none is listed and less than one is expected.
         """
         record = self.record
         if record.unseen is None:
-            return None
+            return ""
         mean, variance = record._numbers().get(label, (math.nan, math.nan))
         listed = len(record.objects.of([label]))
         if math.isnan(mean) or (not listed and mean < 1):
-            return None
-        error = variance**0.5
-        low = max(round(mean - error), min(listed, round(mean)))
-        high = max(low, round(mean + error))
-        return low, high
+            return ""
+        error = round(variance**0.5)
+        return f"{mean:.0f} ± {error}" if error else f"{mean:.0f}"
 
     @property
     def _ending(self) -> str:
@@ -195,11 +191,6 @@ class WindowWords(Words):
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
         width, height = self.record.size
         return [f"looks at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]
-
-
-def _range_in_words(low: int, high: int) -> str:
-    """Write limits of a number, or one number where they are the same."""
-    return f"{low} to {high}" if low < high else str(low)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
