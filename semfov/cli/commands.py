@@ -262,7 +262,7 @@ usage: semfov demo [--out FILE.html]
   --out FILE           the page to write (default: semfov-demo.html), one file that loads nothing from elsewhere
   --quiet              errors alone
 
-The page shows a search for a boat, all people on a sheet of five photographs with each window that was looked at, where
+The page shows a search for a dog, all people on a sheet of five photographs with each window that was looked at, where
 people look, and a stream. They are computed when you run it, by the detector and in the photographs that come with
 semfov: nothing is downloaded. Under each stands the command for a picture of your own.
 """,

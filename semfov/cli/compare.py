@@ -54,7 +54,9 @@ def compare(options: CompareOptions) -> int:
         print("error: no picture could be looked at, so there is nothing to compare or write", file=sys.stderr)
         return 1
     points = scores.points()
-    about = f"{scores.pictures} picture{'s' if scores.pictures != 1 else ''}, {', '.join(targets or ['all classes'])}"
+    judge = "all slices are taken as the truth" if truth is None else f"the truth is {options.annotations}"
+    pictures = f"{scores.pictures} picture{'s' if scores.pictures != 1 else ''}"
+    about = f"{pictures}, {', '.join(targets or ['all classes'])}; {judge}"
     sentences = [
         *conclusion(points, is_truth=truth is not None),
         f"All slices are the whole picture and squares of {side} px that overlap by {options.overlap:g}, cut as SAHI "
@@ -133,9 +135,10 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
     if not is_truth:
         found = f"{last.right} of the {last.reference} objects that all slices list"
         return [
-            f"After {_passes(last)} semfov lists {found}, in {share:.2f} of their time, and "
-            f"{last.listed - last.right} others.",
-            "All slices stand for the truth here, though they miss and invent objects, too: give --annotations FILE.",
+            f"After {_passes(last)} semfov lists {found} and {last.listed - last.right} others, in {share:.2f} of their "
+            "time.",
+            "All slices miss and invent objects, too: AP50 says how well semfov agrees with them. To judge both by your "
+            "own boxes give --annotations FILE.",
         ]
     sentence = (
         f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "
@@ -168,7 +171,7 @@ def _write(options: CompareOptions, points: Sequence[Point], about: str, sentenc
     folder = options.out
     rows = [[point.way, point.passes, point.seconds, point.ap50, *point.counts] for point in points]
     write_text(folder / "compare.csv", csv_text([_COLUMNS, *rows]))
-    figure = plot_comparison(points)
+    figure = plot_comparison(points, "AP50" if options.annotations else "AP50, all slices taken as the truth")
     save_figure(figure, folder / "compare.png")
     table = [_HEADINGS, *map(_cells, points)]
     write_html(folder / "compare.html", comparison_page(about, sentences, table, figure))

@@ -67,16 +67,16 @@ def make_demo(options: DemoOptions) -> int:
 
 
 def _show_search(agent: ActivePerception) -> DemoPart:
-    """Search the photograph of a beach for a boat."""
+    """Search the photograph of a beach for a dog."""
     beach = example("beach")
     records: list[Record] = []
-    found = agent.search(beach, "boat", on_look=records.append)
+    found = agent.search(beach, "dog", on_look=records.append)
     captions = [
-        "boat: undecided" if record.decision is None else f"boat: {record.decision.outcome}" for record in records
+        "dog: undecided" if record.decision is None else f"dog: {record.decision.outcome}" for record in records
     ]
     frames = opening_frames(records, pillow(beach), agent.eye.detector.input_size, captions, _WIDTH)
     return DemoPart(
-        heading="Search: is there a boat, and where?",
+        heading="Search: is there a dog, and where?",
         picture=film_html(frames, _SECONDS_A_LOOK, found.describe()),
         result=f"{found.describe()}. {found.why_it_ended()}",
         command="semfov search kitchen.jpg --target cup --report cup.html",

@@ -27,7 +27,8 @@ def drafts_section(drafts: Drafts, areas: AreasLike | None = None) -> str:
         for name, prediction, these in zip(drafts.names, (drafts.first, drafts.second), boxes, strict=True)
     ]
     if drafts.difference is not None:
-        caption = f"More fixations in {drafts.names[1]} are orange, fewer are purple"
+        first, second = drafts.names
+        caption = f"Purple: more fixations in {first}; orange: more in {second}; grey: both drafts"
         panels.append(figure_html(caption, plot_difference(drafts, title=False)))
     return (
         f'<section aria-labelledby="drafts-title"><h2 id="drafts-title">{escape(_headline(drafts))}</h2>'

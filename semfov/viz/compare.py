@@ -27,11 +27,12 @@ class ComparedPoint(Protocol):
 
 
 @styled
-def plot_comparison(points: Sequence[ComparedPoint]) -> Figure:
+def plot_comparison(points: Sequence[ComparedPoint], measure: str = "AP50") -> Figure:
     """Draw the average precision of each way of looking over its seconds; numbers at the points are passes.
 
     Args:
         points: the points of all ways.
+        measure: what their average precision is called.
 
     Returns:
         The figure.
@@ -53,6 +54,6 @@ def plot_comparison(points: Sequence[ComparedPoint]) -> Figure:
                 color=colour,
                 fontsize=7,
             )
-    axes.set(xlabel="seconds a picture", ylabel="AP50", xlim=(0, None), ylim=(0, 1.05))
+    axes.set(xlabel="seconds a picture", ylabel=measure, xlim=(0, None), ylim=(0, 1.05))
     axes.legend(loc="lower right")
     return figure

@@ -5,6 +5,9 @@ from __future__ import annotations
 from textwrap import fill
 from typing import TYPE_CHECKING
 
+from torch import Tensor
+from torch.nn import functional as F
+
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.paths.areas import AreasLike, percent
@@ -52,7 +55,9 @@ def plot_drafts(drafts: Drafts, *, areas: AreasLike | None = None) -> Figure:
 
 @styled
 def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = True) -> Figure:
-    """Draw where the second draft has more and fewer fixations than the first, over the second one in grey.
+    """Draw where the second draft has more and fewer fixations than the first, over the mean of both in grey.
+
+    In the mean, what one draft alone has is half transparent, so that what lost its fixations is seen, too.
 
     Args:
         drafts: the drafts.
@@ -73,7 +78,7 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
     width, height = drafts.second.size
     inches = _WIDTH * height / width + 0.6
     figure, (axes,) = make_figure(1, 1, width=_WIDTH, height=inches, layout="compressed", axes=only(ax))
-    draw_image(axes, drafts.second.image, Grid(1, 1, drafts.second.size), grey=True)
+    draw_image(axes, _mean_picture(drafts), Grid(1, 1, drafts.second.size), grey=True)
     most = max(float(difference.abs().max()), 1e-12)  # equal drafts have none
     axes.imshow(
         difference.numpy(),
@@ -85,6 +90,14 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
         interpolation="bilinear",
     )
     if title:
-        words = f"{percent(moved)} of the fixations move: orange has more in {drafts.names[1]}, purple fewer"
+        first, second = drafts.names
+        words = f"{percent(moved)} of the fixations move: purple has more in {first}, orange in {second}; grey: both drafts"
         axes.set_title(fill(words, 64), parse_math=False)
     return figure
+
+
+def _mean_picture(drafts: Drafts) -> Tensor:
+    """Mean of both pictures, of the size of the second one's."""
+    first, second = drafts.first.image, drafts.second.image
+    size = tuple(second.shape[-2:])
+    return (F.interpolate(first[None], size, mode="bilinear", antialias=True)[0] + second) / 2

@@ -100,6 +100,9 @@ def test_without_annotations_all_slices_are_the_truth(compare, tmp_path):
     assert "give --annotations FILE" in printed.out
     page = (tmp_path / "out" / "compare.html").read_text("utf-8")
     assert f"of the {slices['reference']} objects that all slices list" in page
+    head = "2 pictures, red; all slices are taken as the truth"
+    assert printed.out.startswith(f"{head}\n")
+    assert page.index(head) < page.index("<figure>")
     assert (tmp_path / "out" / "compare.png").stat().st_size > 0
 
 

@@ -14,14 +14,16 @@ from tests.small import rand
 LEFT, RIGHT = (0, 0, 52, 78), (52, 0, 104, 78)
 
 
-def draft(name, right, size=(104, 78), cells=(39, 52)):
+def draft(name, right, size=(104, 78), cells=(39, 52), photograph=None):
     """A prediction with a share of the fixations in the right half."""
     torch.manual_seed(0)
     model = FixationDensity({"backbone8": 3}).eval().requires_grad_(False)
     log = torch.full((1, *cells), (1 - right) / (cells[0] * cells[1] / 2)).log()
     log[..., cells[1] // 2 :] += torch.tensor(right / (1 - right)).log()
     terms = {"map": log, "centre bias": torch.zeros(1, *cells)}
-    return GazePrediction(model, terms, size, (rand(3, size[1], size[0]) * 255).byte(), name)
+    if photograph is None:
+        photograph = (rand(3, size[1], size[0]) * 255).byte()
+    return GazePrediction(model, terms, size, photograph, name)
 
 
 @pytest.fixture
@@ -104,3 +106,12 @@ def test_the_figure_and_the_page_have_both_maps_and_what_differs(tmp_path):
     assert f'<th scope="row">&lt;right&gt;</th><td>40 %</td><td>75 %</td><td>{difference:+.1f}</td>' in page
     assert page.count("<figure>") == 3
     refused("html", drafts.report, tmp_path / "drafts.pdf")
+
+
+def test_what_one_draft_alone_has_is_half_transparent_in_the_difference():
+    """A white picture that turns black is grey, also where the drafts have other sizes."""
+    white, black = torch.full((3, 78, 104), 255).byte(), torch.zeros(3, 156, 208).byte()
+    drafts = Drafts(draft("a.png", 0.4, photograph=white), draft("b.png", 0.75, size=(208, 156), photograph=black))
+    ground, _ = plot_difference(drafts).axes[0].images
+    assert ground.get_array().shape == (156, 208, 3)
+    assert (ground.get_array().min(), ground.get_array().max()) == pytest.approx((0.5, 0.5), abs=1e-3)
