@@ -16,6 +16,9 @@ _LEAST_AREA = 1e-6  # least factor by which a map may change areas: below it the
 
 _BEYOND = -1e6  # pixels where there is no frame
 
+_STILL = np.eye(3)
+_ROUNDING = 1e-9 + 1e-5 * _STILL  # by so much the matrix of a camera that stands still may differ from it
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -55,7 +58,7 @@ class Motion:
     @classmethod
     def still(cls) -> Self:
         """Make the motion of a camera that stands still."""
-        return cls(np.eye(3))
+        return cls(_STILL)
 
     @classmethod
     def similarity(cls, *, shift: tuple[float, float] = (0, 0), turn: float = 0.0, scale: float = 1.0) -> Self:
@@ -97,7 +100,7 @@ class Motion:
     @property
     def is_still(self) -> bool:
         """Whether every point stays where it is, up to rounding."""
-        return bool(np.allclose(self.matrix, np.eye(3), atol=1e-9))
+        return bool((np.abs(self.matrix - _STILL) <= _ROUNDING).all())
 
     def then(self, later: "Motion") -> "Motion":
         """Compose two motions: this one first, and a later one after it.
@@ -123,9 +126,9 @@ class Motion:
         Returns:
             `(..., 2)` in pixels of the second frame.
         """
-        matrix = torch.from_numpy(self.matrix)
-        mapped = points.double() @ matrix[:, :2].T + matrix[:, 2]
-        return (mapped[..., :2] / mapped[..., 2:]).to(points)
+        places = _values(points)
+        mapped = places @ self.matrix[:, :2].T + self.matrix[:, 2]
+        return torch.from_numpy(mapped[..., :2] / mapped[..., 2:]).to(points)
 
     def is_ahead(self, points: Tensor) -> Tensor:
         """Tell which points the camera can see at all: a homography maps what is behind the camera to pixels, too.
@@ -140,8 +143,7 @@ class Motion:
         >>> quarter.is_ahead(torch.tensor([[3.0, 0.0], [-3.0, 0.0]]))
         tensor([ True, False])
         """
-        matrix = torch.from_numpy(self.matrix)
-        return _is_ahead(matrix, points.double() @ matrix[2, :2] + 1.0)
+        return torch.from_numpy(_are_ahead(self.matrix, self._weights(points)))
 
     def shows(self, boxes: Tensor) -> Tensor:
         """Tell which boxes have their centres before the camera (`is_ahead`); no motion brings the others back.
@@ -166,9 +168,11 @@ class Motion:
         Returns:
             `(...)`, positive.
         """
-        matrix = torch.from_numpy(self.matrix)
-        weight = points.double() @ matrix[2, :2] + 1.0
-        return _local_scale(matrix, weight).to(points)
+        return torch.from_numpy(_local_scales(self.matrix, self._weights(points))).to(points)
+
+    def _weights(self, points: Tensor) -> NDArray[np.float64]:
+        """Compute the weights w of points `(..., 2)`, `(...)`."""
+        return _values(points) @ self.matrix[2, :2] + 1.0
 
     def boxes(self, boxes: Tensor) -> Tensor:
         """Map boxes (`moved_boxes`).
@@ -199,19 +203,24 @@ class Motion:
         return list(self.boxes(torch.cat(list(parts))).split([len(boxes) for boxes in parts]))
 
 
-def _local_scale(matrices: Tensor, weight: Tensor) -> Tensor:
-    """Compute the root of the ratio of areas; the determinant of a map's derivative is det(M) / w³."""
-    return (torch.linalg.det(matrices).abs() / weight.abs() ** 3).sqrt()
+def _values(tensor: Tensor) -> NDArray[np.float64]:
+    """View numbers as an array: maps are so few numbers that PyTorch spends four times as long in calls."""
+    return np.asarray(tensor.detach().double().numpy())
 
 
-def _is_ahead(matrices: Tensor, weight: Tensor) -> Tensor:
-    """Tell where the weight of a map has the sign of a place before the camera.
+def _local_scales(matrices: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute roots of the ratios of areas; the determinant of a map's derivative is det(M) / w³."""
+    return np.asarray(np.sqrt(np.abs(np.linalg.det(matrices)) / np.abs(weights) ** 3))
+
+
+def _are_ahead(matrices: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell where the weights of maps have the sign of a place before the camera.
 
     A homography has no sign, but that of a camera that turns, or moves above a plane, has a positive determinant.
     Affine maps show all places.
     """
     is_affine = (matrices[..., 2, :2] == 0).all(-1)
-    return is_affine | (weight * torch.linalg.det(matrices).sign() > 0)
+    return np.asarray(is_affine | (weights * np.sign(np.linalg.det(matrices)) > 0))
 
 
 def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
@@ -235,15 +244,16 @@ def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     >>> moved_boxes(matrix, torch.tensor([0.0, 0.0, 4.0, 2.0]))
     (tensor([10.,  0., 18.,  4.]), tensor(2.))
     """
-    exact = boxes.double()
-    top_left = exact[..., :2]
-    bottom_right = exact[..., 2:]
-    centre = (top_left + bottom_right) / 2
-    mapped = (matrices[..., :2] @ centre[..., None])[..., 0] + matrices[..., 2]
-    weight = mapped[..., 2:]
-    scale = _local_scale(matrices, weight[..., 0])
-    is_ahead = _is_ahead(matrices, weight[..., 0])[..., None]
-    moved_centre = torch.where(is_ahead, mapped[..., :2] / weight, _BEYOND)
-    half_size = torch.where(is_ahead, (bottom_right - top_left) / 2 * scale[..., None], 0.0)
-    moved = torch.cat([moved_centre - half_size, moved_centre + half_size], -1)
-    return moved.to(boxes), scale.to(boxes)
+    maps = _values(matrices)
+    exact = _values(boxes)
+    low = exact[..., :2]
+    high = exact[..., 2:]
+    centres = (low + high) / 2
+    mapped = (maps[..., :2] @ centres[..., None])[..., 0] + maps[..., 2]
+    weights = mapped[..., 2]
+    scales = _local_scales(maps, weights)
+    is_ahead = _are_ahead(maps, weights)[..., None]
+    moved_centres = np.where(is_ahead, mapped[..., :2] / weights[..., None], _BEYOND)
+    half_sizes = np.where(is_ahead, (high - low) / 2 * scales[..., None], 0.0)
+    moved = np.concatenate([moved_centres - half_sizes, moved_centres + half_sizes], -1)
+    return torch.from_numpy(moved).to(boxes), torch.from_numpy(scales).to(boxes)
