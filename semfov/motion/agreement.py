@@ -1,5 +1,7 @@
 """Whether two reduced frames show the same, block by block."""
 
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,7 +50,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(
-    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], similarity: NDArray[np.float64]
+    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], similarity: NDArray[np.float64] | None = None
 ) -> Agreement:
     """Compare a frame, moved, with another one.
 
@@ -56,73 +58,87 @@ def agreement(
         cv2: OpenCV.
         first: contrast of the frame that is moved, `(h, w)` bytes.
         second: likewise of the other one.
-        similarity: `(2, 3)`, maps pixels of the first frame to those of the second.
+        similarity: `(2, 3)`, maps pixels of the first frame to those of the second; None for no motion.
 
     Returns:
         How well they agree where both show the scene.
     """
     height, width = second.shape
-    moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
     blocks = _Blocks.of(height, width)
+    moved = first
+    is_shown = blocks.pixels > 0
+    if similarity is not None:
+        moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
+        is_shown &= blocks.shown_by(cv2, similarity)
     textured, correlation = _correlations(cv2, moved, second, blocks)
-    is_compared = textured & blocks.shown_by(similarity)
+    is_compared = textured & is_shown
     compared = correlation[is_compared]
     median = float(np.median(compared)) if len(compared) else -1.0
     elsewhere = blocks.spread(is_compared & (correlation < _ALIKE))
     return Agreement(len(compared), int((compared >= _ALIKE).sum()), median, elsewhere)
 
 
-def largest_change(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
+def largest_change(cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
     """Find the largest mean difference of a block of two frames of one size, in grey values."""
-    difference = np.abs(first.astype(np.int16) - second)
-    rows = np.array_split(difference, min(_BLOCKS[1], len(difference)))
-    means = []
-    for row in rows:
-        blocks = np.array_split(row, min(_BLOCKS[0], row.shape[1]), axis=1)
-        means += [float(block.mean()) for block in blocks]
-    return max(means)
+    blocks = _Blocks.of(*first.shape)
+    (sums,) = blocks.sums(cv2.integral(cv2.absdiff(first, second)))
+    return float((sums / blocks.pixels.clip(1)).max())
 
 
-class _Blocks(NamedTuple):
-    """Blocks of a frame `(height, width)`, by the edges between them."""
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Blocks of a frame `(height, width)`, by the edges between them.
+
+    Attributes:
+        down: edges between rows of blocks, `(rows + 1,)`.
+        across: edges between columns of blocks, `(columns + 1,)`.
+        pixels: number of pixels of each, `(rows, columns)`.
+        corners: the pixels in the corners of each, homogeneous, `(3, 4 · rows · columns)`.
+    """
 
     down: NDArray[np.intp]
     across: NDArray[np.intp]
+    pixels: NDArray[np.intp]
+    corners: NDArray[np.float64]
 
-    @classmethod
-    def of(cls, height: int, width: int) -> "_Blocks":
-        """Divide a frame into blocks of nearly the same size."""
+    @staticmethod
+    @lru_cache(4)
+    def of(height: int, width: int) -> "_Blocks":
+        """Divide a frame into blocks of nearly the same size. They are kept, as all frames of a stream have them."""
         columns, rows = _BLOCKS
-        return cls(np.linspace(0, height, rows + 1).astype(np.intp), np.linspace(0, width, columns + 1).astype(np.intp))
+        down = np.linspace(0, height, rows + 1).astype(np.intp)
+        across = np.linspace(0, width, columns + 1).astype(np.intp)
+        y = np.stack([down[:-1], down[1:] - 1])[:, None, :, None]
+        x = np.stack([across[:-1], across[1:] - 1])[None, :, None, :]
+        places = np.broadcast_arrays(x, y, 1)
+        corners = np.stack([place.ravel() for place in places]).astype(np.float64)
+        return _Blocks(down, across, np.outer(np.diff(down), np.diff(across)), corners)
 
-    @property
-    def pixels(self) -> NDArray[np.intp]:
-        """Number of pixels of each, `(rows, columns)`."""
-        return np.outer(np.diff(self.down), np.diff(self.across))
+    def sums(self, *tables: NDArray[np.float64] | NDArray[np.int32]) -> NDArray[np.float64]:
+        """Sum over each by tables of sums over all rectangles from the corner, `(height + 1, width + 1)` each.
 
-    def sums(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum over each by a table of sums over all rectangles from the corner, `(height + 1, width + 1)`."""
-        corners = table[np.ix_(self.down, self.across)]
-        return np.diff(np.diff(corners, axis=0), axis=1)
+        Args:
+            *tables: n tables.
+
+        Returns:
+            `(n, rows, columns)`.
+        """
+        edges = np.array([table[self.down[:, None], self.across] for table in tables], dtype=np.float64)
+        above, below = edges[:, :-1], edges[:, 1:]
+        return np.asarray(below[..., 1:] - below[..., :-1] - above[..., 1:] + above[..., :-1])
 
     def spread(self, chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Mark the pixels of some of them `(rows, columns)` with 255."""
         rows = np.repeat(chosen, np.diff(self.down), axis=0)
         return np.repeat(rows, np.diff(self.across), axis=1).astype(np.uint8) * 255
 
-    def shown_by(self, similarity: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def shown_by(self, cv2: Any, similarity: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which of them another frame of this size shows as a whole, if a similarity `(2, 3)` moves it here."""
-        back = np.linalg.inv(np.vstack([similarity, (0.0, 0.0, 1.0)]))
-        sizes = self.across[-1], self.down[-1]
+        back = cv2.invertAffineTransform(similarity)
         # A block is convex, so its corner pixels tell. They are taken from the nearest pixel of the other frame.
-        inside = []
-        for y in (self.down[:-1], self.down[1:] - 1):
-            for x in (self.across[:-1], self.across[1:] - 1):
-                columns, rows = np.meshgrid(x, y)
-                places = np.stack([columns, rows, np.ones_like(rows)])
-                origin = np.rint(np.einsum("ij,jkl->ikl", back[:2], places))
-                inside.append(((origin >= 0) & (origin < np.reshape(sizes, (2, 1, 1)))).all(0))
-        return np.logical_and.reduce(inside) & (self.pixels > 0)
+        x, y = np.rint(back @ self.corners)
+        is_inside = (x >= 0) & (x < self.across[-1]) & (y >= 0) & (y < self.down[-1])
+        return np.asarray(is_inside.reshape(4, *self.pixels.shape).all(0))
 
 
 def _correlations(
@@ -141,13 +157,12 @@ def _correlations(
         `(rows, columns)`.
     """
     products = cv2.multiply(first, second, dtype=cv2.CV_32F)
-    (a, aa), (b, bb) = (map(blocks.sums, cv2.integral2(frame)) for frame in (first, second))
-    ab = blocks.sums(cv2.integral(products))
+    a, aa, b, bb, ab = blocks.sums(*cv2.integral2(first), *cv2.integral2(second), cv2.integral(products))
     # n² times variances and covariance: whole numbers below 2⁵³, so that a block of one grey value has exactly 0.
     count = blocks.pixels.astype(np.float64)
-    variance_a = count * aa - a.astype(np.float64) ** 2
-    variance_b = count * bb - b.astype(np.float64) ** 2
-    covariance = count * ab - a.astype(np.float64) * b
+    variance_a = count * aa - a**2
+    variance_b = count * bb - b**2
+    covariance = count * ab - a * b
     spread = np.sqrt(variance_a) * np.sqrt(variance_b)
     correlation = np.divide(covariance, spread, out=np.zeros_like(spread), where=spread > 0)
     has_texture = np.sqrt(np.maximum(variance_a, variance_b)) >= _TEXTURE * count

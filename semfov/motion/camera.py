@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from semfov.errors import needing
 from semfov.motion.agreement import agreement, largest_change
 from semfov.motion.coarse import coarse_shift
-from semfov.motion.flow import LEAST_CORNERS, flow_between, rival_between
+from semfov.motion.flow import LEAST_CORNERS, corners_stay, flow_between, rival_between
 from semfov.motion.frames import GreyFrame
 from semfov.motion.motion import Motion
 
@@ -172,6 +172,7 @@ class CameraMotion:
         self._anchor: GreyFrame | None = None  # the first key frame of what has been in view since then
         self._anchor_to_last = _STILL
         self._last: GreyFrame | None = None
+        self._stands_still = False  # whether the camera stood still between the last two frames
         self._course: NDArray[np.float64] | None = None  # the last motion between two frames, in reduced pixels
         self._lost: _LostFrame | None = None  # what was seen before a disturbance, while it may still be found
 
@@ -215,6 +216,9 @@ class CameraMotion:
     def _since_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> Motion | None:
         """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
         unmoved = key if np.array_equal(self._key_to_last, _STILL) else None
+        if self._stands_still and unmoved is not None and self._stays(unmoved, last, present):
+            return Motion.still()
+        self._stands_still = False
         key, fit = self._fit_to_key_or_last(key, last, present)
         # Stripes have no corners, or any motion along them fits. The key frame tells, so that a slow drift is seen.
         is_doubted = fit is None or fit.is_repeated
@@ -230,7 +234,9 @@ class CameraMotion:
         is_certain = self._is_certain(_Fit(last_to_present, rival, fit.median), self._course)
         is_still = shift < _STILL_SHIFT
         # Edges of the blocks of a broken film stay, too, but the blocks change.
-        if not is_certain or (fit.is_repeated and not (is_still and largest_change(last.grey, present.grey) < _SAME)):
+        if not is_certain or (
+            fit.is_repeated and not (is_still and largest_change(self._cv2, last.grey, present.grey) < _SAME)
+        ):
             self._begin_at(present)
             if self._course is None:
                 self._course = last_to_present
@@ -238,6 +244,7 @@ class CameraMotion:
         self._course = last_to_present
         if is_still:
             self._key = key
+            self._stands_still = True
             return Motion.still()
         # As with the motion of the key frame, that of a camera that stands is left out: its noise would add up.
         self._anchor_to_last = last_to_present @ self._anchor_to_last
@@ -253,13 +260,25 @@ class CameraMotion:
 
         A frame that fits the last one, but no longer the anchor, shows another scene that has come little by little.
         """
-        fit = self._between(key, present, self._key_to_last)
+        expected = self._key_to_last if self._course is None else self._course @ self._key_to_last
+        fit = self._between(key, present, expected)
         if fit is not None or last is key:
             return key, fit
         self._key_to_last = _STILL
         fit = self._between(last, present, _STILL)
         is_replaced = fit is not None and self._is_replaced(present, fit)
         return last, None if is_replaced else fit
+
+    def _stays(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> bool:
+        """Tell whether a camera that stood still stands still, in a third of the time that another motion takes."""
+        if key.grey.shape != present.grey.shape:
+            return False
+        found = agreement(self._cv2, key.contrast, present.contrast)
+        if not found.is_enough or found.is_partial or found.median < _CLEAR:
+            return False
+        if key.repeats and largest_change(self._cv2, last.grey, present.grey) >= _SAME:
+            return False
+        return corners_stay(self._cv2, key, present, _STILL_SHIFT / max(present.ratio))
 
     def _is_certain(self, fit: _Fit, course: NDArray[np.float64] | None) -> bool:
         """Tell whether no other motion is as good: there is no rival, or the motion is that of the frames before."""
@@ -272,7 +291,7 @@ class CameraMotion:
 
     def _is_same(self, last: GreyFrame, present: GreyFrame) -> bool:
         """Tell whether nothing has changed between two frames, of which too few corners can be followed."""
-        if last.grey.shape != present.grey.shape or largest_change(last.grey, present.grey) >= _SAME:
+        if last.grey.shape != present.grey.shape or largest_change(self._cv2, last.grey, present.grey) >= _SAME:
             return False
         # Noise hides a slow motion where there is no texture: a sky, or the dark.
         if int(self._cv2.absdiff(last.grey, present.grey).max()) <= _EQUAL:
@@ -281,9 +300,9 @@ class CameraMotion:
 
     def _is_unchanged(self, first: GreyFrame, present: GreyFrame, least: float = 0.0) -> bool:
         """Tell whether all texture of two frames is where it was, by a least correlation, and nothing else is new."""
-        if first.grey.shape != present.grey.shape or largest_change(first.grey, present.grey) >= _SAME:
+        if first.grey.shape != present.grey.shape or largest_change(self._cv2, first.grey, present.grey) >= _SAME:
             return False
-        found = agreement(self._cv2, first.contrast, present.contrast, _STILL[:2])
+        found = agreement(self._cv2, first.contrast, present.contrast)
         return found.is_whole and found.median >= least
 
     def _is_replaced(self, present: GreyFrame, fit: _Fit) -> bool:

@@ -10,10 +10,13 @@ from semfov.motion.frames import GreyFrame
 _STILL = np.eye(3)
 _WINDOW = (15, 15)  # window of the flow around a corner, in reduced pixels
 _PYRAMID = 3  # further levels of the flow's pyramid: it follows shifts of about 15 · 2³ reduced pixels
+_NEAR = 1  # the same where the motion is likely to be nearly the expected one, in half of the time
+_SURE = 0.8  # share of the followed corners that agree from which on the near levels are enough
 _RESIDUAL = 1.5  # reduced pixels within which a corner agrees with a motion
 
 LEAST_CORNERS = 12
 """Fewer corners that agree are no evidence."""
+_NEARLY_ALL = 0.95  # least share of the corners that stay before a camera that stands still
 _LEAST_SHARE = 0.4  # least share of the followed corners that agree
 _RIVALS = 6  # least number of corners of a rival
 _RIVAL_SHIFT = 1.5  # reduced pixels by which a rival moves its corners otherwise
@@ -30,7 +33,7 @@ def flow_between(
         cv2: OpenCV.
         first: the frame whose corners are followed.
         second: the other one.
-        guess: `(3, 3)`, the motion from which the search for the corners begins.
+        guess: `(3, 3)`, the motion from which the search for the corners begins; near it fewer levels are enough.
 
     Returns:
         `(3, 3)`, maps pixels of the first frame to those of the second; None where too few corners agree with it, or it
@@ -38,12 +41,34 @@ def flow_between(
     """
     if first.grey.shape != second.grey.shape or len(first.corners) < LEAST_CORNERS:
         return None
-    before, after = _followed(cv2, first.corners, first, second, guess)
-    if len(before) < LEAST_CORNERS:
-        return None
-    similarity, agree = _fit(cv2, before, after)
-    has_support = agree.sum() >= max(LEAST_CORNERS, _LEAST_SHARE * len(before))
-    return similarity if has_support and _is_plausible(similarity) else None
+    for levels, least_share in ((_NEAR, _SURE), (_PYRAMID, _LEAST_SHARE)):
+        before, after = _followed(cv2, first.corners, first, second, guess, levels)
+        if len(before) < LEAST_CORNERS:
+            continue
+        similarity, agree = _fit(cv2, before, after)
+        has_support = agree.sum() >= max(LEAST_CORNERS, least_share * len(before))
+        if has_support and _is_plausible(similarity):
+            return similarity
+    return None
+
+
+def corners_stay(cv2: Any, first: GreyFrame, second: GreyFrame, most: float) -> bool:
+    """Tell whether nearly all corners of a frame are still there in another one, in a quarter of the flow's time.
+
+    Args:
+        cv2: OpenCV.
+        first: the frame whose corners are followed.
+        second: the other one.
+        most: largest shift of a corner that stays, in reduced pixels.
+
+    Returns:
+        False also where there are too few corners.
+    """
+    if first.grey.shape != second.grey.shape or len(first.corners) < LEAST_CORNERS:
+        return False
+    before, after = _followed(cv2, first.corners, first, second, _STILL, levels=0)
+    stays = np.linalg.norm(after - before, axis=-1) < most
+    return int(stays.sum()) >= _NEARLY_ALL * len(first.corners)
 
 
 def rival_between(
@@ -64,7 +89,7 @@ def rival_between(
     corners = second.corners_in(part)
     if len(corners) < _RIVALS:
         return None
-    after, before = _followed(cv2, corners, second, first, _STILL)
+    after, before = _followed(cv2, corners, second, first, _STILL, _PYRAMID)
     if len(after) < _RIVALS:
         return None
     rival, agree = _fit(cv2, before, after)
@@ -75,7 +100,12 @@ def rival_between(
 
 
 def _followed(
-    cv2: Any, corners: NDArray[np.float32], first: GreyFrame, second: GreyFrame, guess: NDArray[np.float64]
+    cv2: Any,
+    corners: NDArray[np.float32],
+    first: GreyFrame,
+    second: GreyFrame,
+    guess: NDArray[np.float64],
+    levels: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Follow corners `(n, 1, 2)` of a frame into another one; returns those that were found, there and here."""
     expected = cv2.transform(corners, guess[:2]).astype(np.float32)
@@ -85,7 +115,7 @@ def _followed(
         corners,
         expected,
         winSize=_WINDOW,
-        maxLevel=_PYRAMID,
+        maxLevel=levels,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     found = status[:, 0] == 1
