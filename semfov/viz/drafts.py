@@ -91,7 +91,8 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
     )
     if title:
         first, second = drafts.names
-        words = f"{percent(moved)} of the fixations move: purple has more in {first}, orange in {second}; grey: both drafts"
+        more = f"purple has more in {first}, orange in {second}"
+        words = f"{percent(moved)} of the fixations move: {more}; grey: both drafts"
         axes.set_title(fill(words, 64), parse_math=False)
     return figure
 
