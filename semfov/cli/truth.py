@@ -3,8 +3,11 @@
 import warnings
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
+from unicodedata import normalize
+from urllib.parse import unquote
 
 import torch
 
@@ -22,7 +25,7 @@ class Truth:
         self.annotations = read_annotations(path)
         self._images: dict[str, list[Id]] = defaultdict(list)
         for image, entry in self.annotations.images.items():
-            self._images[_parts(entry["file_name"])[-1]].append(image)
+            self._images[_plain(_parts(entry["file_name"])[-1])].append(image)
         self._warn_of_boxes()
 
     @property
@@ -46,7 +49,9 @@ class Truth:
             warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
 
     def image_id(self, name: str, size: tuple[int, int] | None = None) -> Id:
-        """Find the id of a picture; of several of one name that whose folders agree best.
+        """Find the id of a picture; of several of one name that whose folders agree best, letter by letter if need be.
+
+        Names agree in any letter case, and as other systems and addresses write them: `K%C3%BCche.JPG` for `Küche.jpg`.
 
         Args:
             name: path of the picture.
@@ -60,13 +65,14 @@ class Truth:
         """
         parts = _parts(name)
 
-        def agreement(image: Id) -> int:
-            """Count the last parts of both paths that are equal."""
-            image_parts = _parts(self.annotations.images[image]["file_name"])
-            equal = [mine == theirs for mine, theirs in zip(reversed(parts), reversed(image_parts), strict=False)]
-            return equal.index(False) if False in equal else len(equal)
+        def agreement(image: Id) -> tuple[int, int]:
+            """Count the last parts of both paths that agree, and those that are equal."""
+            pairs = [*zip(reversed(parts), reversed(_parts(self.annotations.images[image]["file_name"])), strict=False)]
+            agreeing = takewhile(lambda pair: _plain(pair[0]) == _plain(pair[1]), pairs)
+            equal = takewhile(lambda pair: pair[0] == pair[1], pairs)
+            return len([*agreeing]), len([*equal])
 
-        found = sorted(self._images.get(parts[-1], ()), key=agreement)
+        found = sorted(self._images.get(_plain(parts[-1]), ()), key=agreement)
         if not found or (len(found) > 1 and agreement(found[-1]) == agreement(found[-2])):
             raise DataError(
                 f"annotations {self.path}: expected one image with the file_name of {name}, got {len(found)}"
@@ -106,6 +112,11 @@ class Truth:
         if precision is None:
             return f"no AP: {self.path} has no boxes of these classes in these pictures {counts}"
         return f"AP {precision[0]:.3f}, AP50 {precision[1]:.3f} against {self.path} {counts}"
+
+
+def _plain(part: str) -> str:
+    """Write a part of a path without what differs between systems: letter case, composed letters, percent signs."""
+    return normalize("NFC", unquote(part)).casefold()
 
 
 def _parts(name: str) -> tuple[str, ...]:

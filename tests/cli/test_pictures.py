@@ -263,6 +263,16 @@ def test_pictures_are_found_in_annotations_by_the_ends_of_their_paths(make_truth
         unusable("expected one image with the file_name of", truth.image_id, name)
 
 
+def test_pictures_are_found_as_other_systems_and_addresses_write_their_names(make_truth):
+    composed, apart = "K\u00fcche.jpg", "Ku\u0308che.jpg"  # as Linux and Windows, and as macOS names the file
+    truth = make_truth(f"a/{composed}", "my%20photo.JPG", "b/x.jpg", "B/X.jpg", "100%.png")
+    assert [truth.image_id(name) for name in (composed, apart)] == [1, 1]
+    assert truth.image_id("/photos/my photo.jpg") == 2
+    assert [truth.image_id(name) for name in ("b/x.jpg", "B/X.jpg", "c/x.jpg")] == [3, 4, 3]
+    assert truth.image_id("100%.png") == 5
+    unusable("expected one image with the file_name of", truth.image_id, "z.jpg")
+
+
 def test_boxes_of_annotations_that_look_like_fractions_are_told(make_truth, tmp_path):
     make_truth("x.jpg")
     path = tmp_path / "truth.json"
