@@ -188,9 +188,11 @@ class CandidatePlaces(ABC, Generic[LookType]):
             self._examined = []
             self._places = []
             return
-        self._examined = [place for place in self._examined if bool(motion.shows(place.boxes).all())]
-        moved = motion.boxes_in_parts([place.boxes for place in self._examined])
-        self._examined = [place._replace(boxes=boxes) for place, boxes in zip(self._examined, moved, strict=True)]
+        if not self._examined:
+            return
+        boxes = torch.stack([place.boxes for place in self._examined])
+        places = zip(self._examined, motion.shows(boxes).all(-1).tolist(), motion.boxes(boxes), strict=True)
+        self._examined = [place._replace(boxes=moved) for place, is_shown, moved in places if is_shown]
 
     def cell(self, box: Tensor) -> int | None:
         """Find the cell that a box `(4,)` covers most; None where places are no cells."""

@@ -115,10 +115,13 @@ class Verifier(Generic[LookType]):
             # The closer look that is due is made in the next frame, wherever the camera has turned.
             box = self.candidate.box
             self.candidate = self.candidate._replace(box=motion.boxes(box)) if bool(motion.shows(box)) else None
-        self.verdicts = [verdict for verdict in self.verdicts if bool(motion.shows(verdict.look.box))]
-        for number, verdict in enumerate(self.verdicts):
-            moved = replace(verdict.look, box=motion.boxes(verdict.look.box))
-            self.verdicts[number] = verdict._replace(look=moved)
+        if not self.verdicts:
+            return
+        boxes = torch.stack([verdict.look.box for verdict in self.verdicts])
+        verdicts = zip(self.verdicts, motion.shows(boxes).tolist(), motion.boxes(boxes), strict=True)
+        self.verdicts = [
+            verdict._replace(look=replace(verdict.look, box=box)) for verdict, is_shown, box in verdicts if is_shown
+        ]
 
     def see(self, look: LookType, *, last: bool = False) -> None:
         """Take in a look of the search, and choose the place that is to be looked at closely."""

@@ -1,7 +1,6 @@
 """Maps between two frames of a stream: where points and boxes of one frame lie in the other."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -184,23 +183,6 @@ class Motion:
             `(..., 4)` in pixels of the second frame.
         """
         return moved_boxes(torch.from_numpy(self.matrix), boxes)[0]
-
-    def boxes_in_parts(self, parts: Sequence[Tensor]) -> list[Tensor]:
-        """Map boxes that are kept in parts all at once, which takes the time of one.
-
-        Args:
-            parts: boxes, `(N, 4)` each, in pixels of the first frame.
-
-        Returns:
-            The boxes of each part in pixels of the second frame.
-
-        >>> parts = [torch.zeros(0, 4), torch.tensor([[0.0, 0.0, 4.0, 2.0]])]
-        >>> Motion.similarity(shift=(10, 0)).boxes_in_parts(parts)[1]
-        tensor([[10.,  0., 14.,  2.]])
-        """
-        if not parts:
-            return []
-        return list(self.boxes(torch.cat(list(parts))).split([len(boxes) for boxes in parts]))
 
 
 def _values(tensor: Tensor) -> NDArray[np.float64]:

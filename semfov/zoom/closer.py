@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -111,6 +112,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
 
     def see(self, look: SearchLook) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
+        self._change()
         self._look = look
         self._next = look.number
         self.detections = look.detections
@@ -127,12 +129,16 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Take the most evident box, if it is as likely as what is found, or at the end probable enough."""
-        place = self._most_evident()
+        place = self._most_evident
         least = thresholds.place if last else self.likely
         return None if place is None or place.probability < least else place
 
+    @cached_property
     def _most_evident(self) -> CandidatePlace | None:
-        """Find the box with the highest faded score that is of no examined place; None if there is none."""
+        """The box with the highest faded score that is of no examined place; None if there is none.
+
+        It is asked for several times after each look, and computed anew after what may change it.
+        """
         boxes, scores = self._boxes()
         if self._examined:
             scores = scores.masked_fill(self._are_examined(boxes), 0)
@@ -142,22 +148,38 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         score = float(scores[number])
         return CandidatePlace(boxes[number], score, self._chance(score))
 
+    def _change(self) -> None:
+        """Drop what was computed of the looks and the examined places, as these change."""
+        self.__dict__.pop("_most_evident", None)
+
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the path."""
         self._number = self._next
         self._next += 1
         return super().look_at(candidate, close_up)
 
+    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
+        """Do not list a candidate again, nor others at its place."""
+        self._change()
+        super().dismiss(candidate, box)
+
+    def wait(self, passed: float = FRAME) -> None:
+        """Let seconds pass."""
+        self._change()
+        super().wait(passed)
+
     def follow(self, motion: Motion | None) -> None:
         """Carry the boxes of the target along, too."""
+        self._change()
         super().follow(motion)
-        if motion is not None and self._looks:
-            parts = [boxes for _, (boxes, _) in self._looks]
-            shown = motion.shows(torch.cat(parts)).split([len(boxes) for boxes in parts])
-            ahead = [boxes[is_shown] for (_, (boxes, _)), is_shown in zip(self._looks, shown, strict=True)]
-            moved = motion.boxes_in_parts(ahead)
-            looks = zip(self._looks, shown, moved, strict=True)
-            self._looks = [(time, (boxes, scores[is_shown])) for (time, (_, scores)), is_shown, boxes in looks]
+        if motion is None or not self._looks:
+            return
+        counts = [len(boxes) for _, (boxes, _) in self._looks]
+        together = torch.cat([boxes for _, (boxes, _) in self._looks])
+        moved = motion.boxes(together).split(counts)
+        shown = motion.shows(together).split(counts)
+        looks = zip(self._looks, moved, shown, strict=True)
+        self._looks = [(time, (boxes[ahead], scores[ahead])) for (time, (_, scores)), boxes, ahead in looks]
 
     def probability(self, look: CloseUp) -> float:
         """Compute the present probability that the target is at the place of a closer look.
@@ -218,12 +240,12 @@ class PhotographPlaces(CandidateBoxes):
     @property
     def hit_chance(self) -> float:
         """Chance of a hit at the most evident place; below 0 if there is none."""
-        place = self._most_evident()
+        place = self._most_evident
         return -1.0 if place is None else self._hit_chance_at(place)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Take the most evident place, if the chance of a hit there is worth a pass."""
-        place = self._most_evident()
+        place = self._most_evident
         return None if place is None or self._hit_chance_at(place) < thresholds.stop_below else place
 
     def is_shown(self, candidate: CandidatePlace) -> bool:
