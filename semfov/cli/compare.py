@@ -134,11 +134,11 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
     share = last.seconds / slices.seconds
     if not is_truth:
         found = f"{last.right} of the {last.reference} objects that all slices list"
+        others = f"{last.listed - last.right} others"
         return [
-            f"After {_passes(last)} semfov lists {found} and {last.listed - last.right} others, in {share:.2f} of "
-            "their time.",
+            f"After {_passes(last)} semfov lists {found} and {others}, in {share:.2f} of their time.",
             "All slices miss and invent objects, too: AP50 says how well semfov agrees with them. To judge both by "
-            "your own boxes give --annotations FILE.",
+            "your own boxes, give --annotations FILE.",
         ]
     sentence = (
         f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "

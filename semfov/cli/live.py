@@ -106,9 +106,8 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
                 speed.count_frame()
                 if tracks is not None:
                     lines.append(_mot_lines(moment))
-                if speed.frames == 1 and live.criterion is not None:
-                    print(f"  found: when {live.criterion} (--confirm)")
-                    print("  absent: when p is below one half, and no closer look is worth a frame (--stop-below)")
+                if speed.frames == 1:
+                    print("\n".join(_legend(live, moment)))
                 rate = speed.recent()
                 print(f"  {_moment_line(moment)}  {rate}", flush=True)
                 if add_frame is not None:
@@ -173,6 +172,17 @@ class _Speed:
 def _rate(frames: int, seconds: float) -> str:
     """Write a number of frames in some seconds as a rate; nothing where there is none."""
     return f"{frames / seconds:.1f} frames/s" if frames > 0 and seconds > 0 else ""
+
+
+def _legend(live: LivePerception, moment: Moment) -> list[str]:
+    """Say what the line of a frame has in it, and when a search is decided."""
+    place = "(x, y) × magnification" if moment.belief_map(len(moment) - 1) is None else "cell (column, row)"
+    known = "what is known so far" if moment.decision is None else "what is decided so far (p: probability)"
+    lines = [f"  a line: frame, at {place} of the look: what it shows, with scores; then {known}"]
+    if live.criterion is not None:
+        lines.append(f"  found: when {live.criterion} (--confirm)")
+        lines.append("  absent: when p is below one half, and no closer look is worth a frame (--stop-below)")
+    return lines
 
 
 def _moment_line(moment: Moment) -> str:

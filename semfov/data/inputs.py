@@ -37,6 +37,7 @@ _DTYPES = {
 STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")  # kinds of addresses of cameras and streams
 FRAME = 1 / 25  # seconds between two frames where nothing tells them
 
+_SMALLEST_SIDE = 16  # of pictures whose channels are last; smaller ones may be maps of features
 _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 
 
@@ -159,6 +160,12 @@ def as_pixels(
 def as_batch(images: ImageLike) -> Tensor:
     """Convert images to `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and range."""
     if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
+        # A graph with dynamic sizes would be bound to them.
+        if values_known(images):
+            _, rows, columns, last = images.shape
+            are_last = last in (3, 4) and min(rows, columns) >= _SMALLEST_SIDE
+            got = f"{tuple(images.shape)}, with channels last; take images.permute(0, 3, 1, 2)"
+            check(not are_last, "image", "(batch, channels, height, width)", got)
         return images
     return as_images(images)
 

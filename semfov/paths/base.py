@@ -75,7 +75,7 @@ class Record(Conversion):
 
     _format: ClassVar[Format]
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         """Return the summary, the looks, and the most confident objects."""
         rows = self.object_rows()
         names = []
@@ -85,7 +85,11 @@ class Record(Conversion):
         if len(rows) > _NAMED:
             names.append(f"and {len(rows) - _NAMED} more")
         objects = f"objects from {self.words.threshold}: {', '.join(names) or 'none'}"
-        return "\n  ".join([f"{type(self).__name__}: {self.summary()}", *self.words.lines, objects])
+        return "\n  ".join([self.summary(), *self.words.lines, objects])
+
+    def __repr__(self) -> str:
+        """Return the same, after the name of the class."""
+        return f"{type(self).__name__}: {self}"
 
     def outline(self, look: RecordedLook) -> Tensor | None:
         """Return the border of what a look shows.

@@ -536,7 +536,7 @@ class GazePrediction(OtherWords):
             limit = f", after {self.seen} fixation{'s' if self.seen != 1 else ''} seen by the fovea"
         return f"people look first at {first}{limit}"
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         """Return the description, and the places where most fixations are expected."""
         lines = [
             f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {percent(peak['share'])} of all fixations"
@@ -544,7 +544,10 @@ class GazePrediction(OtherWords):
         ]
         if self.caution is not None:
             lines.append(f"  caution: {self.caution}")
-        return "\n".join([f"{type(self).__name__}: {self.describe()}", *lines])
+        return "\n".join([self.describe(), *lines])
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}: {self}"
 
     def _over_pixels(self, log: Tensor) -> Tensor:
         """Interpolate a log density over the cells, up to a constant, to the probability in each pixel, `(H, W)`."""

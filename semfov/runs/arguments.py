@@ -170,7 +170,8 @@ def mistake(message: str, config: type[CheckedSettings], options: Iterable[str],
     if setting is None or got is None or expected is None:
         return " ".join(message.split())
     value = got[1].strip()
-    matches = get_close_matches(value, _words_of(hint), n=1, cutoff=0.5)
+    # All words are listed anyway, and far ones only look like what was meant: `best` for `fast`.
+    matches = get_close_matches(value, _words_of(hint), n=1, cutoff=0.7)
     suggestion = f"; did you mean {matches[0]!r}?" if matches else ""
     return f"{setting[1].rstrip('_')}: expected {expected}, got {value!r}{suggestion}"
 

@@ -65,6 +65,10 @@ def make_parser(
         def _expand_help(self, action: argparse.Action) -> str:
             return _with_readable_types(super()._expand_help(action))
 
+        def format_help(self) -> str:
+            # In Python a name that is a word of the language has an underscore after it: `with_`.
+            return re.sub(r"(--\w+|\b[A-Z]+)_(?!\w)", r"\1", super().format_help())
+
     class Parser(ArgumentParser):
         """A parser that reports wrong arguments in one line, and whose files have the names of options."""
 

@@ -6,7 +6,8 @@ the same views are made in blocks that stay in the processor's cache (`_foveate_
 of a large image without its finest band (`_foveate_large`).
 """
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from numbers import Real
 from typing import Any, TypeGuard, get_args
 
@@ -25,6 +26,7 @@ from semfov.threads import one_thread_if_small
 
 # Elements of the views of a block on a CPU; those of many views leave the processor's cache.
 _BLOCK = 1 << 21
+_SMALLEST_PICTURE = 64  # pixels of the shorter side; in smaller ones the first pixel may be meant
 _LARGE = 360  # pixels of the shorter side from which on the finest band is not computed for one fixation
 
 
@@ -88,12 +90,22 @@ def foveate(
         return foveate(bands, row, sigma=sigma, growth=growth)[0]
     images = image if isinstance(image, Bands) else as_batch(image)
     like = images.base if isinstance(images, Bands) else images
+    _warn_of_shares(points, images.shape if isinstance(images, Bands) else images.shape[-2:])
     fovea = Fovea.at(points, sigma, growth, like)
     if _blocks_pay(images, fovea, levels):
         views = _foveate_in_blocks(images, fovea, levels, convention)
     else:
         views = _reconstruct(_bands(images, levels, convention), fovea).to(like.dtype)
     return views if points.ndim == 3 else views[:, 0]
+
+
+def _warn_of_shares(points: Tensor, size: Sequence[int]) -> None:
+    """Warn of fixations on a processor that look like shares of a picture `(height, width)`, not like its pixels."""
+    if not points.is_floating_point() or points.device.type != "cpu" or not values_known(points):
+        return
+    if points.numel() and min(size) >= _SMALLEST_PICTURE and bool(((points > 0) & (points < 1)).all()):
+        told = f"all fixations lie in the first pixel, such as {points.reshape(-1, 2)[0].tolist()}"
+        warnings.warn(f"gaze: {told}; of shares of the picture take gaze * (width, height)", stacklevel=4)
 
 
 def _reconstruct(bands: Bands, fovea: Fovea, into: Tensor | None = None) -> Tensor:

@@ -91,8 +91,8 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
     )
     if title:
         first, second = drafts.names
-        more = f"purple has more in {first}, orange in {second}"
-        words = f"{percent(moved)} of the fixations move: {more}; grey: both drafts"
+        colours = f"purple has more in {first}, orange in {second}; grey: both drafts"
+        words = f"{percent(moved)} of the fixations move: {colours}"
         axes.set_title(fill(words, 64), parse_math=False)
     return figure
 

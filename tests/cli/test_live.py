@@ -90,9 +90,10 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert code == 0
     lines = printed.out.splitlines()
     assert lines[0] == "red.avi: searching for “red”"
-    assert re.match(r"     0  at cell \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at cell \(", lines[1])
-    assert re.search(r"\d frames/s$", lines[4])
-    assert re.match(r"4 frames, [\d.]+ frames/s after the first 3", lines[5])
+    assert lines[1].startswith("  a line: frame, at cell (column, row) of the look: what it shows, with scores; then ")
+    assert re.match(r"     0  at cell \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at cell \(", lines[2])
+    assert re.search(r"\d frames/s$", lines[5])
+    assert re.match(r"4 frames, [\d.]+ frames/s after the first 3", lines[6])
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
     run("live", path, "--frames", 2, "--out", tmp_path / "seen.avi")
     assert len(read(tmp_path / "seen.avi")) == 2
@@ -126,7 +127,8 @@ def test_large_frames_are_looked_at_by_windows(run, tmp_path, agent):
     _, printed = run("live", path, "--find", "red,green", "--out", tmp_path / "out")
     lines = printed.out.splitlines()
     assert lines[0] == "large.avi: finding all “red”, “green”"
-    assert re.match(r"     0  at \(\d+, \d+\) × 0\.\d\d: .* (\d|No) reds?, no green found", lines[1])
+    assert lines[1].startswith("  a line: frame, at (x, y) × magnification of the look: ")
+    assert re.match(r"     0  at \(\d+, \d+\) × 0\.\d\d: .* (\d|No) reds?, no green found", lines[2])
     assert [film.shape for film in read(tmp_path / "out" / f"live{video_suffix()}")] == [(768, 1024, 3)] * 4
     _, printed = run("live", path, "--target", "red", "--frames", 1)
     assert re.search(r"0  at .* red: (found|undecided), p 0\.\d\d", printed.out)
@@ -162,7 +164,7 @@ def test_closer_looks_at_a_video_are_printed_unless_they_are_switched_off(run, a
         r"^ +(\d)  closely at cell \((\d), (\d)\): p 0\.98 there +red: found, p .* \(there 0\.98\)", printed.out, re.M
     )
     assert len(shown) == 1
-    assert printed.out.splitlines()[1] == "  found: when a closer look gives p 0.7 there (--confirm)"
+    assert printed.out.splitlines()[2] == "  found: when a closer look gives p 0.7 there (--confirm)"
     number, column, row = map(int, shown[0])
     # Red covers rows 40 to 60 of 120, and starts at column 10 of 160 per frame.
     assert 20 * column < 10 * number + 20

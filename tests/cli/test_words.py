@@ -77,6 +77,8 @@ WRONG_USE = {
     "find . --imgsz 640": "unknown option --imgsz; did you mean --input-size?",
     "detect a.jpg": "unknown command 'detect'; did you mean 'find'?",
     "saliency a.jpg": "unknown command 'saliency'; did you mean 'gaze'?",
+    "gaze a.jpg --quality fast": "quality: expected 'quick' or 'best', got 'fast'",
+    "gaze a.jpg --quality bst": "got 'bst'; did you mean 'best'?",
     "compare . --with slicing": "with: expected some of 'sahi', 'ranked', got 'slicing'",
     "compare . --wth sahi": "unknown option --wth; did you mean --with?",
     "compare . --with": "--with: expected a value, got none",
@@ -161,6 +163,7 @@ def test_help_is_one_screen_with_options_that_exist(name, capsys):
     usage = short.partition("\nusage:")[2].partition("\n\nWeights")[0]
     named = set(re.findall(r"--[a-z][\w.-]*", usage)) - {"--help-all"}
     assert [option for option in named if f"--{option[2:].replace('-', '_')}" not in whole] == []
+    assert re.findall(r"\w+_(?!\w)", whole) == []  # such as with_, which only Python needs
 
 
 def test_options_may_have_dashes_or_underscores(tmp_path, capsys):

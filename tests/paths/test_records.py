@@ -183,6 +183,7 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
     first = repr(record).splitlines()[0]
     assert first.startswith(f"{type(record).__name__}: ")
     assert first == f"{type(record).__name__}: {record.summary()}"
+    assert str(record).splitlines()[0] == record.summary()  # what `print` shows
     rows = record.rows()
     json.dumps(rows, allow_nan=False)
     assert record.to_frame().to_dict("records")[0].keys() == rows[0].keys()

@@ -269,3 +269,23 @@ def test_a_plain_tensor_is_a_number():
     assert float(Foveation(torch.tensor(6.0)).sigma.detach()) == pytest.approx(6.0)
     refused(r"sigma: expected a number, got shape \(2,\)", Foveation, torch.tensor([6.0, 7.0]))
     refused("learnable: expected False", Foveation, torch.nn.Parameter(torch.tensor(6.0)), learnable=True)
+
+
+def test_channels_last_are_refused_and_maps_of_features_are_not():
+    sensor = Foveation(20.0)
+    photographs = torch.rand(2, 24, 32, 3)
+    message = r"image: expected .*, got \(2, 24, 32, 3\), .* take images\.permute\(0, 3, 1, 2\)"
+    refused(message, sensor, photographs, (5, 5))
+    assert sensor(photographs.permute(0, 3, 1, 2), (5, 5)).shape == (2, 3, 24, 32)
+    assert sensor(torch.rand(2, 24, 5, 3), (1, 1)).shape == (2, 24, 5, 3)
+
+
+def test_fixations_that_look_like_shares_are_warned_of():
+    sensor = Foveation(20.0)
+    photograph = torch.rand(1, 3, 64, 80)
+    message = r"gaze: all fixations lie in the first pixel, .* take gaze \* \(width, height\)"
+    for shares in ((0.5, 0.5), torch.tensor([[[0.2, 0.9], [0.5, 0.5]]])):
+        with pytest.warns(UserWarning, match=message):
+            sensor(photograph, shares)
+    for pixels in ((0, 0), torch.zeros(2), torch.tensor([[[0.5, 0.5], [40.0, 30.0]]]), torch.zeros(1, 0, 2)):
+        sensor(photograph, pixels)
