@@ -26,6 +26,9 @@ def cheapest_pairs(costs: NDArray[np.float64]) -> NDArray[np.intp]:
     kept_rows = np.unique(rows)
     kept_columns = np.unique(columns)
     possible = np.minimum(costs[np.ix_(kept_rows, kept_columns)], 0.0)
+    cheapest = possible.argmin(1)
+    if len(set(cheapest.tolist())) == len(cheapest):  # each row can have its best: no sum is lower
+        return np.stack([kept_rows, kept_columns[cheapest]], -1)
     table = np.concatenate([possible, np.zeros((len(kept_rows), len(kept_rows)))], 1)
     column_of = _assigned(table)
     count = len(kept_columns)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from semfov.detection.selection import Selection, suppress
 from semfov.motion import CameraStep, Motion
 from semfov.tracking.assignment import cheapest_pairs
 from semfov.tracking.kalman import Floats, Kinematics
@@ -18,7 +19,7 @@ from semfov.tracking.model import TrackingModel
 from semfov.tracking.tracks import Tracks, no_trail
 
 _AS_CLOSE = 0.9  # of the magnification of a look, from which on another one is as close
-_SAME = 0.5  # intersection over union from which on two objects of a class are one
+_ONE_OF_CLASS = Selection(iou=0.5, limit=10**9, per_class=True)  # two objects that overlap by more than half are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +203,9 @@ class Tracker:
             magnification=np.full(len(rows), seen.magnification),
             passes=np.full(len(rows), seen.number),
         )
-        others = np.setdiff1d(np.arange(len(self.tracks)), rows)
-        joined = self.tracks[others].joined(updated)
+        is_other = np.ones(len(self.tracks), bool)
+        is_other[rows] = False
+        joined = self.tracks[is_other].joined(updated)
         self.tracks = joined[joined.track_ids.argsort()]
 
     def _begin(self, seen: Seen, noise: Floats, fresh: NDArray[np.bool_]) -> None:
@@ -231,18 +233,11 @@ class Tracker:
 
     def _merge_doubles(self) -> None:
         """Drop objects that lie on a more probable one of their class."""
-        # Imported here: torchvision takes a second, and most programs of this room are not streams.
-        from torchvision.ops import batched_nms
-
-        # Torchvision keeps classes apart by shifting their boxes, which must not be negative for that.
-        boxes = self.tracks.boxes
-        kept = batched_nms(
-            boxes - boxes.amin() if len(boxes) else boxes,
-            torch.from_numpy(self.tracks.log_odds).float(),
-            torch.from_numpy(self.tracks.labels),
-            _SAME,
-        )
-        self.tracks = self.tracks[np.sort(kept.numpy())]
+        tracks = self.tracks
+        odds = torch.from_numpy(tracks.log_odds).float()
+        kept = suppress(tracks.boxes, odds, torch.from_numpy(tracks.labels), _ONE_OF_CLASS)
+        if len(kept) < len(tracks):
+            self.tracks = tracks[np.sort(kept.numpy())]
 
 
 _SIZE_SPREAD = 0.5  # standard deviation of the logarithm of the sizes of other objects
