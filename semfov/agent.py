@@ -13,8 +13,7 @@ from semfov.agents.kinds import KINDS_OF_LOOK, KindOfLook
 from semfov.agents.picture import OpenedPicture, PictureLike, check_order
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers import LearnedMap, Observer, Target
+from semfov.belief.observers import Observer, SemanticMap, Target
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
@@ -103,7 +102,7 @@ class ActivePerception(nn.Module):
         self.columns, self.rows = grid
         settings = eye.settings()
         for module in self.modules():
-            if isinstance(module, FovealObservationModel | TargetEvidence | MapEvidence | Verification):
+            if isinstance(module, FovealObservationModel | TargetEvidence | Verification):
                 check_same_detector(module.metadata.get("detector", {}), settings["detector"], module.title)
                 check_sensor(module.metadata.get("sensor", {}), settings["sensor"], module.title, strict=True)
                 check_grid(module.metadata.get("training", {}), grid, module.title)
@@ -118,7 +117,7 @@ class ActivePerception(nn.Module):
         grid: tuple[int, int] = (10, 10),
         **options: Any,
     ) -> Self:
-        """Make the agent for everyday use, which searches with learned target evidence and explores with a learned map.
+        """Make the agent for everyday use, which searches with learned evidence and explores with the semantic map.
 
         Args:
             name: a detector with shipped models: `yolox-nano`, `yolov3-tiny`, `nanodet-plus-m-1.5x` (with `weights=`).
@@ -282,14 +281,16 @@ class ActivePerception(nn.Module):
         """The part of the agent that turns a head in a scene.
 
         Raises:
-            InputError: the agent has no learned evidence and map for its sensor.
+            InputError: the agent has no learned evidence and semantic map for its sensor.
         """
         search = self.searching.observer
         explore = self.exploring.observer
-        if not (isinstance(search, Target) and isinstance(explore, LearnedMap)):
+        if not (isinstance(search, Target) and isinstance(explore, SemanticMap)):
             got = f"{type(search).__name__} and {type(explore).__name__}"
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
-            raise InputError(f"how: expected an agent with learned evidence and map for a head, got {got}; {remedy}")
+            raise InputError(
+                f"how: expected an agent with learned evidence and a semantic map for a head, got {got}; {remedy}"
+            )
         return HeadAgent(self.eye, search.model, explore.model)
 
     def kind_of_look(
@@ -483,7 +484,7 @@ class ActivePerception(nn.Module):
             The record, without target and decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
 
         Raises:
-            InputError: an argument does not fit the kind of look, or `min_gain` is given without a learned map.
+            InputError: an argument does not fit the kind of look, or `min_gain` is given without a semantic map.
             DataError: the file of the picture cannot be read.
         """
         settings = ExploreSettings(

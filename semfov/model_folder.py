@@ -7,8 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
+from semfov.belief.observers import Observer, Semantic, SemanticMap, Target
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.detection.detector import Detector
@@ -25,13 +24,15 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.named import SENSORS
 from semfov.zoom.evidence import GlimpseEvidence
 
-_FolderModel = FovealObservationModel | TargetEvidence | Verification | MapEvidence | GlimpseEvidence
+_FolderModel = FovealObservationModel | TargetEvidence | Verification | GlimpseEvidence
+
+RAW_OBSERVATION = "raw-observation.safetensors"
+"""Name of the file of an observation model that takes raw scores as they are, for explorations."""
 
 KINDS: dict[str, type[_FolderModel]] = {
     "observation": FovealObservationModel,
     "evidence": TargetEvidence,
     "verification": Verification,
-    "map": MapEvidence,
     "windows": GlimpseEvidence,
 }
 """Classes of the parts that are models."""
@@ -84,6 +85,12 @@ class ModelFolder:
         """File of a part, whether the agent uses it or not; None if there is none."""
         entry = self.manifest.parts.get(lookup(part, PARTS, "part"))
         return None if entry is None or entry.file is None else inside(self.path, entry.file)
+
+    def map_file(self) -> Path | None:
+        """File of the observation model for explorations, of raw scores where these were better; None without one."""
+        file = self.file("observation")
+        takes_raw = file is not None and self.manifest.parts["observation"].settings.get("map") == "raw"
+        return self.path / RAW_OBSERVATION if takes_raw else file
 
     def used(self, part: str) -> bool:
         """Whether the agent uses a part."""
@@ -211,9 +218,10 @@ class ModelFolder:
         return Semantic(components, model, footprint=settings["footprint"], tempering=settings["exponent"])
 
     def _exploration(self, eye: Eye) -> tuple[Observer, Policy]:
-        """Make the observer and the policy of explorations: a learned map, or random looks without one."""
-        learned = self._models.get("map")
-        if not isinstance(learned, MapEvidence):
+        """Make the observer and the policy of explorations: the semantic map, or random looks without a model."""
+        file = self.map_file()
+        if file is None:
             return Semantic(len(self.manifest.classes) + 1), Policy("random")
         sensor = self.manifest.sensor
-        return LearnedMap(learned), Policy("closer-look", fovea=eye.sensor.width(sensor) / sensor["reference"])
+        model = FovealObservationModel.from_pretrained(file)
+        return SemanticMap(model), Policy("closer-look", fovea=eye.sensor.width(sensor) / sensor["reference"])

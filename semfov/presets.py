@@ -8,15 +8,14 @@ from os import PathLike, fspath
 from typing import Any
 
 from semfov.belief.grid import check_cells
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.belief.observers import Semantic, SemanticMap, Target
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.detection.load import DetectorLike, load_detector
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
-from semfov.io.compatibility import learned_for
+from semfov.io.compatibility import learned_for, trained_for
 from semfov.io.pretrained import shipped_model
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
@@ -34,7 +33,7 @@ _THROUGH_BELIEF = "-search"
 def recommended_arguments(
     name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
 ) -> dict[str, Any]:
-    """Make the arguments of the recommended agent: learned evidence for search, a learned map for exploration."""
+    """Make the arguments of the recommended agent: learned evidence for search, the semantic map for exploration."""
     fit = (
         "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
     )
@@ -51,7 +50,7 @@ def recommended_arguments(
         "eye": eye,
         "search": (Target(evidence), Policy("non-predictive")),
         "explore": (
-            LearnedMap(MapEvidence.from_pretrained(name)),
+            SemanticMap(FovealObservationModel.from_pretrained(trained_for(detector.name, growth))),
             Policy("closer-look", fovea=sigma / eye.reference),
         ),
         "verification": Verification.if_shipped(name),

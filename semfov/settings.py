@@ -212,8 +212,8 @@ class ExploreSettings(LookSettings, StartSettings):
     """Settings of an exploration of a picture (`ActivePerception.explore`).
 
     Args:
-        min_gain: least expected gain of another look; below it the episode ends. For a fovea with a learned map it
-            counts cells that are newly classified right (None: 0.1), for a head likewise (None: 0), for windows new
+        min_gain: least expected gain of another look; below it the episode ends. For a fovea with the semantic map
+            it counts cells that are newly classified right (None: 0.1), for a head likewise (None: 0), for windows new
             objects (None: 0.01). 0 makes all looks. A photograph is looked at wholly by windows, whatever it is.
         score_threshold: score from which on an object is listed; in windows its probability, or its score in the whole
             picture (None: 0.5 there).

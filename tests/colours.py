@@ -72,7 +72,7 @@ def write_home(folder: Path, count: int = 20) -> Path:
 
 
 SMALL = [
-    "--columns", "4", "--rows", "4", "--holdout", "4", "--steps", "120", "--map_steps", "20", "--fixations", "6",
+    "--columns", "4", "--rows", "4", "--holdout", "4", "--steps", "120", "--fixations", "6",
     "--sensor.sigma", "60", "--sensor.growth", "1", "--workers", "1",
 ]  # fmt: skip
 """Settings of a small fit of everything to the photographs."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov import ActivePerception, EmbeddedScenes, Eye, FovealObservationModel, Foveation, Grid, Scanpath
-from semfov.belief import Belief, DirichletBelief, MapEvidence, TargetEvidence, Verification
+from semfov.belief import Belief, DirichletBelief, TargetEvidence, Verification
 from semfov.belief.observers import Look, Semantic
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Candidates, Detections, Detector, Selection
@@ -147,13 +147,6 @@ def evidence() -> TargetEvidence:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return TargetEvidence(4, 4).eval()
-
-
-def mapping() -> MapEvidence:
-    """An untrained model of map evidence."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return MapEvidence(4, 4, components=4).eval()
 
 
 def observing() -> Semantic:

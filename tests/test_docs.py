@@ -295,7 +295,7 @@ def test_the_commands_for_a_custom_detector_run(folder, run):
         (folder / name).mkdir()
         write_photographs(folder / name).rename(folder / instances)
     fit, *looks = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
-    tiny = [*SMALL, *["--data.limit", "6", "--holdout", "3", "--steps", "3", "--map_steps", "3", "--fixations", "2"]]
+    tiny = [*SMALL, *["--data.limit", "6", "--holdout", "3", "--steps", "3", "--fixations", "2"]]
     assert written_files(run(once([*fit, *tiny])))
     assert len(looks) >= 1
     for words in looks:

@@ -5,14 +5,14 @@ import json
 import pytest
 import torch
 
-from semfov import ActivePerception, Eye, Foveation, Panorama
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Panorama
 from semfov.agents.episode import EpisodeLimits, Goal, StreamEpisode
 from semfov.agents.fovea_episode import FoveaEpisode, GazePlan
 from semfov.agents.head import HeadAgent, HeadEpisode
 from semfov.agents.window_episode import GivenWindows
 from semfov.agents.windows import ZoomAgent
-from semfov.belief import MapEvidence, TargetEvidence
-from semfov.belief.observers import LearnedMap, Semantic
+from semfov.belief import TargetEvidence
+from semfov.belief.observers import Semantic, SemanticMap
 from semfov.decision.stopping import AtDetection, AtGoal, StoppingCriterion
 from semfov.gaze.policies import Policy
 from semfov.head.belief import SceneObserver
@@ -67,13 +67,14 @@ def given_windows():
 def of_head():
     torch.manual_seed(0)
     eye = Eye(Foveation(100.0, growth=2.0), Tiles(("red", "green", "blue"), fill=0.0, pure=True)).eval()
-    agent = HeadAgent(eye.requires_grad_(False), TargetEvidence(components=4), MapEvidence(components=4)).eval()
+    observation = FovealObservationModel.identity(["red", "green", "blue"], [0.2])
+    agent = HeadAgent(eye.requires_grad_(False), TargetEvidence(components=4), observation).eval()
     agent = agent.requires_grad_(False)
     image = torch.zeros(3, 180, 360)
     image[2, 80:100, 200:220] = 1
     views = agent.views(Panorama(image))
-    observer = SceneObserver(LearnedMap(agent.map_evidence), views)
-    return HeadEpisode(agent, observer, ExploreGain(views, agent.map_evidence), None, limits=LIMITS)
+    observer = SceneObserver(SemanticMap(agent.observation), views)
+    return HeadEpisode(agent, observer, ExploreGain(views), None, limits=LIMITS)
 
 
 STILL = {

@@ -10,8 +10,8 @@ import torch
 from torch.nn import functional as F
 
 import semfov
-from semfov import ActivePerception, Eye, Foveation, Grid, InputError, MapEvidence, TargetEvidence
-from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid, InputError, TargetEvidence
+from semfov.belief.observers import Semantic, SemanticMap, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.examples import example
 from semfov.data.sources import open_stream
@@ -32,20 +32,24 @@ def scene(x, y=8, size=24):
     return picture
 
 
-def learned(kind):
+def learned():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        model = kind(6, 5, components=3)
+        model = TargetEvidence(6, 5, components=3)
         torch.nn.init.normal_(model.prior)
     return model
+
+
+def observation():
+    return FovealObservationModel.identity(["red", "green"], [0.2])
 
 
 def observers():
     return {
         "semantic": Semantic(3),
         "closest": Semantic(3, memory="closest"),
-        "target": Target(learned(TargetEvidence)),
-        "map": LearnedMap(learned(MapEvidence)),
+        "target": Target(learned()),
+        "map": SemanticMap(observation()),
     }
 
 
@@ -97,7 +101,7 @@ def test_live_search_of_a_constant_image_at_rate_zero_equals_a_search(name, one_
 
 
 def test_a_prior_changes_the_fovea_in_a_search_and_in_a_stream_by_the_odds(one_thread):
-    model = learned(TargetEvidence)
+    model = learned()
     model.shares = torch.tensor([0.7, 0.9])
     model.thresholds = Thresholds(1.0, 0.0, 0.5)
     agent, image = agent_with(Target(model)), scene(100, 80)
@@ -119,12 +123,11 @@ def test_a_prior_changes_the_fovea_in_a_search_and_in_a_stream_by_the_odds(one_t
 
 
 def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration(one_thread):
-    model = learned(MapEvidence)
     agent = agent_with(Semantic(3))
     agent = ActivePerception(
         agent.eye,
         (Semantic(3), Policy("non-predictive")),
-        (LearnedMap(model), Policy("closer-look", fovea=0.2)),
+        (SemanticMap(observation()), Policy("closer-look", fovea=0.2)),
         grid=(8, 6),
     ).eval()
     live, image = agent.live(rate=0, start=3), scene(60, 60)

@@ -20,12 +20,11 @@ from semfov.zoom.hint_maps import features
 from semfov.zoom.hints import Gist
 
 KINDS = (
-    FovealObservationModel, semfov.TargetEvidence, semfov.MapEvidence, Verification, GlimpseEvidence,
+    FovealObservationModel, semfov.TargetEvidence, Verification, GlimpseEvidence,
     semfov.saliency.FixationDensity,
 )  # fmt: skip
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
-MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 
 
@@ -102,17 +101,17 @@ def test_shipped_models_of_target_evidence(path):
     assert odds[middle] > max(0.0, float(other[middle]) + 1)
 
 
-@pytest.mark.parametrize("path", MAPS, ids=lambda path: path.stem)
-def test_shipped_models_of_map_evidence(path):
-    model = semfov.MapEvidence.from_pretrained(path.stem)
-    check_name(model, path)
+@pytest.mark.parametrize("kind", ["", "-sharp"])
+@pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x"])
+def test_shipped_models_make_semantic_maps(detector, kind):
+    model = semfov.FovealObservationModel.from_pretrained(f"{detector}{kind}")
     # A confident detection at the fovea determines the class of its cell, and distant cells are background.
     grid, fixation = semfov.Grid(10, 10, (640, 480)), torch.tensor([[330.0, 230.0]])
     scores = torch.full((1, 1, 81), 0.001)
     scores[..., 7] = 0.92
     box = torch.tensor([[[300.0, 200.0, 360.0, 260.0]]])
     seen = semfov.Detections(box, scores, torch.ones(1, 1, dtype=torch.bool))
-    mapper = semfov.observers.LearnedMap(model)
+    mapper = semfov.observers.SemanticMap(model)
     with torch.no_grad():
         belief = mapper(mapper.start(1, grid, fixation), seen, fixation, grid)
     named = belief.probabilities[0].argmax(-1)
@@ -154,7 +153,7 @@ DETECTORS = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
 def test_every_detector_has_all_kinds_of_models():
     names = {"yolov3-tiny", "yolox-nano"}
     learned = {learned_for(name, growth) for name in names for growth in (1.0, 2.0)} | {"nanodet-plus-m-1.5x"}
-    assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
+    assert {path.stem for path in TARGET} == learned
     kinds = ("", "-sharp", "-published", "-published-narrow", "-zoom")
     at_thresholds = {f"{name}-published-{threshold}" for name in names for threshold in (0.1, 0.25, 0.5)}
     every = {name + kind for name in names | {"nanodet-plus-m-1.5x"} for kind in kinds}

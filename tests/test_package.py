@@ -78,7 +78,6 @@ COMMANDS = [
     ("eval.search", ["--workers", "0"]),
     ("eval.explore", ["--detector.name", "yolo"]),
     ("train.fit_fom", ["--help"]),
-    ("train.fit_map", ["--steps", "-1"]),
 ]
 
 IMPORTED = f"""

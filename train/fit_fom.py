@@ -25,6 +25,7 @@ from typing import Annotated, Literal
 import torch
 
 from semfov.errors import check
+from semfov.fit.cells import MOST_PHOTOGRAPHS, MappedLooks, fit_cells, mapped_looks
 from semfov.fit.observation import count_misses, fit_published, statistics_of
 from semfov.fit.samples import Samples
 from semfov.fit.settings import FitConfig
@@ -120,7 +121,7 @@ class FitFomConfig(FitConfig):
 _TRAINED = ("discriminative", "search")
 """Methods that maximise the probability of the true class, from the published fit on."""
 
-_SEARCHED_CELLS = (10, 10)  # columns and rows of the searches that the fit through the belief learns from
+_CELLS = (10, 10)  # columns and rows of the beliefs through which numbers are fitted
 
 
 def _fitted_name(config: FitFomConfig) -> str:
@@ -276,7 +277,7 @@ def _fit_to_search(
     """Fit a model through the belief; returns it, and how much better searches of held-out photographs land."""
     searches: dict[int, SearchedLooks] = {}
     for shard in sampler.by_shard():
-        searches |= searched_looks(sampler.scenes, shard, _SEARCHED_CELLS, config.max_target_area)
+        searches |= searched_looks(sampler.scenes, shard, _CELLS, config.max_target_area)
     training = [looks for index, looks in searches.items() if index % config.holdout]
     judged = [looks for index, looks in searches.items() if index % config.holdout == 0]
     options = {"looks": config.looks, "steps": config.steps, "seed": config.seed}
@@ -305,6 +306,8 @@ def fit_fom(config: FitFomConfig) -> None:
     model.miss_rate = misses.rates().to(model.edges)
     if config.mosaics:
         model.metadata["cells"] = misses.total.sum(1).tolist()
+    elif config.method in _TRAINED:
+        fit_cells(model, _mapped_looks(config, sampler), seed=config.seed)
     saved = model
     landing = ""
     if config.method == "search":
@@ -332,6 +335,17 @@ def _fit_model(
         return published(method=config.method)
     start = published(expected="empirical")
     return fit_discriminative(start, training.scores, training.distance, training.labels)
+
+
+def _mapped_looks(config: FitFomConfig, sampler: Sampler) -> list[MappedLooks]:
+    """List looks at photographs that are not held out, with what their cells hold."""
+    mapped: list[MappedLooks] = []
+    for shard in sampler.by_shard():
+        fitted_on = [index for index in shard.scenes.unique().tolist() if index % config.holdout]
+        mapped += mapped_looks(sampler.scenes, shard, fitted_on, _CELLS)
+        if len(mapped) >= MOST_PHOTOGRAPHS:
+            break
+    return mapped[:MOST_PHOTOGRAPHS]
 
 
 def _count_misses(config: FitFomConfig, sampler: Sampler, model: FovealObservationModel) -> MissCounts:

@@ -18,8 +18,8 @@ from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
 from eval.decide.run import detected_on_landing, landing
 from eval.search.run import SearchConfig
-from semfov.belief import MapEvidence, TargetEvidence
-from semfov.belief.observers import LearnedMap, Observer, Target
+from semfov.belief import TargetEvidence
+from semfov.belief.observers import Observer, SemanticMap, Target
 from semfov.episode import Step, rollout
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.looking import CellLooks
@@ -31,7 +31,7 @@ from semfov.gaze.policies import Policy
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
-from semfov.runs.setup import make_learned
+from semfov.runs.setup import make_learned, make_map
 
 COUNTS = (1, 5, 15)
 """Numbers of looks after which beliefs are evaluated."""
@@ -54,7 +54,7 @@ _ALL_CLASSES = {
 }
 """Beliefs fused by Kaplan's rule: from raw scores, from calibrated scores, and from raw scores tempered by 0.5."""
 
-LEARNED, MAP = "learned", "learned map"
+LEARNED, MAP = "learned", "semantic map"
 
 
 class BeliefCalibrationRun(ComparedLooking):
@@ -74,17 +74,15 @@ class BeliefCalibrationRun(ComparedLooking):
         evidence = if_shipped(
             partial(make_learned, TargetEvidence), belief.target_model, self.eye, partial(leave_out, LEARNED)
         )
-        evidence_map = if_shipped(
-            partial(make_learned, MapEvidence), belief.map_model, self.eye, partial(leave_out, MAP)
-        )
-        self.models = self.models._replace(evidence=evidence, map=evidence_map)
+        of_map = if_shipped(make_map, belief.map_model, self.eye, partial(leave_out, MAP))
+        self.models = self.models._replace(evidence=evidence, map=of_map)
         self.observers: dict[str, Observer] = {
             name: self.strategies[label(choice, self.task)].observer for name, choice in _ALL_CLASSES.items()
         }
         if evidence is not None:
             self.observers[LEARNED] = Target(evidence)
-        if evidence_map is not None:
-            self.observers[MAP] = LearnedMap(evidence_map)
+        if of_map is not None:
+            self.observers[MAP] = SemanticMap(of_map)
 
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, and how calibration is measured."""

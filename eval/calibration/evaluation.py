@@ -41,7 +41,7 @@ class CalibrationConfig(EyeConfig):
         beliefs: evaluate beliefs, too, for which every cell of every photograph is fixated once.
         grid: `[columns, rows]` of the grid of the beliefs.
         target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
-        map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
+        map_model: observation model of the semantic map, by name or file (None: ours for the detector and sensor).
         target_area: a class is searched for only if its boxes cover at most this share of the image.
         out: folder for the tables and the figures.
         cache: folder for the labelled detections and for the stored detections from every cell (None: `out` for the

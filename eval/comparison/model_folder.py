@@ -30,10 +30,11 @@ def with_models(config: _Config) -> _Config:
     for name in ("model", "target_model", "map_model"):
         value = getattr(config.belief, name)
         check(value is None, f"belief.{name}", "null, since models defines it", value)
-    files = {part: folder.file(part) for part in ("observation", "evidence", "map")}
-    names = {"model": "observation", "target_model": "evidence", "map_model": "map"}
+    files = {part: folder.file(part) for part in ("observation", "evidence")}
+    names = {"model": "observation", "target_model": "evidence"}
     columns, rows = folder.manifest.grid
     models: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
+    models["map_model"] = _text(folder.map_file())
     belief = replace(config.belief, columns=columns, rows=rows, **models)  # type: ignore[arg-type]
     detector = _detector_of(folder, config.detector)
     named = type(config)().policies != config.policies
@@ -74,7 +75,7 @@ def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfi
 def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> str | PolicyConfig:
     """Return the policy that the agent of a folder uses."""
     if config.task == "exploration":
-        return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
+        return PolicyConfig("closer-look", "learned") if folder.map_file() else "random-raw"
     if folder.used("evidence"):
         return EVIDENCE
     if not folder.used("tempering"):
@@ -90,9 +91,8 @@ def _needs(choice: str | PolicyConfig, config: ComparedConfig) -> list[str]:
     policy = resolve(choice, config.task)
     if policy.policy == EVIDENCE:
         return ["evidence"]
-    learned = ["map"] if policy.scores == "learned" else []
     model = policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model
-    return [*learned, *(["observation"] if model or policy.scores == "calibrated" else [])]
+    return ["observation"] if model or policy.scores in ("calibrated", "learned") else []
 
 
 def _text(path: Path | None) -> str | None:

@@ -1,27 +1,25 @@
 """Replays recorded episodes, with the detections and the belief at each fixation."""
 
 from dataclasses import replace
-from functools import partial
 
 import torch
 
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
-from semfov.belief import MapEvidence
-from semfov.belief.observers import LearnedMap, Observer, Semantic
+from semfov.belief.observers import Observer, Semantic, SemanticMap
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath
 from semfov.paths.trace import Trace
 from semfov.runs.results import ResultRecord
-from semfov.runs.setup import make_learned
+from semfov.runs.setup import make_map
 
 
 def replay(run: ComparedLooking, index: int, record: ResultRecord) -> Scanpath:
     """Replay a recorded episode.
 
     A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:
-    the learned map of the recommended agent or, if none is shipped for the eye, a map by Kaplan's rule from tempered
+    that of the recommended agent or, if no model is shipped for the eye, one by Kaplan's rule from tempered
     scores.
     """
     grid, candidate = run.grid(index), run.candidate(record["policy"], index)
@@ -37,9 +35,9 @@ def replay(run: ComparedLooking, index: int, record: ResultRecord) -> Scanpath:
         most=cells.shape[1],
     )
     beside: Observer | None = None
-    if not isinstance(candidate.observer, Semantic | LearnedMap):
-        model = if_shipped(partial(make_learned, MapEvidence), run.config.belief.map_model, run.eye)
-        beside = Semantic(len(run.scenes.classes) + 1, tempering=0.5) if model is None else LearnedMap(model)
+    if not isinstance(candidate.observer, Semantic | SemanticMap):
+        model = if_shipped(make_map, run.config.belief.map_model, run.eye)
+        beside = Semantic(len(run.scenes.classes) + 1, tempering=0.5) if model is None else SemanticMap(model)
     with torch.no_grad():
         trace = Trace(grid, ("background", *run.scenes.classes), cue, beside)
         for step in steps:

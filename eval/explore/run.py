@@ -64,7 +64,7 @@ class ExploreConfig(ComparedConfig):
             calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
             (kl-calibrated); and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
             `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`,
-            `vocus2`, `itti-koch` or `people`, each followed by `-raw` or `-calibrated`. With the learned map:
+            `vocus2`, `itti-koch` or `people`, each followed by `-raw` or `-calibrated`. With the semantic map:
             `random-learned`, `closer-look-learned`, `expected-gain-learned`, `vocus2-learned`, `itti-koch-learned` and
             `people-learned`.
         out: folder for tables, figures, per-episode records and the manifest.

@@ -15,9 +15,9 @@ from torch.nn import functional as F
 
 from eval.comparison.records import own_settings
 from eval.head.scan import Scan
-from semfov.belief import MapEvidence, TargetEvidence
+from semfov.belief import TargetEvidence
 from semfov.belief.belief import Belief
-from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers import SemanticMap, Target
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
@@ -38,7 +38,7 @@ from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
-from semfov.runs.setup import make_eye, make_learned, make_scenes
+from semfov.runs.setup import make_eye, make_learned, make_map, make_scenes
 from semfov.runs.store import DetectionStore, RememberedLooks
 from semfov.sensor.sphere import Boxes
 
@@ -110,7 +110,7 @@ class HeadRun(SceneRun):
         self.eye = make_eye(config.detector, SensorConfig())
         self.fovea = SensorConfig().fovea
         self.target_evidence = make_learned(TargetEvidence, None, self.eye)
-        self.map_evidence = make_learned(MapEvidence, None, self.eye)
+        self.observation = make_map(None, self.eye)
         photographs = make_scenes(config.data, self.eye.detector.classes)
         if not len(photographs):
             raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
@@ -131,7 +131,7 @@ class HeadRun(SceneRun):
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, its models and the settings."""
-        models = [self.target_evidence, self.map_evidence]
+        models = [self.target_evidence, self.observation]
         return {"eye": self.eye.settings(), "models": models, "settings": own_settings(self.config)}
 
     def world(self, index: int) -> World:
@@ -252,10 +252,8 @@ class HeadRun(SceneRun):
             views, self.places(index), self.scenes.annotation(index).labels, len(self.scenes.classes)
         )
         area, config = views.world.area * answers.any(-1), self.config
-        gain, observer = (
-            ExploreGain(views, self.map_evidence, config.unseen),
-            SceneObserver(LearnedMap(self.map_evidence), views),
-        )
+        gain = ExploreGain(views, config.unseen)
+        observer = SceneObserver(SemanticMap(self.observation), views)
         start, records = self.start(index, views, 0), list[ResultRecord]()
         for name, acquire in self.ways(gain, start).items():
             seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()

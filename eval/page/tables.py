@@ -123,7 +123,7 @@ def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "rig
 
 
 def paired_maps(folder: Path, field: str = "right") -> list[str]:
-    """`paired` for explorations by a learned map."""
+    """`paired` for explorations by the semantic map."""
     return paired(folder, "random-learned", (1, 2, 3, 4, 10, 20), field, ending="-learned")
 
 

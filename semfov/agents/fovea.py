@@ -9,7 +9,7 @@ from torch import Tensor
 from semfov.agents.episode import EpisodeLimits, on_cpu
 from semfov.agents.fovea_episode import FoveaEpisode, FoveaStream, GazeParts, GazePlan
 from semfov.belief import Grid
-from semfov.belief.observers import LearnedMap
+from semfov.belief.observers import SemanticMap
 from semfov.belief.observers.any_of import TargetLike
 from semfov.decision.stopping import AtDetection, AtGoal, LittleGain, StoppingCriterion
 from semfov.errors import InputError, check, check_finite, check_shape, check_whole
@@ -17,7 +17,7 @@ from semfov.gaze.acquisition import ExpectedGain
 from semfov.paths import GazePrediction, Scanpath
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 
-_MIN_GAIN = 0.1  # default for the least gain of a look by a learned map, in cells that are classified correctly
+_MIN_GAIN = 0.1  # default for the least gain of a look, in cells that are classified correctly
 RATE = 2.5  # default rate at which the belief fades in a stream, per second
 _CONFIRM = 0.5  # default for the score of a detection that ends a search without thresholds
 
@@ -88,9 +88,9 @@ class FoveaAgent(GazeParts):
         limits = EpisodeLimits.of(settings)
         observer = on_cpu(self.exploring.observer)
         min_gain, policy = settings.min_gain, settings.policy
-        if min_gain and not isinstance(observer, LearnedMap):
+        if min_gain and not isinstance(observer, SemanticMap):
             raise InputError(
-                f"min_gain: expected None for an agent without a learned map, got {min_gain}; use the recommended agent"
+                f"min_gain: expected None for an agent without a semantic map, got {min_gain}; use a recommended agent"
             )
         plan = GazePlan(
             self,
@@ -101,9 +101,10 @@ class FoveaAgent(GazeParts):
         )
 
         def criterion(grid: Grid) -> StoppingCriterion:
-            if not isinstance(observer, LearnedMap) or (policy is not None and min_gain is None):
+            if not isinstance(observer, SemanticMap) or (policy is not None and min_gain is None):
                 return StoppingCriterion()
-            return LittleGain(ExpectedGain(observer.model, grid), _MIN_GAIN if min_gain is None else min_gain)
+            gain = ExpectedGain(grid, self.eye.sensor.width(self.eye.sensor.settings()) / self.eye.reference)
+            return LittleGain(gain, _MIN_GAIN if min_gain is None else min_gain)
 
         return FoveaEpisode(plan, image, limits, criterion).run()
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, on_cpu
-from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers import SemanticMap, Target
 from semfov.belief.prior import Prior
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.data.classes import class_index, class_numbers
@@ -25,9 +24,10 @@ from semfov.head.closer import CloserLooks
 from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
-from semfov.io.compatibility import learned_for
+from semfov.io.compatibility import learned_for, trained_for
 from semfov.io.pretrained import shipped_model
 from semfov.kinds import HEAD
+from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import Ending, HeadPath
 from semfov.paths.head import HeadLook, head_look
 from semfov.paths.stimulus import reduced_copy
@@ -50,7 +50,7 @@ class HeadAgent(nn.Module):
     Args:
         eye: sensor and detector.
         search: evidence model for a target.
-        explore: evidence model for a map.
+        explore: observation model for a map.
 
     Attributes:
         classes: names of the classes, background first.
@@ -62,10 +62,10 @@ class HeadAgent(nn.Module):
         print(path, path.gaze(-1))
     """
 
-    def __init__(self, eye: Eye, search: TargetEvidence, explore: MapEvidence) -> None:
+    def __init__(self, eye: Eye, search: TargetEvidence, explore: FovealObservationModel) -> None:
         super().__init__()
         self.eye, self.classes = eye, ("background", *eye.detector.classes)
-        self.target_evidence, self.map_evidence = search, explore
+        self.target_evidence, self.observation = search, explore
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", **options: Any) -> Self:
@@ -84,10 +84,11 @@ class HeadAgent(nn.Module):
         """
         eye = Eye(Foveation(_SIGMA, growth=2.0), load_detector(name, **options))
         shipped = shipped_model(TargetEvidence, learned_for(eye.detector.name, 2.0), name)
-        models = TargetEvidence.from_pretrained(shipped), MapEvidence.from_pretrained(shipped)
-        for model in models:
-            model.check_compatible(eye.settings())
-        return cls(eye, *models).eval().requires_grad_(False)
+        search = TargetEvidence.from_pretrained(shipped)
+        explore = FovealObservationModel.from_pretrained(trained_for(eye.detector.name, 2.0))
+        search.check_compatible(eye.settings())
+        explore.check_compatible(eye.settings())
+        return cls(eye, search, explore).eval().requires_grad_(False)
 
     def views(self, scene: SceneLike, color: Color = "rgb") -> Views:
         """List the views and fixations that are possible in a scene.
@@ -211,11 +212,10 @@ class HeadAgent(nn.Module):
         settings.check_suitable(HEAD)
         limits = EpisodeLimits.of(settings, _PASSES)
         views = self.views(scene, color)
-        evidence = on_cpu(self.map_evidence)
         path = HeadEpisode(
             self,
-            SceneObserver(LearnedMap(evidence), views),
-            ExploreGain(views, evidence),
+            SceneObserver(SemanticMap(on_cpu(self.observation)), views),
+            ExploreGain(views),
             None,
             targets,
             min_gain=0.0 if settings.min_gain is None else settings.min_gain,

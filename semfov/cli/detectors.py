@@ -4,7 +4,7 @@ from os import fspath
 from pathlib import Path
 
 from semfov.agent import ActivePerception
-from semfov.belief import MapEvidence, TargetEvidence, Verification
+from semfov.belief import TargetEvidence, Verification
 from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import DetectorsOptions
 from semfov.cli.outcome import table_lines
@@ -16,12 +16,13 @@ from semfov.gaze.saliency import FixationDensity
 from semfov.io.files import cache_folder
 from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
+from semfov.observation.foveal import FovealObservationModel
 from semfov.zoom import GlimpseEvidence
 
 _PURPOSES: dict[str, type[Pretrained]] = {
     "search": TargetEvidence,
     "closer looks": Verification,
-    "explore": MapEvidence,
+    "explore": FovealObservationModel,
     "large pictures": GlimpseEvidence,
     "gaze": FixationDensity,
 }

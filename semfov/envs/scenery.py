@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import check_cells
-from semfov.belief.observers import LearnedMap, Observer, Target
+from semfov.belief.observers import Observer, Target
 from semfov.data import Annotation, Scenes, class_index
 from semfov.data.large import open_large
 from semfov.data.mosaics import Mosaics
@@ -137,8 +137,8 @@ class Scenery(_Surroundings[Eye]):
         self.annotation = self.pictures.annotation
         self.observer: Observer = looking.strategies[self.policy].observer
         self.together = self.observer
-        if isinstance(self.observer, Target | LearnedMap):
-            self.together = type(self.observer)(self.observer.model, together=True)  # type: ignore[arg-type]
+        if isinstance(self.observer, Target):
+            self.together = type(self.observer)(self.observer.model, together=True)
         # Results are kept for as long as an environment uses this scenery.
         self.episodes = cache(self._list)
         self.grid = cache(looking.grid)

@@ -48,9 +48,9 @@ def fit_detector(
     """Fit all models that the recommended agent needs to a detector, and return the agent.
 
     This is `semfov fit` as a function. The detector looks at every photograph from every cell. Then
-    an observation model, the exponent of its likelihoods, target evidence, the verification of targets by closer looks
-    and a map of all classes are fitted, and, on mosaics of enough photographs, the evidence for pictures larger than
-    the detector's input (unless `windows=False`). Each of them is compared with raw scores on held-out photographs, and
+    an observation model, the exponent of its likelihoods, target evidence and the verification of targets by closer
+    looks are fitted, and, on mosaics of enough photographs, the evidence for pictures larger than the detector's input
+    (unless `windows=False`). Each of them is compared with raw scores on held-out photographs, and
     the verification with the same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent
     again.
 

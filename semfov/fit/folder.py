@@ -11,7 +11,6 @@ from typing import Any
 from semfov.errors import DataError, InputError
 from semfov.fit.evidence_part import EvidenceFit
 from semfov.fit.looking import Looking
-from semfov.fit.map_part import MapFit
 from semfov.fit.observation import ObservationFit
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.settings import FitDetectorConfig
@@ -30,12 +29,11 @@ FITS: dict[str, type[PartFit]] = {
     "tempering": TemperingFit,
     "evidence": EvidenceFit,
     "verification": VerificationFit,
-    "map": MapFit,
     "windows": WindowsFit,
 }
 """The fits of `semfov.io.manifest.PARTS`, in the order in which they build on each other."""
 
-_SETTINGS = ("holdout", "fixations", "steps", "map_steps", "seed")
+_SETTINGS = ("holdout", "fixations", "steps", "seed")
 """Settings that the manifest of a model folder records."""
 
 

@@ -9,11 +9,10 @@ from semfov.fit.part import PartInputs
 from semfov.runs.tables import table
 
 _TITLES = {
-    "observation": "Observation model",
+    "observation": "Observation model (explorations)",
     "tempering": "Tempering",
     "evidence": "Target evidence (searches)",
     "verification": "Verification (closer looks)",
-    "map": "Learned map (explorations)",
     "windows": "Evidence by magnification (large pictures)",
 }
 """Titles of the parts in reports."""

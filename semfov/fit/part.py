@@ -75,7 +75,6 @@ class PartInputs:
             config,
             holdout=config.holdout or (3 if share < 1 else 5),
             steps=config.steps or max(250, round(500 * share)),
-            map_steps=config.map_steps or max(300, round(1000 * share)),
         )
         self.components = len(run.scenes.classes) + 1
         self.absent = 2 if self.components <= _FEW else None
@@ -141,7 +140,7 @@ class PartFit(ABC):
     def fit(self) -> PartResult:
         """Fit the part."""
 
-    def write(self, name: str, model: Pretrained, used: bool, why: str) -> Part:
+    def write(self, name: str, model: Pretrained, used: bool, why: str, **settings: Any) -> Part:
         """Write the model of a part.
 
         Args:
@@ -149,13 +148,14 @@ class PartFit(ABC):
             model: its fitted model.
             used: whether the agent should use it.
             why: sentence about the comparison with the agent without it.
+            settings: JSON values for the manifest.
 
         Returns:
             The entry of the part in the manifest.
         """
         file = f"{name}.safetensors"
         model.save(self.config.out / file)
-        return Part(file, sha256(self.config.out / file), used, why)
+        return Part(file, sha256(self.config.out / file), used, why, settings)
 
     @staticmethod
     def left_out(why: str) -> PartResult:

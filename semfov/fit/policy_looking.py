@@ -5,8 +5,8 @@ from dataclasses import asdict, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from semfov.belief import MapEvidence, TargetEvidence
-from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
+from semfov.belief import TargetEvidence
+from semfov.belief.observers import Observer, Semantic, SemanticMap, Target
 from semfov.errors import check
 from semfov.eye import Eye
 from semfov.fit.looking import Looking
@@ -18,7 +18,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
 from semfov.runs.presets import TARGET_EVIDENCE, label, resolve
 from semfov.runs.scene_run import SceneRun, digest_of
-from semfov.runs.setup import make_fitted, make_learned, make_observation
+from semfov.runs.setup import make_fitted, make_learned, make_map, make_observation
 from semfov.strategy import Strategy
 
 _OF_SEMANTIC = ("footprint", "tempering", "memory", "misses", "association")
@@ -92,7 +92,7 @@ class _Models(NamedTuple):
     observation: FovealObservationModel | None = None
     fitted: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
-    map: MapEvidence | None = None
+    map: FovealObservationModel | None = None
 
 
 class _LoadedModels:
@@ -117,7 +117,7 @@ def _load(name: str, belief: BeliefConfig, eye: Eye) -> Any:
         return make_fitted(belief.search_model, eye)
     if name == "evidence":
         return make_learned(TargetEvidence, belief.target_model, eye)
-    return make_learned(MapEvidence, belief.map_model, eye)
+    return make_map(belief.map_model, eye)
 
 
 def _by_evidence(policy: PolicyConfig, task: Task) -> bool:
@@ -154,7 +154,7 @@ def _make_strategy(
     if _by_evidence(policy, task):
         return Strategy(Target(model("evidence")), chosen)
     if policy.scores == "learned":
-        return Strategy(LearnedMap(model("map")), chosen)
+        return Strategy(SemanticMap(model("map")), chosen)
     if policy.scores == "fitted":
         return Strategy(Semantic.searching(model("fitted")), chosen)
     return Strategy(_make_semantic(policy, belief, components, model), chosen)
@@ -163,9 +163,7 @@ def _make_strategy(
 def _make_policy(policy: PolicyConfig, belief: BeliefConfig, model: Callable[[str], Any], fovea: float) -> Policy:
     """Build the policy, with what its acquisition function takes."""
     function = FUNCTIONS[policy.policy]
-    needed = None
-    if "model" in function.takes:
-        needed = model("map" if function.needs_map else "observation")
+    needed = model("observation") if "model" in function.takes else None
     available = {"fovea": fovea, "prior": belief.prior}
     options = {name: available[name] for name in available.keys() & function.takes}
     return Policy(function, needed, samples=policy.samples, calibrated=policy.scores == "calibrated", **options)

@@ -82,7 +82,6 @@ class FitDetectorConfig(FitOnCellsConfig):
             and to which the verification is fitted.
         fixations: looks at each photograph to fit the observation model to.
         steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
-        map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
         windows: also fit the evidence for pictures larger than the detector's input, if there are enough photographs.
         window_steps: training steps of that evidence.
         gaze: pictures that people viewed, to fit where people look to. Without photographs, nothing else is fitted.
@@ -98,7 +97,6 @@ class FitDetectorConfig(FitOnCellsConfig):
     judged: Count = 100
     fixations: Count = 8
     steps: Count | None = None
-    map_steps: Count | None = None
     windows: bool = True
     window_steps: Count = 400
     gaze: GazeModelFit = field(default_factory=GazeModelFit)

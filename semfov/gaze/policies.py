@@ -5,7 +5,7 @@ from typing import Any, get_args
 
 from torch import Tensor, nn
 
-from semfov.belief import Grid, MapEvidence
+from semfov.belief import Grid
 from semfov.errors import InputError, check, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, AcquisitionFunction, Task
 from semfov.gaze.acquisition.lookahead import sampled_likelihoods
@@ -49,7 +49,7 @@ class Policy(nn.Module):
     def __init__(
         self,
         function: str | type[AcquisitionFunction],
-        model: FovealObservationModel | MapEvidence | None = None,
+        model: FovealObservationModel | None = None,
         *,
         samples: int | None = None,
         calibrated: bool = True,
@@ -76,17 +76,13 @@ class Policy(nn.Module):
             else:
                 setattr(self, name, value)
 
-    def _model_for(
-        self, model: FovealObservationModel | MapEvidence | None
-    ) -> FovealObservationModel | MapEvidence | None:
+    def _model_for(self, model: FovealObservationModel | None) -> FovealObservationModel | None:
         """Check the model that the function is made from; None if it is made from none."""
         if "model" not in self.function.takes:
             return None
-        needed = MapEvidence if self.function.needs_map else FovealObservationModel
-        if not isinstance(model, needed):
-            words = "a learned map" if self.function.needs_map else "an observation model"
+        if not isinstance(model, FovealObservationModel):
             got = "none" if model is None else f"a {type(model).__name__}"
-            raise InputError(f"policy {self.name!r}: expected {words}, got {got}")
+            raise InputError(f"policy {self.name!r}: expected an observation model, got {got}")
         return model
 
     def _check_settings(self, settings: Mapping[str, object]) -> None:

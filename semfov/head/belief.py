@@ -9,9 +9,10 @@ from torch import Tensor
 from semfov.belief.belief import Belief, pick
 from semfov.belief.evidence import farther
 from semfov.belief.grid import Grid
-from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers import SemanticMap, Target
 from semfov.belief.observers.base import Look, Observer, own
 from semfov.belief.observers.gathering import EvidenceLook
+from semfov.belief.observers.semantic_map import CellLook
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check
 from semfov.head.views import Views
@@ -21,10 +22,11 @@ _CERTAIN = 1e-6  # probabilities nearer to 0 or 1 fade as this one does
 
 @dataclass(frozen=True)
 class _SceneLook(Look):
-    """The evidence of a look about the cells of a view; gaze `(1,)`."""
+    """The evidence of a look about the cells of a view; the cell `(1,)` of the view and that of the scene, `gaze`."""
 
     pose: int
-    inner: EvidenceLook
+    inner: EvidenceLook | CellLook
+    cell: Tensor
     gaze: Tensor
 
     @classmethod
@@ -74,7 +76,7 @@ class SceneObserver(Observer):
 
     by_target = True
 
-    def __init__(self, inner: Target | LearnedMap, views: Views, *, prior: float | None = None) -> None:
+    def __init__(self, inner: Target | SemanticMap, views: Views, *, prior: float | None = None) -> None:
         super().__init__()
         check(prior is None or 0 < prior < 1, "prior", "a probability between 0 and 1", prior)
         self.inner = inner
@@ -86,7 +88,7 @@ class SceneObserver(Observer):
         check(batch == 1, "batch", "1, as a head has one episode at a time", batch)
         cells = len(self.views.world.scene)
         nothing = like.new_zeros(1, cells)
-        values = like.new_zeros(1, cells, 2 if isinstance(self.inner, Target) else len(self.inner.model.prior))
+        values = like.new_zeros(1, cells, 2 if isinstance(self.inner, Target) else self.inner.components)
         return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), {})
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
@@ -95,7 +97,8 @@ class SceneObserver(Observer):
         pose = int((float(fixation[0, 1]) + 0.5) // height)
         point = fixation - fixation.new_tensor([0, pose * height])
         inner = self.inner.weigh(detections, point, self.views.view_grid, target)
-        return _SceneLook(pose, inner, self.views.gaze_cell[self.views.grid.cell_of(fixation)])
+        cell = self.views.view_grid.cell_of(point)
+        return _SceneLook(pose, inner, cell, self.views.gaze_cell[self.views.grid.cell_of(fixation)])
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
         belief = own(belief, SceneBelief, "belief")
@@ -113,7 +116,7 @@ class SceneObserver(Observer):
         cells = views.visible[pose]
         is_owner = belief.owner[0, cells] == pose
         nearest = torch.minimum(
-            views.distances[pose][int(look.inner.fixated)],
+            views.distances[pose][int(look.cell)],
             torch.where(is_owner, belief.closest[0, cells], torch.inf),
         )
         # The view takes the cells to which its gaze came closest, and renews those that it had.
@@ -167,10 +170,13 @@ class SceneObserver(Observer):
             return torch.cat([view.probability(0), view.chance(0)])
         return view.class_probabilities()[0].mT
 
-    def _unseen(self, look: EvidenceLook, like: Tensor) -> Tensor:
+    def _unseen(self, look: EvidenceLook | CellLook, like: Tensor) -> Tensor:
         """Compute the values `(1, S, C)` of cells that were never seen."""
         if isinstance(self.inner, Target) and self.prior is not None:
             return torch.full_like(like, self.prior)
+        if isinstance(self.inner, SemanticMap):
+            return self.inner.unseen(like).expand_as(like).clone()
+        look = own(look, EvidenceLook, "look")
         evidence = torch.zeros_like(look.evidence) + self.inner.model.unseen(look.evidence)
         blank = replace(look, evidence=evidence, distance=torch.ones_like(look.distance), score=0 * look.score)
         probabilities = self._probabilities(self.inner.update(self.inner.start(1, self.views.view_grid, like), blank))

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.belief import Belief, MapEvidence
+from semfov.belief import Belief
 from semfov.belief.observers.base import own
 from semfov.errors import InputError
+from semfov.gaze.acquisition.accuracy import corrected_cells
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneBelief
 from semfov.head.scenes import World
@@ -127,28 +128,28 @@ class ExploreGain(LookGain):
 
     .. math:: G(h, f) = \sum_{x \text{ seen}} |x| \, E[\Delta \mid f](x) + u \sum_{x \text{ not}} |x| \, a(d_{h,f}(x))
 
-    For cells that were seen before, `MapEvidence.gain` has learned the gain of a look. For the others it is u times the
-    acuity of the fovea there. After a turn of the head the eye lands on one of nine cells. All cells of a view are
+    For cells that were seen before, the gain is that of `semfov.acquisition.ExpectedGain`. For the others it is u times
+    the acuity of the fovea there. After a turn of the head the eye lands on one of nine cells. All cells of a view are
     valued where the head stays.
 
     Args:
         views: the possible views and fixations.
-        model: the model that the map is learned with.
         unseen: u, expected fraction of cells that are classified correctly when they are first fixated.
 
-    >>> from semfov.belief.observers import LearnedMap
+    >>> from semfov import FovealObservationModel
+    >>> from semfov.belief.observers import SemanticMap
     >>> from semfov.head import Flat
     >>> from semfov.head.belief import SceneObserver
-    >>> views, model = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8)), MapEvidence(components=3)
-    >>> belief = SceneObserver(LearnedMap(model), views).start(1, views.grid, torch.zeros(1))
-    >>> gains = ExploreGain(views, model)(belief, here=0, poses=[0, 1])
+    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    >>> model = FovealObservationModel.identity(["cup", "cat"], [0.2])
+    >>> belief = SceneObserver(SemanticMap(model), views).start(1, views.grid, torch.zeros(1))
+    >>> gains = ExploreGain(views)(belief, here=0, poses=[0, 1])
     >>> int((gains > OUT).sum())  # 100 cells of the present view, and 9 of the other one
     109
     """
 
-    def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
+    def __init__(self, views: Views, unseen: float = UNSEEN) -> None:
         super().__init__(views)
-        self.model = model
         self.unseen = unseen
         side = views.view_grid.columns
         # After a turn the eye lands near the corners, the sides or the middle of a view.
@@ -178,9 +179,9 @@ class ExploreGain(LookGain):
             is_seen_here = is_seen[cells]
             if bool(is_seen_here.any()):
                 seen = cells[is_seen_here]
-                distance = views.distances[pose][fixated][:, is_seen_here][None]
-                learned = self.model.gain(probabilities[:, seen], belief.closest[:, seen], belief.looks, distance)[0]
-                gain = gain + learned @ views.world.area[seen]
+                distance = views.distances[pose][fixated][:, is_seen_here]
+                corrected = corrected_cells(probabilities[:, seen], belief.closest[:, seen], distance, views.fovea)[0]
+                gain = gain + corrected @ views.world.area[seen]
             gains[pose * views.cells + fixated] = gain
         return gains
 

@@ -28,7 +28,7 @@ Settings = Mapping[str, Any]
 
 
 def learned_for(detector: str, growth: float) -> str:
-    """Name the learned evidence and maps that are shipped for a detector with a sensor.
+    """Name the learned evidence that is shipped for a detector with a sensor.
 
     Args:
         detector: name of the detector.
@@ -38,6 +38,19 @@ def learned_for(detector: str, growth: float) -> str:
         The name.
     """
     return f"{detector}-published" if growth == 1 else detector
+
+
+def trained_for(detector: str, growth: float) -> str:
+    """Name the observation model, trained for the posterior, that is shipped for a detector with a sensor.
+
+    Args:
+        detector: name of the detector.
+        growth: of the sensor's blur.
+
+    Returns:
+        The name.
+    """
+    return f"{detector}-sharp" if growth == 1 else detector
 
 
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
@@ -171,7 +184,7 @@ def check_grid(fitted: Settings, grid: tuple[int, int], what: str) -> None:
     raise InputError(
         f"grid: the {what} was fitted on {columns} × {rows} cells and is valid for half to twice as many "
         f"along each side, got {grid[0]} × {grid[1]}; use grid={(columns, rows)}, or fit models on such a grid (python "
-        f"-m train.fit_search and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
+        f"-m train.fit_search, with --columns {grid[0]} --rows {grid[1]})"
     )
 
 

@@ -17,7 +17,7 @@ FILE = "manifest.json"
 _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
-PARTS = ("observation", "tempering", "evidence", "verification", "map", "windows")
+PARTS = ("observation", "tempering", "evidence", "verification", "windows")
 """Parts that a folder may hold, in the order in which they are fitted."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
@@ -45,7 +45,8 @@ _RECORD = {
     # Further values depend on the sensor, which checks them when it is made.
     "sensor": Object({"name": Text(), "reference": Number(above=0)}, Json(), ("name", "reference")),
     "grid": Array(Number(1, 200), 2),
-    "parts": Object(dict.fromkeys(PARTS, _PART)),
+    # Folders of earlier versions have a map of its own, which is not read.
+    "parts": Object(dict.fromkeys((*PARTS, "map"), _PART)),
     "training": Object(others=Json()),
 }
 
@@ -100,7 +101,7 @@ class Manifest:
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
         record = _read_record(Path(folder) / FILE)
-        parts = {name: Part(**part) for name, part in record["parts"].items()}
+        parts = {name: Part(**part) for name, part in record["parts"].items() if name in PARTS}
         for part in parts.values():
             _check_file(part, Path(folder))
         columns, rows = record["grid"]

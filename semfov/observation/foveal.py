@@ -62,6 +62,8 @@ class FovealObservationModel(Pretrained):
             to background, whose row is ignored (`Semantic(association="one")`); None takes them from `miss_rate`.
         refutation: ρ, from 0 to 1, share by which a detection loses weight once a cell that it covers was fixated
             (`Semantic(association="one")`); 0 is as published.
+        cell: m, a and w, positive, by which a look says what a whole cell holds (`semfov.observers.SemanticMap`): the
+            odds of a miss, an exponent, and the weight of background. The default is about that of YOLOX-nano.
         metadata: JSON values that are saved with the model: `detector` and `sensor` (the settings that it was fitted
             for), `counts`, and further information.
 
@@ -70,6 +72,7 @@ class FovealObservationModel(Pretrained):
         log_exponents: `(N,)`, logarithm of the exponents.
         log_miss: `(K+1, N)`, logarithm of the odds of a miss; None if they are not known.
         refutation: `()`, ρ.
+        log_cell: `(3,)`, logarithms of m, a and w.
 
     Raises:
         InputError: a shape does not fit, or a value is out of range.
@@ -93,6 +96,7 @@ class FovealObservationModel(Pretrained):
             "log_exponents": Field(("N",), low=-10, high=10, optional=True),
             "log_miss": Field(("K+1", "N"), low=-50, high=50, optional=True),
             "refutation": Field((), low=0, high=1, optional=True),
+            "log_cell": Field((3,), low=-50, high=50, optional=True),
         },
         {"classes": CLASSES, "epsilon": Number(above=0, high=1)},
     )
@@ -115,6 +119,7 @@ class FovealObservationModel(Pretrained):
         exponents: Tensor | None = None,
         miss_odds: Tensor | None = None,
         refutation: float | Tensor = 0.0,
+        cell: Sequence[float] | Tensor = (0.001, 1.0, 0.25),
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -138,6 +143,8 @@ class FovealObservationModel(Pretrained):
         odds = _table(miss_odds, "miss_odds", shape[:2], alpha)
         powers = _table(exponents, "exponents", shape[1:2], alpha)
         refuted = torch.as_tensor(refutation).detach().to(alpha).clone()
+        of_cells = _table(torch.as_tensor(cell), "cell", (3,), alpha)
+        assert of_cells is not None
         if rates is not None:
             are_probabilities = bool(((rates >= 0) & (rates <= 1)).all())
             check(are_probabilities, "miss_rate", "probabilities", "numbers outside [0, 1]")
@@ -153,6 +160,7 @@ class FovealObservationModel(Pretrained):
         self.log_exponents = nn.Parameter(powers.log())
         self.log_miss = None if odds is None else nn.Parameter(odds.log())
         self.refutation = nn.Parameter(refuted)
+        self.log_cell = nn.Parameter(of_cells.log())
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
@@ -495,6 +503,7 @@ class FoldedObservationModel(FovealObservationModel):
             exponents=model.log_exponents.exp(),
             miss_odds=None if model.log_miss is None else model.log_miss.exp(),
             refutation=model.refutation,
+            cell=model.log_cell.exp(),
             metadata=model.metadata,
         )
         with torch.no_grad():
@@ -523,7 +532,7 @@ def _table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor
     check(tuple(table.shape) == shape, name, f"shape {shape}", tuple(table.shape))
     check_finite(table, name)
     copied = table.detach().to(like).clone()
-    if name in ("exponents", "miss_odds"):
+    if name in ("exponents", "miss_odds", "cell"):
         check(bool((copied > 0).all()), name, "positive numbers", float(copied.min()))
     return copied
 

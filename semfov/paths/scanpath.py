@@ -193,8 +193,7 @@ class Scanpath(_CellRecord):
         looks: the looks; the clock of the episode is the sum of their times so far. The value of a closer look is the
             probability that the target is at the place.
         probabilities: `(n, X·Y, K+1)`, probability that each cell holds each class after each fixation, background
-            first. A learned map gives marginal probabilities: several classes can share a cell, so they need not sum
-            to 1.
+            first.
         values: `(n, X·Y)`, values of the acquisition function, by which the next fixation was chosen.
         posterior: `(n, X·Y)`, probability of the target in each cell after each fixation, by the belief of the search;
             None for exploration.

@@ -176,7 +176,7 @@ class BeliefConfig(Settings):
         search_model: observation model fitted through the belief, by name or file (None: the one shipped for the
             detector).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
-        map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
+        map_model: observation model of the semantic map, by name or file (None: ours for the detector and sensor).
     """
 
     columns: Side = 10
@@ -204,7 +204,7 @@ class PolicyConfig(Settings):
         policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient
             cell), or `target-evidence` (uses the learned evidence for the target).
         scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
-            first; `learned` uses a learned belief, which is the learned map in explorations and the learned target
+            first; `learned` uses a learned belief, which is the semantic map in explorations and the learned target
             evidence in searches; `fitted` passes them through an observation model that was fitted through the belief.
         tempering: exponent of the likelihoods.
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.

@@ -80,11 +80,10 @@ def _search_presets(plain: _Presets, salient: _Presets) -> _Presets:
 
 def _exploration_presets(plain: _Presets, salient: _Presets) -> _Presets:
     """Make the presets of explorations, of policies and of saliency maps by name."""
-    scored = {name: policy for name, policy in plain.items() if not FUNCTIONS[name].needs_map} | salient
-    of_learned_map = {**scored, "expected-gain": PolicyConfig("expected-gain")}
+    scored = plain | salient
     learned = {
         f"{name}-learned": replace(policy, scores="learned")
-        for name, policy in of_learned_map.items()
+        for name, policy in scored.items()
         if not FUNCTIONS[policy.policy].needs_model
     }
     named = {"recommended": PolicyConfig("closer-look", "learned"), "published": PolicyConfig("kl", "calibrated")}

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from semfov.belief import MapEvidence, TargetEvidence, Verification
+from semfov.belief import TargetEvidence, Verification
 from semfov.data import CocoScenes, EmbeddedScenes, Scenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
 from semfov.eye import Eye
-from semfov.io.compatibility import learned_for
+from semfov.io.compatibility import learned_for, trained_for
 from semfov.io.files import read_text
 from semfov.io.pretrained import shipped_model
 from semfov.observation.foveal import FovealObservationModel
@@ -21,7 +21,7 @@ from semfov.sensor import Foveation, named_sensor
 _OPTIONAL = "background", "weights", "classes", "head", "stride", "input_size", "runtime", "logits", "per_class"
 """Settings of a detector that are options of `load_detector` of the same name, given only where they are changed."""
 
-_Learned = TypeVar("_Learned", TargetEvidence, MapEvidence, Verification)
+_Learned = TypeVar("_Learned", TargetEvidence, Verification)
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> None:
@@ -148,6 +148,11 @@ def make_fitted(name: str | None, eye: Eye) -> FovealObservationModel:
     return make_observation(name, eye)
 
 
+def make_map(name: str | None, eye: Eye) -> FovealObservationModel:
+    """Load an observation model for the map of all classes: by name, or ours for the fovea's growth."""
+    return make_observation(_own_model(eye) if name is None else name, eye)
+
+
 def observation_name(eye: Eye) -> str:
     """Name of the observation model that is shipped for an eye: the published one, or ours for the fovea's growth."""
     detector = eye.detector
@@ -157,8 +162,12 @@ def observation_name(eye: Eye) -> str:
         name = published_model(detector.name, sensor, detector.selection.threshold)
         if is_published and (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
             return name
-    name = f"{detector.name}-sharp" if _growth_of(eye) == 1 else detector.name
-    return shipped_model(FovealObservationModel, name, "MODEL")
+    return _own_model(eye)
+
+
+def _own_model(eye: Eye) -> str:
+    """Name our own observation model for a detector and the growth of a fovea."""
+    return shipped_model(FovealObservationModel, trained_for(eye.detector.name, _growth_of(eye)), "MODEL")
 
 
 def make_learned(kind: type[_Learned], name: str | None, eye: Eye) -> _Learned:

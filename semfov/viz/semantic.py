@@ -35,10 +35,7 @@ _NAME_POINTS = 7
 
 
 def cell_entropy(scanpath: Scanpath) -> Tensor:
-    """Compute the entropy in bits of the class of every cell after each look, `(n, X·Y)`.
-
-    Marginal probabilities, as of a learned map, are scaled to sum to 1.
-    """
+    """Compute the entropy in bits of the class of every cell after each look, `(n, X·Y)`."""
     shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
     return torch.special.entr(shares).sum(-1).detach().cpu() / math.log(2)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from semfov import Detections, Grid, MapEvidence
+from semfov import Detections, Grid, TargetEvidence
 from semfov.belief.evidence import Gathered
 
 
@@ -29,12 +29,12 @@ def random_looks():
 
 
 @pytest.fixture
-def toy_map():
-    """A small model of map evidence with random parameters."""
+def toy_evidence():
+    """A small model of target evidence with random parameters."""
 
     def make(components=5, widths=(8, 6), seed=1, metadata=None):
         generator = torch.Generator().manual_seed(seed)
-        model = MapEvidence(*widths, components=components, metadata=metadata)
+        model = TargetEvidence(*widths, components=components, metadata=metadata)
         with torch.no_grad():
             for parameter in model.parameters():
                 parameter.copy_(0.6 * torch.randn(parameter.shape, generator=generator))

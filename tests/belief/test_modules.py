@@ -2,12 +2,10 @@
 
 from functools import partial
 
-import torch
-
 from semfov.belief import Verification
-from semfov.belief.observers import AnyOf, LearnedMap, Semantic, Target
+from semfov.belief.observers import AnyOf, Semantic, SemanticMap, Target
 from tests.base_tester import GraphTester, Host, make_testers
-from tests.small import GRID, detections, evidence, look, mapping, model, observing, rand
+from tests.small import GRID, detections, evidence, look, model, observing, rand
 
 
 class TestVerification(GraphTester):
@@ -41,17 +39,6 @@ class TestTargetEvidence(LookTester):
         return module(detections(scores, boxes), fixation, GRID, 2)
 
 
-class TestMapEvidence(LookTester):
-    test_export = None  # traced as a part of AnyOfOneMap
-
-    def make(self):
-        return mapping()
-
-    @staticmethod
-    def call(module, scores, boxes, fixation):
-        return module(detections(scores, boxes), fixation, GRID, torch.tensor([1, 2, 3], device=scores.device))
-
-
 class ObserverTester(LookTester):
     """An observer's belief about class 2 after the same detections from two fixations."""
 
@@ -83,7 +70,10 @@ class PartTester(ObserverTester):
 
 
 globals().update(
-    make_testers(PartTester, {"Target": lambda: Target(evidence()), "LearnedMap": lambda: LearnedMap(mapping())})
+    make_testers(
+        PartTester,
+        {"Target": lambda: Target(evidence()), "SemanticMap": lambda: SemanticMap(model().requires_grad_(False))},
+    )
 )
 globals().update(
     make_testers(
@@ -91,7 +81,7 @@ globals().update(
         {
             "Semantic": observing,
             "SemanticWithMisses": lambda: Semantic(4, misses=model().requires_grad_(False), memory="closest"),
-            "AnyOfOneMap": lambda: AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0}),
+            "AnyOfOneMap": lambda: AnyOf(SemanticMap(model().requires_grad_(False)), {1: 0.3, 2: 1.0}),
         },
     )
 )

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from semfov import Detections, Grid, MapEvidence, TargetEvidence
+from semfov import Detections, Grid, TargetEvidence
 from semfov.belief import Verification
 from semfov.belief.evidence import READOUT, blur, logarithm, nearness, network
 from semfov.belief.observers import Target
@@ -160,10 +160,10 @@ class Recorder(nn.Module):
 
 
 @pytest.mark.parametrize("columns", [1, 2, 6, 12, 24])
-def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, dtype, device, columns):
+def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_evidence, gathered, dtype, device, columns):
     said = gathered(dtype=dtype)
     said = type(said)(*(each.to(device) for each in said))
-    model, recorder = toy_map().to(device, dtype), Recorder()
+    model, recorder = toy_evidence().to(device, dtype), Recorder()
     more = torch.arange(24.0, device=device).to(dtype)
     got = model.read_out(recorder, said.nearest, said, columns, more, 2 * more)
     torch.testing.assert_close(got, said.nearest + 0.5)
@@ -181,8 +181,8 @@ def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, dtype
         assert torch.equal(recorder.read[row, :, READOUT:], torch.stack([more, 2 * more], -1))
 
 
-def test_inputs_of_a_network_have_the_precision_of_the_evidence(toy_map, gathered):
-    model, recorder, said = toy_map().bfloat16(), Recorder(), gathered(dtype=torch.bfloat16)
+def test_inputs_of_a_network_have_the_precision_of_the_evidence(toy_evidence, gathered):
+    model, recorder, said = toy_evidence().bfloat16(), Recorder(), gathered(dtype=torch.bfloat16)
     assert model.read_out(recorder, said.nearest, said, 6).dtype == recorder.read.dtype == torch.bfloat16
 
 
@@ -220,9 +220,8 @@ def test_networks_have_two_hidden_layers():
     )
 
 
-@pytest.mark.parametrize("kind", [MapEvidence, TargetEvidence])
-def test_all_classes_start_with_the_same_prior(kind):
-    model = kind(4, 5, components=7)
+def test_all_classes_start_with_the_same_prior():
+    model = TargetEvidence(4, 5, components=7)
     assert torch.equal(model.prior, torch.zeros(7))
     assert model.widths == (4, 5)
     assert model.metadata == {}

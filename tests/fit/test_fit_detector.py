@@ -24,7 +24,7 @@ from eval.search import main as search
 from eval.search.run import SearchConfig
 from semfov import ActivePerception, DataError, EmbeddedScenes, FovealObservationModel, InputError
 from semfov.belief import Verification
-from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.belief.observers import Semantic, SemanticMap, Target
 from semfov.cli.main import main as command
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.detector import _check_photographs, _seconds_of_looks, _with_classes
@@ -89,7 +89,7 @@ def test_the_folder_describes_its_models(home):
     assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
     assert manifest.sensor["sigma"] == 60
     assert manifest.sensor["growth"] == 1
-    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "map", "windows"]
+    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "windows"]
     assert manifest.training["photographs"] == 20
     assert manifest.training["held_out"] == 5
     for name, part in manifest.parts.items():
@@ -108,7 +108,7 @@ def test_the_folder_describes_its_models(home):
     section = text.split("## Verification (closer looks)")[1].split("## ")[0]
     assert f"| {verification.thresholds.confirm:.2f} (chosen) " in section
     assert "| no closer looks " in section
-    for name in ("reliability.png", "search.png", "explore.png"):
+    for name in ("reliability.png", "search.png"):
         assert f"({name})" in text
         with Image.open(home / "models" / name) as picture:
             picture.verify()
@@ -121,7 +121,7 @@ def test_the_agent_of_the_folder_finds_the_target(home):
     assert (agent.columns, agent.rows) == (4, 4)
     assert not any(parameter.requires_grad for parameter in agent.parameters())
     assert isinstance(agent.searching.observer, Target if folder.used("evidence") else Semantic)
-    assert isinstance(agent.exploring.observer, LearnedMap if folder.used("map") else Semantic)
+    assert isinstance(agent.exploring.observer, SemanticMap)
     image = photograph_with(2, (7, 0))
     assert 12 in agent.search(image, "blue", start=3, shifts=15).cells.tolist()
     assert len(agent.explore(image, shifts=3).cells) >= 1
@@ -170,7 +170,6 @@ FITS = {
     "tempering": "tempering.hit_rates",
     "evidence": "evidence_part.fit_evidence",
     "verification": "verification_part.fit_in_folds",
-    "map": "map_part.fit_map_evidence",
     "windows": "windows_part._fit_mosaics",
 }
 
@@ -196,7 +195,7 @@ def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("part", "lost"), [("verification", "model"), ("map", "record")])
+@pytest.mark.parametrize(("part", "lost"), [("verification", "model"), ("evidence", "record")])
 def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, lost):
     """As after a killed run: finished parts are read, and the missing one is fitted with the same result."""
     shutil.copytree(home / "models", tmp_path / "models")
@@ -272,21 +271,24 @@ def test_a_part_that_does_not_improve_is_not_used(home, tmp_path):
     rewrite_manifest(folder, used=True)
     agent = ActivePerception.from_pretrained(folder)
     assert isinstance(agent.searching.observer, Target)
-    assert isinstance(agent.exploring.observer, LearnedMap)
+    assert isinstance(agent.exploring.observer, SemanticMap)
     assert agent.exploring.policy.name == "closer-look"
     given = SearchConfig(models=folder, policies=("recommended", "random"))
     assert with_models(given).policies == ("target-evidence", "random")
     rewrite_manifest(folder, used=False)
     agent = ActivePerception.from_pretrained(folder)
-    for strategy, policy in ((agent.searching, "non-predictive"), (agent.exploring, "random")):
-        assert isinstance(strategy.observer, Semantic)
-        assert strategy.observer.observation is None
-        assert strategy.observer.tempering == 1
-        assert strategy.observer.footprint == "overlap"
-        assert strategy.policy.name == policy
+    observer = agent.searching.observer
+    assert isinstance(observer, Semantic)
+    assert observer.observation is None
+    assert observer.tempering == 1
+    assert observer.footprint == "overlap"
+    assert agent.searching.policy.name == "non-predictive"
+    # Maps take raw scores, where these were better, without another part.
+    assert isinstance(agent.exploring.observer, SemanticMap)
     given = SearchConfig(models=folder, policies=("recommended", "target-evidence"))
     assert with_models(given).policies == ("non-predictive-raw", "target-evidence")
-    assert with_models(ExploreConfig(models=folder, policies=("recommended",))).policies == ("random-raw",)
+    (explored,) = with_models(ExploreConfig(models=folder, policies=("recommended",))).policies
+    assert (explored.policy, explored.scores) == ("closer-look", "learned")
 
 
 def photograph_with(colour, place):
@@ -541,14 +543,14 @@ def test_fitting_from_python_returns_the_agent_of_the_folder(home, tmp_path):
     root = home / "photographs"
     agent = semfov.fit_detector(
         home / "colours.onnx", root, root / "instances.json", out=tmp_path / "out", limit=6, columns=4, rows=4,
-        holdout=3, steps=3, map_steps=3, cache=home / "cache", threshold=0.05,
+        holdout=3, steps=3, cache=home / "cache", threshold=0.05,
     )  # fmt: skip
     assert agent.eye.detector.selection.threshold == 0.05
     assert Manifest.read(tmp_path / "out").training["photographs"] == 6
     # Three training steps hardly improve on raw scores; the agent uses only the parts that improved.
     folder = ModelFolder(tmp_path / "out")
     assert isinstance(agent.searching.observer, Target) == folder.used("evidence")
-    assert (agent.exploring.policy.name == "closer-look") == folder.used("map")
+    assert agent.exploring.policy.name == "closer-look"
 
 
 def test_fitting_uses_targets_of_all_sizes():

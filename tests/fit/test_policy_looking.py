@@ -20,7 +20,6 @@ from semfov import (
     observers,
     policies,
 )
-from semfov.belief import MapEvidence
 from semfov.fit import policy_looking
 from semfov.fit.policy_looking import (
     _belief_settings,
@@ -56,7 +55,7 @@ def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
 
 @pytest.mark.parametrize("task", ["search", "exploration"])
 def test_policies_with_equal_settings_of_the_belief_have_equal_observers(task, model):
-    models = {"observation": model, "evidence": TargetEvidence(components=3), "map": MapEvidence(components=3)}
+    models = {"observation": model, "evidence": TargetEvidence(components=3), "map": model}
     models["fitted"] = model
     seen = {}
     for name in presets(task):
@@ -83,7 +82,7 @@ def test_policies_that_do_not_depend_on_the_belief_value_cells_alike_for_any(nam
 
 
 def test_prediction_calibration_and_misses_need_an_observation_model(model):
-    every = {"evidence": TargetEvidence(components=3), "map": MapEvidence(components=3), "observation": model}
+    every = {"evidence": TargetEvidence(components=3), "map": model, "observation": model}
 
     def needs_model(belief, *choices, task="search"):
         asked = set()
@@ -104,19 +103,19 @@ def test_prediction_calibration_and_misses_need_an_observation_model(model):
     assert all(needs_model(None, PolicyConfig(name)) for name in ahead)
     without = {"random", "closer-look", "saliency", "expected-gain"}
     for name in policies.policy_names("exploration"):
-        scores = "learned" if name == "expected-gain" else "raw"
-        given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
+        given = PolicyConfig(name, saliency="vocus2" if name == "saliency" else None)
         assert needs_model(None, given, task="exploration") == (name not in without)
 
 
 def test_models_are_loaded_by_the_names_in_the_settings(monkeypatch):
     monkeypatch.setattr(policy_looking, "make_observation", lambda name, eye: ("observation", name))
+    monkeypatch.setattr(policy_looking, "make_map", lambda name, eye: ("map", name))
     monkeypatch.setattr(policy_looking, "make_learned", lambda kind, name, eye: (kind, name))
     belief = BeliefConfig(model="mine", target_model="sought", map_model="everything")
     assert [_load(name, belief, SimpleNamespace()) for name in ("observation", "evidence", "map")] == [
         ("observation", "mine"),
         (TargetEvidence, "sought"),
-        (MapEvidence, "everything"),
+        ("map", "everything"),
     ]
 
 

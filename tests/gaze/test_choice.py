@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, MapEvidence, acquisition
+from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
 from semfov.fit.examples import _Exploratory
 from semfov.gaze import Viewer
 from semfov.gaze.acquisition import FUNCTIONS, AcquisitionFunction
@@ -198,22 +198,11 @@ def model():
     return model.requires_grad_(False)
 
 
-@pytest.fixture
-def mapping():
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return MapEvidence(4, 4, components=3).requires_grad_(False)
-
-
 OWN = {name for name, kind in FUNCTIONS.items() if kind.__module__.startswith("semfov.")}
 """Functions of the package; others may be registered."""
 
 
-def model_for(name, model, mapping):
-    return mapping if FUNCTIONS[name].needs_map else model
-
-
-@pytest.mark.parametrize("name", sorted(OWN - {"expected-gain", "saliency"}))
+@pytest.mark.parametrize("name", sorted(OWN - {"saliency"}))
 def test_a_policy_makes_its_acquisition_function(name, model):
     beta = 0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1))
     given = {"target": 1, "model": model, "grid": SCENE}
@@ -221,7 +210,7 @@ def test_a_policy_makes_its_acquisition_function(name, model):
     assert torch.equal(values_of(Policy(name, model)(1, SCENE), beta), values_of(expected, beta))
 
 
-def test_settings_reach_the_function(model, mapping):
+def test_settings_reach_the_function(model):
     beta = 0.5 + torch.rand(1, 12, 3, generator=torch.Generator().manual_seed(1))
     for made, expected in [
         (Policy("kl", model, prior=2.0), acquisition.KLDivergence(model, SCENE, prior=2.0)),
@@ -229,9 +218,6 @@ def test_settings_reach_the_function(model, mapping):
         (Policy("neighbourhood", model, sigma=2.0), acquisition.NeighbourhoodPosterior(1, model, SCENE, sigma=2.0)),
     ]:
         assert torch.equal(values_of(made(1, SCENE), beta), values_of(expected, beta))
-    policy = Policy("expected-gain", mapping)
-    assert policy.model is mapping
-    assert policy(None, SCENE).model is mapping
     refused("unknown setting of policy 'kl' 'prio'; did you mean 'prior'", Policy, "kl", model, prio=1.0)
     for options in ({"prior": None}, {"prior": "high"}):
         with pytest.raises(InputError, match="policy 'kl': expected values that fit model, grid, prior, got others"):
@@ -251,11 +237,11 @@ def test_every_named_function_is_public():
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_models_are_submodules_of_the_policy(name, model, mapping):
+def test_models_are_submodules_of_the_policy(name, model):
     """They are in its state dict, and change dtype with it."""
-    policy, part = Policy(name, model_for(name, model, mapping)), model_for(name, model, mapping)
+    policy = Policy(name, model)
     needed = "model" in FUNCTIONS[name].takes
-    assert list(policy.state_dict()) == ([f"model.{name}" for name in part.state_dict()] if needed else [])
+    assert list(policy.state_dict()) == ([f"model.{name}" for name in model.state_dict()] if needed else [])
     policy.double()
     moved = [tensor.dtype for tensor in policy.state_dict().values() if tensor.is_floating_point()]
     assert set(moved) <= {torch.float64}
@@ -286,8 +272,7 @@ def test_a_missing_model_is_an_error_when_the_policy_is_made():
         if "model" not in kind.takes:
             Policy(name)
             continue
-        needed = "a learned map" if kind.needs_map else "an observation model"
-        refused(f"policy '{name}': expected {needed}, got none", Policy, name)
+        refused(f"policy '{name}': expected an observation model, got none", Policy, name)
 
 
 @pytest.mark.parametrize("name", sorted(OWN & set(policy_names("search")) - {"random", "saliency"}))

@@ -1,5 +1,6 @@
 """Acquisition functions that look ahead, by an observation model, against loops and integrals."""
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -14,18 +15,15 @@ from semfov import (
     FovealObservationModel,
     Grid,
     InputError,
-    MapEvidence,
-    TargetEvidence,
     acquisition,
     dirichlet,
     fusion,
     policies,
 )
-from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.belief.observers import SemanticMap
 from semfov.fit.policy_looking import _make_strategy
 from semfov.gaze.acquisition import (
     BayesianSurprise,
-    CloserLook,
     ExpectedAccuracy,
     ExpectedGain,
     KLDivergence,
@@ -34,11 +32,13 @@ from semfov.gaze.acquisition import (
     TwoPeaks,
     UpperConfidenceBound,
 )
+from semfov.gaze.acquisition.accuracy import _CORRECTED
 from semfov.gaze.acquisition.lookahead import look_ahead_by_samples, sampled_likelihoods
 from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, PolicyConfig
 from semfov.runs.presets import label, presets, resolve
 from semfov.strategy import Strategy
+from tests import small
 from tests.refusals import refused
 from tests.small import draw, rand, values_of
 
@@ -47,12 +47,7 @@ GRID, CELLS = Grid(5, 4, (50, 40)), Grid(4, 3, (80, 60))
 
 @pytest.fixture
 def model():
-    generator = torch.Generator().manual_seed(1)
-    model = MapEvidence(5, 4, components=4)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.copy_(0.6 * torch.randn(parameter.shape, generator=generator))
-    return model.requires_grad_(False).eval()
+    return small.model().requires_grad_(False)
 
 
 def belief_of(model, dtype=torch.float32, device=None):
@@ -62,7 +57,7 @@ def belief_of(model, dtype=torch.float32, device=None):
     boxes = torch.cat([corner, corner + 3 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
     scores = (3 * torch.rand(3, 4, 4, generator=generator)).softmax(-1)
     seen = Detections(boxes.to(device, dtype), scores.to(device, dtype), torch.ones(3, 4, dtype=bool, device=device))
-    observer = LearnedMap(model)
+    observer = SemanticMap(model)
     belief, visited = observer.start(3, GRID, seen.scores), torch.zeros(3, 20, dtype=torch.bool, device=device)
     for cells in ([0, 7, 19], [4, 8, 2]):
         belief = observer(belief, seen, GRID.centres[cells].to(seen.boxes), GRID)
@@ -73,36 +68,30 @@ def belief_of(model, dtype=torch.float32, device=None):
 def test_gain_is_summed_over_all_cells(model, dtype, device):
     model = model.to(device, dtype)
     belief, visited = belief_of(model, dtype, device)
-    acquisition = ExpectedGain(model, GRID).to(device)
-    got = acquisition(belief, visited)
+    got = ExpectedGain(GRID, 0.2).to(device)(belief, visited)
     assert got.shape == (3, 20)
     assert got.dtype == dtype
     assert got.device.type == device.type
     for episode in range(3):
-        one = belief[episode : episode + 1]
         for fixation in range(20):
-            distance = GRID.distance(GRID.centres[fixation])[None].to(one.closest)
-            gains = model.gain(one.probabilities, one.closest, one.looks, distance)[0, 0]
             total = 0.0
-            for cell, told in enumerate(gains):
-                nearer = float(distance[0, cell]) < float(one.closest[0, cell]) - 1e-6
-                assert nearer == (float(told) != 0)
-                total += float(told)
+            for cell in range(20):
+                now = math.dist(GRID.centres[cell].tolist(), GRID.centres[fixation].tolist()) / 50
+                before = float(belief.closest[episode, cell])
+                wrong = 1 - float(belief.class_probabilities()[episode, cell].max())
+                sharper = math.exp(-max(now / 0.2 - 1, 0)) - math.exp(-max(before / 0.2 - 1, 0))
+                total += _CORRECTED * wrong * max(sharper, 0)
             assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-4)
     # A second look at the same cell gains nothing.
-    assert not got[visited].any()
-    assert bool((got[~visited] != 0).all())
+    assert float(got[visited].abs().max()) < 1e-6
 
 
-def test_other_beliefs_are_refused_but_closer_look_takes_a_learned_map(model):
-    acquisition, visited = ExpectedGain(model, GRID), torch.zeros(1, 20, dtype=torch.bool)
-    like = torch.empty(0)
-    for observer in (Semantic(4), Target(TargetEvidence(4, 4, components=4))):
-        belief = observer.start(1, GRID, like)
-        refused(f"belief: expected MapBelief, got {type(belief).__name__}", acquisition, belief, visited)
-    belief, visited = belief_of(model)
-    shares = DirichletBelief(belief.probabilities, belief.closest)
-    torch.testing.assert_close(CloserLook(GRID, 0.2)(belief, visited), CloserLook(GRID, 0.2)(shares, visited))
+def test_before_the_first_look_every_cell_gains():
+    belief = DirichletBelief(torch.ones(1, 20, 4))
+    got = ExpectedGain(GRID, 10.0)(belief, torch.zeros(1, 20, dtype=torch.bool))
+    # A fovea as wide as the image sees all cells.
+    torch.testing.assert_close(got, torch.full((1, 20), 20 * 0.75 * _CORRECTED))
+    refused("fovea: expected a positive number", ExpectedGain, GRID, 0.0)
 
 
 LEARNED = {
@@ -121,15 +110,11 @@ DIRICHLET = ("kl", "negative-entropy", "surprise", "two-peaks")
     ("task", "policy", "scores", "expected"),
     [
         *(("exploration", policy, "learned", "expected 'raw' or 'calibrated' for policy") for policy in DIRICHLET),
-        *(
-            ("exploration", "expected-gain", scores, "expected 'learned' for policy")
-            for scores in ("raw", "calibrated")
-        ),
         *(("search", policy, "learned", ".*") for policy in ("random", "non-predictive", "target-evidence")),
     ],
 )
 def test_policies_refuse_scores_of_another_belief(task, policy, scores, expected):
-    """Policies for Dirichlet beliefs need an observation model or a Dirichlet belief; a learned map has neither."""
+    """Policies that predict looks need the model that the scores of the belief are calibrated by."""
     refused(f"^scores: {expected} ?'{policy}', got '{scores}'", resolve, PolicyConfig(policy, scores), task)
     if task == "exploration":
         assert f"{policy}-{scores}" not in presets(task)
@@ -146,16 +131,15 @@ def test_settings_of_another_belief_are_refused(policy, setting):
         resolve(PolicyConfig(own.policy, "learned", saliency=own.saliency, **setting), "exploration")
 
 
-def test_strategies_of_learned_maps(model):
+def test_strategies_of_semantic_maps(model):
     def strategy(name, **models):
         return _make_strategy(resolve(name, "exploration"), "exploration", BeliefConfig(), 4, models.__getitem__, 0.15)
 
     for name, policy in LEARNED.items():
         made = strategy(name, map=model)
         assert isinstance(made, Strategy)
-        assert isinstance(made.observer, LearnedMap)
+        assert isinstance(made.observer, SemanticMap)
         assert made.observer.model is model
-        assert not made.observer.together
         assert made.policy.name == policy.policy
         with pytest.raises(KeyError, match="map"):
             strategy(name, observation=FovealObservationModel.identity(["a", "b", "c"], [0.2]))
@@ -164,8 +148,8 @@ def test_strategies_of_learned_maps(model):
 
 def test_a_grid_in_double_precision_works_with_a_belief_in_single_precision(model):
     belief, visited = belief_of(model)
-    wide = ExpectedGain(model, Grid(5, 4, torch.tensor([50.0, 40.0], dtype=torch.float64)))
-    torch.testing.assert_close(wide(belief, visited), ExpectedGain(model, GRID)(belief, visited))
+    wide = ExpectedGain(Grid(5, 4, torch.tensor([50.0, 40.0], dtype=torch.float64)))
+    torch.testing.assert_close(wide(belief, visited), ExpectedGain(GRID)(belief, visited))
 
 
 class Model:

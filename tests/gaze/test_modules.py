@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from semfov import DirichletBelief, acquisition, policies, saliency
-from semfov.belief.observers import LearnedMap
 from tests.base_tester import GraphTester, TensorTester, make_testers
-from tests.small import GRID, detections, look, mapping, memory, model, rand
+from tests.small import GRID, memory, model, rand
 
 
 class AcquisitionTester(GraphTester):
@@ -39,6 +38,7 @@ def functions(target, model, values):
         "UpperConfidenceBound": lambda: a.UpperConfidenceBound(model(), GRID),
         "ProbabilityOfImprovement": lambda: a.ProbabilityOfImprovement(model(), GRID),
         "ExpectedAccuracy": lambda: a.ExpectedAccuracy(model(), GRID),
+        "ExpectedGain": lambda: a.ExpectedGain(GRID),
         "CloserLook": lambda: a.CloserLook(GRID),
         "Static": lambda: a.Static(values),
         "Uniform": a.Uniform,
@@ -70,24 +70,6 @@ class TestCorrectLocalisation(AcquisitionTester, TensorTester):
         return acquisition.CorrectLocalisation(2, model(), GRID, nodes=8)
 
 
-class TestExpectedGain(GraphTester):
-    """After one look."""
-
-    batched = (0, 1, 2)
-
-    def make(self):
-        return acquisition.ExpectedGain(mapping(), GRID)
-
-    def inputs(self):
-        return look()
-
-    @staticmethod
-    def call(module, scores, boxes, fixation):
-        mapper = LearnedMap(module.model)
-        belief = mapper(mapper.start(len(scores), GRID, scores), detections(scores, boxes), fixation, GRID)
-        return module(belief, belief.visited)
-
-
 class PolicyTester(AcquisitionTester):
     """Values that a policy's acquisition function gives for a belief; that function has the other tests."""
 
@@ -109,23 +91,12 @@ class TestPolicyCorrectLocalisation(TensorTester):
 
 
 for kind in (each for each in acquisition.FUNCTIONS.values() if each.__module__.startswith("semfov.")):
-    if kind not in (acquisition.CorrectLocalisation, acquisition.Static) and not kind.needs_map:
+    if kind not in (acquisition.CorrectLocalisation, acquisition.Static):
         made = {f"Policy{kind.__name__}": lambda kind=kind: policies.Policy(kind, model().requires_grad_(False))}
         globals().update(make_testers(PolicyTester, made))
 
 
 globals().update(make_testers(PolicyTester, {"Policy": lambda: policies.Policy("saliency", values=rand(len(GRID)))}))
-
-
-class TestPolicyExpectedGain(PolicyTester):
-    inputs = TestExpectedGain.inputs
-
-    def make(self):
-        return policies.Policy("expected-gain", mapping())
-
-    @staticmethod
-    def call(module, scores, boxes, fixation):
-        return TestExpectedGain.call(module(None, GRID), scores, boxes, fixation)
 
 
 class TestFixationDensity(GraphTester):

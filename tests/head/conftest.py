@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from semfov import Eye, Foveation, MapEvidence, TargetEvidence
+from semfov import Eye, FovealObservationModel, Foveation, TargetEvidence
 from tests.small import Tiles
 
 
@@ -19,7 +19,9 @@ def eye():
 @pytest.fixture
 def models():
     torch.manual_seed(0)
-    return TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)
+    # Its map is in doubt about cells without detections, so that some looks in a view pay.
+    observation = FovealObservationModel.identity(["red", "green", "blue"], [0.2], cell=(0.4, 1.0, 1.0))
+    return TargetEvidence(components=4).requires_grad_(False), observation.requires_grad_(False)
 
 
 @pytest.fixture

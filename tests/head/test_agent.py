@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from examples.pan_tilt import SimulatedCamera
 from semfov import ActivePerception, Detections, Eye, Flat, Foveation, HeadAgent, Panorama
 from semfov.agents.head import _decide_look
-from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers import SemanticMap, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.examples import example
 from semfov.gaze.policies import Policy
@@ -226,7 +226,7 @@ def test_a_search_ends_when_no_cell_is_worth_a_look(agent, panorama):
 def test_the_agent_for_any_picture_finds_all_classes_with_a_head(agent, panorama):
     strategies = (
         (Target(agent.target_evidence), Policy("non-predictive")),
-        (LearnedMap(agent.map_evidence), Policy("random")),
+        (SemanticMap(agent.observation), Policy("random")),
     )
     whole = ActivePerception(agent.eye, *strategies)
     path = whole.find_all(Panorama(panorama), passes=2)
@@ -467,7 +467,7 @@ def test_the_record_of_a_camera_shows_what_it_saw_and_is_stored(agent, panorama,
 def test_one_agent_takes_scenes_files_and_cameras(eye, models, panorama, tmp_path):
     """The kind of look follows from the picture; the record is that of the part of the agent that turns a head."""
     one = ActivePerception(
-        eye, (Target(models[0]), Policy("non-predictive")), (LearnedMap(models[1]), Policy("random"))
+        eye, (Target(models[0]), Policy("non-predictive")), (SemanticMap(models[1]), Policy("random"))
     ).eval()
     head = HeadAgent(eye, *models).eval()
     file = tmp_path / "around.png"

@@ -13,7 +13,8 @@ from torch.nn import functional as F
 from eval.head.run import _rests_on
 from eval.head.scan import Scan
 from semfov import EmbeddedScenes, Panorama, TargetEvidence, rollout
-from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers import SemanticMap, Target
+from semfov.gaze.acquisition.accuracy import _CORRECTED
 from semfov.gaze.choice import Given
 from semfov.head import ExploreGain, Flat, Panoramas, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
@@ -196,9 +197,9 @@ def test_the_head_stays_if_turning_is_expensive_and_turns_if_it_is_cheap(views, 
 
 
 def test_explore_gain_equals_brute_force(views, eye, models):
-    model, pose = models[1], pose_ahead(views)
-    belief = episode(views, eye, SceneObserver(LearnedMap(model), views), [pose * 100 + 55, pose * 100 + 11])[-1]
-    gains = ExploreGain(views, model, 0.2)(belief, pose, [pose, 0])
+    pose = pose_ahead(views)
+    belief = episode(views, eye, SceneObserver(SemanticMap(models[1]), views), [pose * 100 + 55, pose * 100 + 11])[-1]
+    gains = ExploreGain(views, 0.2)(belief, pose, [pose, 0])
     area, fovea = views.world.area, 100 / 640
     for action, allowed in ((pose * 100 + 3, True), (22, True), (3, False)):
         if not allowed:
@@ -211,8 +212,9 @@ def test_explore_gain_equals_brute_force(views, eye, models):
             if belief.owner[0, x] < 0:
                 value += float(area[x]) * 0.2 / (1 + float(distance) / fovea)
             else:
-                inputs = belief.class_probabilities()[:, x : x + 1], belief.closest[:, x : x + 1], belief.looks
-                value += float(area[x] * model.gain(*inputs, distance[None, None, None])[0, 0, 0])
+                wrong = 1 - float(belief.class_probabilities()[0, x].max())
+                now, before = (math.exp(-max(float(each) / fovea - 1, 0)) for each in (distance, belief.closest[0, x]))
+                value += float(area[x]) * _CORRECTED * wrong * max(now - before, 0)
         assert float(gains[action]) == pytest.approx(value, rel=1e-3, abs=1e-4)
 
 
@@ -221,7 +223,7 @@ def test_what_was_seen_fades_by_the_seconds_that_pass(views, eye, models, model)
     """By hand: log odds, or logarithms of all classes, of cells that the later looks do not show."""
     views.world.rate = 0.2
     speeds = views.world.speeds
-    inner = Target(models[0]) if model == 0 else LearnedMap(models[1])
+    inner = Target(models[0]) if model == 0 else SemanticMap(models[1])
     observer = SceneObserver(inner, views, prior=None if model else 0.03)
     order = [pose_ahead(views), views.tiling[1][5]]
     steps = look_around(

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semfov import Detections, Eye, Flat, Foveation, HeadAgent, Panorama
-from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers import SemanticMap, Target
 from semfov.head import ExploreGain, PanTiltCamera, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.closer import CloserLooks
@@ -117,8 +117,8 @@ def test_a_box_is_shown_by_the_narrowest_field_that_has_room_for_it(speck, model
 
 def test_no_more_than_a_handful_is_offered_and_no_place_twice(speck, models):
     views = Views(Panorama(speck, fields=FIELDS))
-    map_gain = ExploreGain(views, models[1])
-    observer = SceneObserver(LearnedMap(models[1]), views)
+    map_gain = ExploreGain(views)
+    observer = SceneObserver(SemanticMap(models[1]), views)
     action = views.ahead
     point = views.grid.centres[action][None]
     detections = boxes_in_view(*[6.0] * 6)

@@ -5,13 +5,13 @@ from functools import cache
 import torch
 
 from semfov import Eye, Foveation, HeadAgent
-from semfov.belief.observers import LearnedMap, Target
+from semfov.belief.observers import SemanticMap, Target
 from semfov.head import ExploreGain, Panorama, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.views import Views
 from semfov.settings import ExploreSettings
 from tests.base_tester import BaseTester
-from tests.small import Blobs, detections, evidence, look, mapping, rand
+from tests.small import Blobs, detections, evidence, look, model, rand
 
 
 @cache
@@ -56,11 +56,12 @@ class TestSearchGain(SceneTester):
 
 class TestExploreGain(SceneTester):
     def make(self):
-        return ExploreGain(views(), mapping())
+        return ExploreGain(views())
 
     @staticmethod
     def call(module, scores, boxes):
-        return module(SceneTester.seen(SceneObserver(LearnedMap(module.model), views()), scores, boxes), 0, [0, 1])
+        mapper = SceneObserver(SemanticMap(model().requires_grad_(False)), views())
+        return module(SceneTester.seen(mapper, scores, boxes), 0, [0, 1])
 
 
 class TestPerSecond(SceneTester):
@@ -77,7 +78,7 @@ class TestHeadAgent(BaseTester):
     on_cpu = True
 
     def make(self):
-        return HeadAgent(Eye(Foveation(20.0), Blobs()), evidence(), mapping()).eval().requires_grad_(False)
+        return HeadAgent(Eye(Foveation(20.0), Blobs()), evidence(), model()).eval().requires_grad_(False)
 
     def inputs(self):
         return (rand(3, 60, 120),)

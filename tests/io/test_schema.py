@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from semfov import DataError, DirichletStatistics, FovealObservationModel, InputError, TargetEvidence
-from semfov.belief import MapEvidence, Verification
+from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.io import storage
 from semfov.io.pretrained import PretrainedForEye
@@ -27,10 +27,6 @@ def observation():
 
 def evidence():
     return TargetEvidence(3, 2, components=3, thresholds=Thresholds(0.83, 0.05), metadata=METADATA)
-
-
-def everything():
-    return MapEvidence(3, 2, components=3, metadata=METADATA)
 
 
 def glimpses():
@@ -56,7 +52,7 @@ def seeded(make):
     return made
 
 
-EVERY = (observation, evidence, everything, glimpses, verification)
+EVERY = (observation, evidence, glimpses, verification)
 MODELS = {make.__name__: seeded(make) for make in EVERY}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 

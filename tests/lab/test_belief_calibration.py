@@ -10,8 +10,8 @@ from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrati
 from eval.calibration.beliefs_report import _add_up, _curves, _landing_table, _pooled, write_belief_report
 from eval.calibration.sums import AddedSums
 from eval.search.run import SearchConfig
-from semfov import FovealObservationModel, InputError, MapEvidence, TargetEvidence, rollout
-from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov import FovealObservationModel, InputError, TargetEvidence, rollout
+from semfov.belief.observers import Semantic, SemanticMap, Target
 from semfov.episode import StoredLooks
 from semfov.fit.protocols import choose_classes
 from semfov.gaze.acquisition import TargetPosterior
@@ -23,7 +23,7 @@ from semfov.runs.setup import make_eye
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 
-BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
+BELIEFS = ["raw", "calibrated", "tempered", "learned", "semantic map"]
 
 
 def write_models(folder):
@@ -31,9 +31,8 @@ def write_models(folder):
     settings = make_eye(DetectorConfig(), SensorConfig()).settings()
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        for kind, name in ((TargetEvidence, "target"), (MapEvidence, "map")):
-            kind(8, 6, metadata=settings).save(folder / f"{name}.safetensors")
-    return {f"{name}_model": str(folder / f"{name}.safetensors") for name in ("target", "map")}
+        TargetEvidence(8, 6, metadata=settings).save(folder / "target.safetensors")
+    return {"target_model": str(folder / "target.safetensors"), "map_model": "yolox-nano"}
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,7 @@ def probabilities_along(run, target, path, detections, grid):
         "calibrated": Semantic(81, model),
         "tempered": Semantic(81, tempering=0.5),
         "learned": Target(run.models.evidence),
-        "learned map": LearnedMap(run.models.map),
+        "semantic map": SemanticMap(run.models.map),
     }
     probabilities = {}
     for name, observer in observers.items():
@@ -134,21 +133,17 @@ def test_sums_match_beliefs_updated_step_by_step(run):
 
 @pytest.mark.slow
 def test_a_belief_is_left_out_when_its_model_is_not_shipped(config, run, tmp_path, monkeypatch):
-    for kind in (TargetEvidence, MapEvidence):
-        monkeypatch.setattr(kind, "shipped", tmp_path)
+    monkeypatch.setattr(TargetEvidence, "shipped", tmp_path)
     bare = BeliefCalibrationRun(replace(config, belief=BeliefConfig(columns=4, rows=3), out=tmp_path))
-    assert list(bare.observers) == BELIEFS[:3]
+    assert list(bare.observers) == [*BELIEFS[:3], "semantic map"]
     assert bare.guide == "tempered"
     assert bare.key != run.key
     finish(bare, "believing")
     text, written = write_belief_report(bare)
     assert all(path.stat().st_size > 200 for path in written)
-    for name, title in (("learned", "target evidence"), ("learned map", "map evidence")):
-        assert (
-            f"Left out because no fitted model is shipped: {name} (detector: no model of {title} is shipped for" in text
-        )
+    assert "Left out because no fitted model is shipped: learned (detector: no model of target evidence is" in text
     assert "The tempered belief guides the gaze" in text
-    with pytest.raises(InputError, match="unknown model of map evidence 'mine'"):
+    with pytest.raises(InputError, match="unknown observation model 'mine'"):
         BeliefCalibrationRun(replace(config, belief=replace(config.belief, map_model="mine")))
 
 

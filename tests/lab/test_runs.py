@@ -16,8 +16,8 @@ from eval.explore import report as explore_report
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import report as search_report
 from eval.search.run import SearchConfig, SearchRun
-from semfov import ActivePerception, MapEvidence, rollout
-from semfov.belief.observers import LearnedMap
+from semfov import ActivePerception, FovealObservationModel, rollout
+from semfov.belief.observers import SemanticMap
 from semfov.fit import protocols
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 from tests.refusals import refused
@@ -235,7 +235,7 @@ def test_a_replayed_semantic_search_has_the_original_beliefs_and_values(run, sea
 def test_a_replayed_search_by_target_evidence_also_has_the_recommended_map(run, searched):
     records, steps = searched[SOUGHT]
     looks, grid = run.detections(0), run.grid(0)
-    mapper = LearnedMap(MapEvidence.from_pretrained(run.eye.detector.name))
+    mapper = SemanticMap(FovealObservationModel.from_pretrained(run.eye.detector.name))
     for number, record in enumerate(records):
         path = replay(run, 0, record)
         assert path.seconds == (), "from the store it takes no time"

@@ -28,7 +28,7 @@ from eval.zoom.objects import (
 from eval.zoom.orders import in_order, quad_tree, shuffled
 from eval.zoom.report import recall_and_precision, recall_cells
 from eval.zoom.run import ZoomConfig, ZoomRun
-from semfov import MapEvidence, TargetEvidence
+from semfov import FovealObservationModel, TargetEvidence
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Detections, Objects
 from semfov.head.views import Views
@@ -73,8 +73,10 @@ def config(request, tmp_path, monkeypatch):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles())
     monkeypatch.setattr("eval.head.run.make_scenes", lambda data, classes: NoiseScenes())
     torch.manual_seed(0)
-    models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)
-    monkeypatch.setattr("eval.head.run.make_learned", lambda kind, name, eye: {type(m): m for m in models}[kind])
+    evidence = TargetEvidence(components=4).requires_grad_(False)
+    observation = FovealObservationModel.identity(["red", "green", "blue"], [0.2]).requires_grad_(False)
+    monkeypatch.setattr("eval.head.run.make_learned", lambda kind, name, eye: evidence)
+    monkeypatch.setattr("eval.head.run.make_map", lambda name, eye: observation)
     return HeadConfig(
         scene=request.param,
         scenes=2,

@@ -53,7 +53,7 @@ def test_agents_are_those_of_the_package(kind):
     agent = load("agent", kind=kind, **options)
     assert type(agent.searching.observer) is observer
     assert agent.searching.policy.name == search
-    assert type(agent.exploring.observer) is (observers.LearnedMap if kind == "recommended" else observers.Semantic)
+    assert type(agent.exploring.observer) is (observers.SemanticMap if kind == "recommended" else observers.Semantic)
     assert agent.exploring.policy.name == explore
     assert (agent.columns, agent.rows) == options.get("grid", (10, 10))
 

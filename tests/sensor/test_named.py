@@ -149,7 +149,7 @@ def test_the_levels_of_a_multi_scale_fovea_are_its_scales(home):
 
 
 def test_a_folder_of_models_keeps_its_sensor(home, tmp_path):
-    small = ["--columns", "3", "--rows", "2", "--holdout", "2", "--steps", "4", "--map_steps", "5", "--fixations", "3"]
+    small = ["--columns", "3", "--rows", "2", "--holdout", "2", "--steps", "4", "--fixations", "3"]
     arguments = given(home, "models", *small, "--judged", "2", "--sensor.settings.fovea", "80")
     assert command(["fit", str(home / "colours.onnx"), *arguments]) == 0
     folder = ModelFolder(home / "models")

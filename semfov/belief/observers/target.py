@@ -19,7 +19,7 @@ from semfov.errors import InputError
 
 @dataclass(frozen=True)
 class TargetLook(EvidenceLook):
-    """Evidence of looks about one class, which is not that of a learned map about one."""
+    """Evidence of looks about one class, which is not a row of a map."""
 
 
 @dataclass(frozen=True)

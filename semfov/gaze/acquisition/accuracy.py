@@ -2,14 +2,15 @@
 
 from torch import Tensor
 
-from semfov.belief import Grid, MapEvidence
+from semfov.belief import Grid
 from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
-from semfov.belief.observers.base import own
-from semfov.belief.observers.learned_map import MapBelief
-from semfov.errors import InputError, check_shape
+from semfov.errors import InputError, check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.acquisition.closer_look import acuity
 from semfov.gaze.acquisition.lookahead import at_levels
 from semfov.observation.foveal import FovealObservationModel
+
+_CORRECTED = 0.3  # c, fitted by least squares to explorations of photographs
 
 
 class ExpectedAccuracy(AcquisitionFunction):
@@ -74,40 +75,58 @@ class ExpectedAccuracy(AcquisitionFunction):
 class ExpectedGain(AcquisitionFunction):
     r"""Expected number of additional cells that the map classifies correctly after a look, :math:`E[\Delta \mid f]`.
 
-    `MapEvidence.gain` predicts the gain of each cell, and this is the sum over the cells. The prediction was learned
-    from looks of explorations: a cell gains by a closer look, and gains more where the map is less certain. An
-    exploration can end when no cell is expected to gain more than a look costs
-    (`semfov.ActivePerception.explore(min_gain=...)`).
+    .. math:: a(f) = c \sum_x \bigl(1 - \max_k p_k(x)\bigr) \bigl[v(d(x, f)) - v(d^*(x))\bigr]_+
+
+    The map is wrong in a cell with probability :math:`1 - \max_k p_k`, background included. A look corrects a share c
+    of the wrong cells where it adds a full acuity v to that of their closest look (`CloserLook`). An exploration can
+    end when no look is expected to gain more than it costs (`semfov.ActivePerception.explore(min_gain=...)`).
 
     Args:
-        model: the model that the map is learned with.
         grid: the cells of one image.
+        fovea: width of the fovea in units of the image's longer side (100 px of 640 by default).
 
-    >>> from semfov.belief.observers import LearnedMap
+    Raises:
+        InputError: `fovea` is not positive.
+
     >>> import torch
-    >>> model = MapEvidence(components=3).requires_grad_(False)
-    >>> grid = Grid(3, 1, (30, 10))
-    >>> belief = LearnedMap(model).start(1, grid, torch.zeros(1))
-    >>> ExpectedGain(model, grid)(belief, torch.zeros(1, 3, dtype=torch.bool)).shape
-    torch.Size([1, 3])
+    >>> from semfov import DirichletBelief
+    >>> belief = DirichletBelief(torch.ones(1, 3, 4), torch.tensor([[0.0, 1 / 3, 2 / 3]]))
+    >>> ExpectedGain(Grid(3, 1, (90, 30)))(belief, torch.tensor([[True, False, False]])).argmax()
+    tensor(1)
     """
 
     name = "expected-gain"
     tasks = ("exploration",)
-    needs_map = True
     distance: Tensor
 
-    def __init__(self, model: MapEvidence, grid: Grid) -> None:
+    def __init__(self, grid: Grid, fovea: float = 100 / 640) -> None:
         super().__init__()
-        self.model = model
+        check(fovea > 0, "fovea", "a positive number", fovea)
+        self.fovea = fovea
         self.register_buffer("distance", grid.cell_distance)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Compute values `(B, X·Y)`, in cells, for a belief of `semfov.observers.LearnedMap`."""
-        learned = own(belief, MapBelief, "belief")
-        distance = self.distance.to(learned.closest)
+        """Compute values `(B, X·Y)`, in cells, for a belief about all classes, which knows each cell's closest look."""
+        distance = self.distance.to(belief.closest)
 
-        def gain(probabilities: Tensor, closest: Tensor, looks: Tensor) -> Tensor:
-            return self.model.gain(probabilities, closest, looks, distance).sum(-1)
+        def gain(probabilities: Tensor, closest: Tensor) -> Tensor:
+            return corrected_cells(probabilities, closest, distance, self.fovea).sum(-1)
 
-        return one_by_one(gain, learned.probabilities, learned.closest, learned.looks)
+        return one_by_one(gain, belief.class_probabilities(), belief.closest)
+
+
+def corrected_cells(probabilities: Tensor, closest: Tensor, distance: Tensor, fovea: float) -> Tensor:
+    """Compute the terms of `ExpectedGain`, how probable it is that a look corrects each cell.
+
+    Args:
+        probabilities: `(B, X·Y, K+1)`, class probabilities of a map.
+        closest: `(B, X·Y)`, from each cell to its closest fixation so far, in longer sides of the image.
+        distance: `(F, X·Y)`, from each of F possible fixations to every cell.
+        fovea: width of the fovea, in the same unit.
+
+    Returns:
+        `(B, F, X·Y)`.
+    """
+    wrong = 1 - probabilities.amax(-1)
+    sharper = (acuity(distance, fovea) - acuity(closest, fovea)[:, None]).clamp(min=0)
+    return _CORRECTED * wrong[:, None] * sharper

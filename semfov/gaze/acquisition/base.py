@@ -69,7 +69,6 @@ class AcquisitionFunction(nn.Module, ABC):
         tasks: tasks that the function is for.
         takes: the arguments that the function is made from, by name.
         needs_model: whether it is made from an observation model.
-        needs_map: whether its `model` is a learned map, whose belief alone it works on.
         by_belief: whether its values depend on the belief.
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
@@ -93,7 +92,6 @@ class AcquisitionFunction(nn.Module, ABC):
     tasks: ClassVar[tuple[Task, ...]] = ()
     takes: ClassVar[Mapping[str, Parameter]]
     needs_model: ClassVar[bool]
-    needs_map: ClassVar[bool] = False
     by_belief: ClassVar[bool] = True
     by_place: ClassVar[bool] = False
 
@@ -105,7 +103,7 @@ class AcquisitionFunction(nn.Module, ABC):
         named = {name: parameter for name, parameter in parameters.items() if parameter.kind not in stars}
         # What it passes on by `**` are arguments of its base.
         cls.takes = {**getattr(cls, "takes", {}), **named} if Parameter.VAR_KEYWORD in kinds else named
-        cls.needs_model = "model" in cls.takes and not cls.needs_map
+        cls.needs_model = "model" in cls.takes
         if cls.__dict__.get("name"):
             by_name = Parameter.VAR_POSITIONAL not in kinds or Parameter.VAR_KEYWORD in kinds
             cls._register(by_name)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from semfov import FovealObservationModel, MapEvidence, TargetEvidence
+from semfov import FovealObservationModel, TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.fixations import Fixations, write_table
 from semfov.runs.config import DetectorConfig, SensorConfig
@@ -63,7 +63,6 @@ def write_material(folder: Path) -> None:
         torch.manual_seed(0)
         thresholds = Thresholds(0.6, 0.3)
         TargetEvidence(4, 4, components=4, thresholds=thresholds, metadata=settings).save(folder / "target.safetensors")
-        MapEvidence(4, 4, components=4, metadata=settings).save(folder / "map.safetensors")
         GlimpseEvidence(3).save(folder / "zoom.safetensors")
         alpha, rates = 0.5 + torch.rand(4, 3, 4), torch.full((4, 3), 0.3)
         model = FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=rates, metadata=settings)
@@ -145,7 +144,7 @@ COMMANDS = {
     "eval.calibration": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "1", "--grid", "[3,2]", "--target_area", "0.5",
                   "--model", "HERE/observation.safetensors",
-                  "--target_model", "HERE/target.safetensors", "--map_model", "HERE/map.safetensors"),
+                  "--target_model", "HERE/target.safetensors", "--map_model", "HERE/observation.safetensors"),
         files=("beliefs.md", "beliefs.csv", "beliefs.json"),
         others=("calibration.md", "config.yaml", "manifest.json", "reliability.png", "beliefs.png"),
     ),
@@ -208,17 +207,6 @@ COMMANDS = {
             (("--looks", "1"), "looks: expected a whole number from 2 to"),
         ),
     ),
-    "train.fit_map": Command(
-        settings=(*NETWORK, *PHOTOGRAPHS, *TRAINED, "--gain_steps", "2"),
-        files=(MODEL, "judged.json", "report.md"),
-        parts="cache/looks/*/*/*.safetensors",
-        refused=(
-            (("--holdout", "1"), "holdout: expected a whole number from 2 to 1,000,000,000, got 1"),
-            (("--looks", "1"), "looks: expected a whole number from 2 to 10,000, got 1"),
-            (("--others", "12"), "others: expected from 1 to 11, got 12"),
-            (("--others", "0"), "others: expected a whole number from 1 to 1,000,000,000, got 0"),
-        ),
-    ),
     "train.fit_verification": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--columns", "3", "--rows", "2", "--looks", "3", "--folds", "2",
                   "--target_model", "HERE/target.safetensors"),
@@ -238,10 +226,10 @@ COMMANDS = {
     "train.fit_shares": Command(workers=False),
     "semfov.cli.main fit": Command(
         settings=("HERE/colours.onnx", *PHOTOGRAPHS, "--data.limit", "8", "--columns", "3", "--rows", "2",
-                  "--holdout", "4", "--steps", "4", "--map_steps", "2", "--fixations", "2",
+                  "--holdout", "4", "--steps", "4", "--fixations", "2",
                   "--sensor.sigma", "60", "--sensor.growth", "1"),
-        files=("evidence.safetensors", "map.safetensors"),
-        others=("manifest.json", "report.md", "search.png", "explore.png"),
+        files=("evidence.safetensors", "observation.safetensors"),
+        others=("manifest.json", "report.md", "search.png"),
         parts="cache/looks/*/*/*.safetensors",
         refused=(
             ((), "model: expected the name or the file of a detector, got none"),

@@ -70,7 +70,7 @@ def test_a_run_writes_its_files(finished):
     assert not list(folder.rglob("*.part"))
 
 
-@pytest.mark.parametrize("finished", [f"train.fit_{name}" for name in ("search", "map", "verification")], indirect=True)
+@pytest.mark.parametrize("finished", [f"train.fit_{name}" for name in ("search", "verification")], indirect=True)
 def test_a_fitted_model_says_what_it_was_fitted_to_and_with_which_settings(finished):
     _, settings, folder = finished
     with safe_open(folder / "out" / MODEL, "pt") as file:

@@ -1,0 +1,119 @@
+"""The observer of explorations: the paper's belief about all classes, with what a look says about a whole cell."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
+from semfov.belief.evidence import farther
+from semfov.belief.fusion import RULES
+from semfov.belief.grid import Grid
+from semfov.belief.likelihood import likelihoods
+from semfov.belief.observers.base import Look, Observer, own
+from semfov.detection.detections import Detections
+from semfov.observation.foveal import FovealObservationModel
+
+_LEAST = 1e-6  # of the likelihood of background, by which the others are divided
+_WEAK = 1e-5  # Dirichlet parameter of a prior that one look outweighs
+
+
+@dataclass(frozen=True)
+class CellLook(Look):
+    """What looks say about whole cells.
+
+    Attributes:
+        ratio: likelihood of the classes given a detection, relative to background, summed over the detections that
+            overlap each cell, `(B, X·Y, K+1)`.
+        distance: from the fixation to each cell, `(B, X·Y)`, in longer sides of the image.
+    """
+
+    ratio: Tensor
+    distance: Tensor
+
+
+class SemanticMap(Observer):
+    r"""A Dirichlet belief about what each cell holds, in which the closest look at a cell counts.
+
+    A look has one likelihood for each cell: the detector missed its object, with odds m, or one of the detections l
+    that overlap the cell shows it (`semfov.belief.association`). An exponent a and a weight of background w calibrate
+    it:
+
+    .. math:: \lambda_k(x) = \Bigl(m + \sum_{l \ni x} \frac{p(S_l \mid k, d_l)}{p(S_l \mid 0, d_l)}\Bigr)^a,
+              \qquad \lambda_0(x) = w
+
+    It is fused with a prior that it outweighs by Kaplan's rule (`semfov.fusion.kaplan`), so that the belief is
+    proportional to λ. A closer look replaces a farther one, because looks at a static scene are not independent.
+
+    Args:
+        model: calibrates the scores, and has m, a and w (`FovealObservationModel.log_cell`).
+
+    >>> model = FovealObservationModel.identity(["cup", "cat"], [0.2], cell=(0.01, 1.0, 1.0))
+    >>> observer, grid = SemanticMap(model), Grid(2, 1, (10, 10))
+    >>> seen = Detections(torch.tensor([[[0.0, 0, 4, 4]]]), torch.tensor([[[0.2, 0.7, 0.1]]]), torch.ones(1, 1).bool())
+    >>> belief = observer(observer.start(1, grid, torch.zeros(1)), seen, torch.tensor([[2.0, 2.0]]), grid)
+    >>> belief.class_probabilities().argmax(-1)  # a cup, and nothing
+    tensor([[1, 0]])
+    """
+
+    def __init__(self, model: FovealObservationModel) -> None:
+        super().__init__()
+        self.model = model
+
+    @property
+    def components(self) -> int:
+        """K + 1, number of classes with background."""
+        return len(self.model.classes) + 1
+
+    def start(self, batch: int, grid: Grid, like: Tensor) -> DirichletBelief:
+        """Begin with the same small parameter for every class in every cell."""
+        return DirichletBelief(like.new_full((batch, len(grid), self.components), _WEAK))
+
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> CellLook:
+        """Sum what the detections in each cell say, the same for every target."""
+        likelihood = likelihoods(detections, fixation, grid, self.model)
+        ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
+        covered = grid.footprint(detections.boxes) * detections.mask[..., None]
+        return CellLook(covered.to(ratio).mT @ ratio, grid.distance(fixation).to(ratio))
+
+    def likelihood(self, ratio: Tensor) -> Tensor:
+        """Compute the likelihood of every class in a cell.
+
+        Args:
+            ratio: `(..., K+1)`, sums of its detections (`CellLook`).
+
+        Returns:
+            `(..., K+1)`, λ; differentiable in the numbers of the model.
+        """
+        miss, exponent, background = self.model.log_cell.exp().to(ratio)
+        objects = (miss + ratio[..., 1:]).pow(exponent)
+        return torch.cat([background.expand_as(objects[..., :1]), objects], -1)
+
+    def unseen(self, like: Tensor) -> Tensor:
+        """Compute the probabilities of all classes in a cell in which nothing was detected, `(K+1,)`."""
+        likelihood = self.likelihood(like.new_zeros(self.components))
+        return likelihood / likelihood.sum()
+
+    def update(self, belief: Belief, look: Look) -> DirichletBelief:
+        """Take the likelihood of cells to which the look is closer than all before."""
+        old = dirichlet_belief(belief)
+        cells = own(look, CellLook, "look")
+        prior = torch.full_like(old.beta, _WEAK)
+        likelihood = self.likelihood(cells.ratio.to(prior))
+        fused = RULES["kaplan"](prior, likelihood / likelihood.amax(-1, keepdim=True))
+        is_closer = (cells.distance < old.closest)[..., None]
+        return replace(
+            old,
+            beta=torch.where(is_closer, fused, old.beta),
+            closest=torch.minimum(cells.distance, old.closest),
+        )
+
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
+        r"""Move the Dirichlet parameters towards the prior, and the closest looks away.
+
+        .. math:: \beta \leftarrow \beta_0 + k (\beta - \beta_0)
+        """
+        old = dirichlet_belief(belief)
+        if keep == 1:
+            return old
+        return replace(old, beta=_WEAK + keep * (old.beta - _WEAK), closest=old.closest + farther(keep))

@@ -1,0 +1,143 @@
+"""The semantic map: loops over cells, the closest look, cells without detections, gradients, its fit."""
+
+import math
+
+import pytest
+import torch
+
+from semfov import Detections, FovealObservationModel, Grid
+from semfov.belief.observers import SemanticMap
+from semfov.errors import DataError
+from semfov.fit.cells import MappedLooks, fit_cells, map_loss
+
+GRID = Grid(5, 4, (100, 80))
+FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
+MISS, EXPONENT, BACKGROUND = CELL = (0.05, 1.4, 0.6)
+
+
+def model(**settings):
+    """A model with three levels and random parameters."""
+    generator = torch.Generator().manual_seed(3)
+    alpha = (torch.randn(4, 3, 4, generator=generator, dtype=torch.float64) / 2).exp()
+    return FovealObservationModel(alpha, [0.2, 0.5], ["cup", "cat", "dog"], **{"cell": CELL, **settings})
+
+
+@pytest.fixture
+def looks(random_looks):
+    return random_looks(GRID, looks=3, most=4, components=4, dtype=torch.float64)
+
+
+def watch(observer, looks, order=(0, 1, 2)):
+    belief = observer.start(1, GRID, looks.scores)
+    for number in order:
+        part = slice(number, number + 1)
+        belief = observer(belief, looks[part], FIXATIONS[part].double(), GRID)
+    return belief
+
+
+def covers(box, cell):
+    left, top = cell % 5 * 20, cell // 5 * 20
+    return box[0] < left + 20 and box[2] > left and box[1] < top + 20 and box[3] > top
+
+
+def test_a_cell_takes_the_likelihood_of_its_closest_look(looks):
+    fom = model().requires_grad_(False)
+    got = watch(SemanticMap(fom), looks).class_probabilities()[0]
+    offset = torch.cdist(GRID.centres.double(), FIXATIONS.double()) / 100
+    for cell in range(20):
+        look = int(offset[cell].argmin())
+        expected = [BACKGROUND] + [MISS] * 3
+        for box, scores, real in zip(looks.boxes[look], looks.scores[look], looks.mask[look], strict=True):
+            if real and covers(box.tolist(), cell):
+                middle = (box[:2] + box[2:]) / 2 - 0.5
+                calibrated = fom.calibrate(scores, (middle - FIXATIONS[look].double()).norm() / 100)
+                for k in (1, 2, 3):
+                    expected[k] += float(calibrated[k] / calibrated[0])
+        expected[1:] = [value**EXPONENT for value in expected[1:]]
+        shares = [value / sum(expected) for value in expected]
+        # The prior counts as a thousandth of a look.
+        assert got[cell].tolist() == pytest.approx(shares, abs=1e-3), cell
+
+
+def test_a_farther_look_changes_no_cell_and_order_matters_only_in_ties(looks):
+    observer = SemanticMap(model().requires_grad_(False))
+    belief = watch(observer, looks)
+    again = watch(observer, looks, (0, 1, 2, 1, 0))
+    assert torch.equal(again.beta, belief.beta)
+    offset = torch.cdist(GRID.centres, FIXATIONS)
+    is_tied = (offset == offset.amin(1, keepdim=True)).sum(1) > 1
+    assert torch.equal(watch(observer, looks, (2, 1, 0)).beta[0, ~is_tied], belief.beta[0, ~is_tied])
+    torch.testing.assert_close(belief.closest[0], offset.amin(1).double() / 100)
+
+
+def test_an_unseen_cell_is_as_one_without_detections():
+    observer = SemanticMap(model().requires_grad_(False))
+    expected = torch.tensor([BACKGROUND, *3 * [MISS**EXPONENT]], dtype=torch.float64)
+    torch.testing.assert_close(observer.unseen(torch.zeros(1).double()), expected / expected.sum())
+    nothing = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 4), torch.zeros(1, 0, dtype=torch.bool))
+    seen = watch(observer, nothing, (0,))
+    torch.testing.assert_close(
+        seen.class_probabilities()[0, 7].double(), observer.unseen(torch.zeros(1).double()), atol=1e-3, rtol=0
+    )
+
+
+def test_a_belief_fades_towards_the_prior(looks):
+    observer = SemanticMap(model().requires_grad_(False))
+    belief = watch(observer, looks)
+    look = observer.weigh(looks[:1], FIXATIONS[:1].double(), GRID)
+    visited = torch.zeros(1, 20, dtype=torch.bool)
+    assert observer.fade(belief, look, 1.0, visited) is belief
+    faded = observer.fade(belief, look, 0.5, visited)
+    start = observer.start(1, GRID, looks.scores)
+    torch.testing.assert_close(faded.beta, (belief.beta + start.beta) / 2)
+    # So far away, a look counts half as much.
+    torch.testing.assert_close(faded.closest - belief.closest, torch.full_like(belief.closest, math.log(2) / 6))
+
+
+def test_gradients_reach_the_numbers_of_cells_and_alpha(looks):
+    fom = model()
+    mapped = MappedLooks(looks, FIXATIONS.double(), GRID, torch.rand(20, 4) < 0.5)
+
+    def loss(cell, alpha):
+        fom.log_cell.data, fom.log_alpha.data = cell, alpha
+        parameters = {"log_cell": cell, "log_alpha": alpha}
+        observer = SemanticMap(fom)
+        return torch.func.functional_call(
+            _Loss(observer, mapped), {f"observer.model.{name}": value for name, value in parameters.items()}
+        )
+
+    inputs = fom.log_cell.detach().clone().requires_grad_(), fom.log_alpha.detach().clone().requires_grad_()
+    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-4, fast_mode=True)
+
+
+class _Loss(torch.nn.Module):
+    def __init__(self, observer, mapped):
+        super().__init__()
+        self.observer, self.mapped = observer, mapped
+
+    def forward(self):
+        return map_loss(self.observer, self.mapped, torch.arange(3))
+
+
+def test_the_fit_finds_how_certain_the_map_may_be(looks):
+    """Cells that never hold an object, against cells that always do."""
+    losses = {}
+    for name, held in (("empty", 0), ("full", 1)):
+        answers = torch.zeros(20, 4, dtype=torch.bool)
+        answers[:, held] = True
+        mapped = MappedLooks(looks, FIXATIONS.double(), GRID, answers)
+        fom = model()
+        others = {key: value.clone() for key, value in fom.state_dict().items() if key != "log_cell"}
+        before = float(map_loss(SemanticMap(fom), mapped, torch.arange(3)).detach())
+        fit_cells(fom, [mapped])
+        after = float(map_loss(SemanticMap(fom), mapped, torch.arange(3)).detach())
+        assert after < before
+        assert all(torch.equal(fom.state_dict()[key], value) for key, value in others.items())
+        assert all(parameter.requires_grad for parameter in fom.parameters())
+        losses[name] = float(fom.log_cell[2].detach())
+    assert losses["full"] < math.log(BACKGROUND) < losses["empty"]
+
+
+def test_a_fit_needs_a_photograph():
+    with pytest.raises(DataError, match="none of the photographs contains an object"):
+        fit_cells(model(), [])
