@@ -3,13 +3,13 @@
     python -m eval.prior --data.root DIR --data.annotations instances.json --detector.name yolox-nano --out runs/prior
 
 Without photographs it uses the embedded scenes. All photographs are searched by windows for each of the classes that
-are in most of them: without `prior`, with one half, and with the share of the photographs that hold the class. Then
-each one is searched for some classes that are drawn evenly from all, likewise, and for one that it holds and one that
-it does not hold, whose share is one half. The table has the mean probability, the Brier score, the expected calibration
-error, the area under ROC and the decisions beside the share of the searches whose target is there, and the difference
-of the Brier score to that without `prior`, paired over the photographs. `best` is the Brier score after an offset and a
-slope of the log odds that are fitted to these searches themselves: what is left is ranking, not calibration. If the
-command is stopped, repeat it to continue.
+are in most of them: with the share of the searches of the fit, with one half, and with the share of the photographs
+that hold the class. Then each one is searched for some classes that are drawn evenly from all, likewise, and for one
+that it holds and one that it does not hold, whose share is one half. The table has the mean probability, the Brier
+score, the expected calibration error, the area under ROC and the decisions beside the share of the searches whose
+target is there, and the difference of the Brier score to that with the share of the fit, paired over the photographs.
+`best` is the Brier score after an offset and a slope of the log odds that are fitted to these searches themselves: what
+is left is ranking, not calibration. If the command is stopped, repeat it to continue.
 """
 
 import sys
@@ -26,6 +26,7 @@ from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_summary
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
+from semfov.belief.prior import PriorLike
 from semfov.data.classes import class_index
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.logistic import logistic_regression
@@ -54,9 +55,9 @@ _ALWAYS = "always "  # begins the names of the questions about one class
 _MISSING = {_ALWAYS: "one of these classes, not there", PAIR: "the one that is not there"}
 """Names for the searches without their target, by how the names of their questions begin."""
 
-_DECIDED = ("found, there", "absent, there", "found, not there", "absent, not there")
+_DECIDED = ("right", "wrong", "undecided", "found, there", "absent, there", "found, not there", "absent, not there")
 
-_PRIORS = {"without": "-", "half": "0.5", "with": "share"}
+_PRIORS = {"fit": "fit", "half": "0.5", "share": "share"}
 """The priors of a search, by their names in the records, as the table names them."""
 
 
@@ -124,22 +125,22 @@ class PriorRun(SceneRun):
         questions = [*always, *((RANDOM, target) for target in drawn), *((PAIR, target) for target in pair)]
         records = []
         for question, target in questions:
-            prior = None if question == PAIR else float(self.shares[target - 1])
+            priors: dict[str, PriorLike] = {"fit": "fit", "half": 0.5}
+            if question != PAIR:
+                priors["share"] = float(self.shares[target - 1])
             records.append(
                 {
                     "scene": self.scenes.ids[index],
                     "question": question,
                     "target": self.scenes.classes[target - 1],
                     "present": bool((annotation.labels == target).any()),
-                    "without": self._search(source, target, None),
-                    "half": self._search(source, target, 0.5),
-                    "with": None if prior is None else self._search(source, target, prior),
+                    **{way: self._search(source, target, prior) for way, prior in priors.items()},
                 }
             )
         watch.lap("search")
         return records, watch.seconds
 
-    def _search(self, source: WindowLooks, target: int, prior: float | None) -> ResultRecord:
+    def _search(self, source: WindowLooks, target: int, prior: PriorLike) -> ResultRecord:
         """Search the photograph for a class, and record the decision."""
         limits = EpisodeLimits(PASSES)
         names = ("background", *self.scenes.classes)
@@ -168,13 +169,14 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
         there = torch.tensor([record["present"] for record in some])
         frequency = f"{float(there.double().mean()):.3f}"
         for way, name in _PRIORS.items():
-            if some and some[0][way] is not None:
+            if some and way in some[0]:
                 rows.append([question, name, str(len(some)), frequency, *_measured(some, way)])
     return "\n".join(
         [
-            "Probability that a photograph holds the class: without `prior=`, with one half, and with the share of the "
-            "photographs that hold it. `there`: share of the searches whose target is there. Decisions are in % of the "
-            "searches whose target is there, and of those whose target is not.",
+            "Probability that a photograph holds the class: with the share of the searches of the fit, with one half, "
+            "and with the share of the photographs that hold it. `there`: share of the searches whose target is there. "
+            "Right, wrong and undecided are in % of all searches, the other decisions in % of those whose target is "
+            "there, and of those whose target is not.",
             "",
             *table(rows),
             "",
@@ -186,11 +188,11 @@ def _measured(records: Sequence[ResultRecord], way: str) -> list[str]:
     """Measure probabilities, in the order of the headings, and count decisions and passes."""
     probability = torch.tensor([record[way]["probability"] for record in records], dtype=torch.float64)
     there = torch.tensor([record["present"] for record in records])
-    usual = torch.tensor([record["without"]["probability"] for record in records], dtype=torch.float64)
+    usual = torch.tensor([record["fit"]["probability"] for record in records], dtype=torch.float64)
     squares = torch.stack([(values - there.double()).square() for values in (probability, usual)])
     brier = Bootstrap.of(lambda chosen: squares[:, chosen].mean(1), [record["scene"] for record in records])
     apart = brier.less(1)
-    difference = "" if way == "without" else plus_minus(float(apart.value[0]), float(apart.error[0]), 3, sign="+")
+    difference = "" if way == "fit" else plus_minus(float(apart.value[0]), float(apart.error[0]), 3, sign="+")
     area = best = "-"
     if there.any() and not there.all():
         area = f"{area_under_roc(probability, there):.3f}"
@@ -215,11 +217,16 @@ def _best_brier(probability: Tensor, there: Tensor) -> float:
 
 
 def _decided(records: Sequence[ResultRecord], way: str) -> list[str]:
-    """Compute which % end found and absent, of the searches whose target is there, then of the others."""
-    cells = []
+    """Compute which % end right, wrong and undecided, and found and absent where the target is there and where not."""
+    right_outcomes = ["found" if record["present"] else "absent" for record in records]
+    outcomes = [record[way]["outcome"] for record in records]
+    right = sum(outcome == correct for outcome, correct in zip(outcomes, right_outcomes, strict=True))
+    undecided = outcomes.count("undecided")
+    counts = (right, len(records) - right - undecided, undecided)
+    cells = [share(count, len(records)) for count in counts]
     for present in (True, False):
-        outcomes = [record[way]["outcome"] for record in records if record["present"] == present]
-        cells += [share(outcomes.count(outcome), len(outcomes)) for outcome in ("found", "absent")]
+        some = [record[way]["outcome"] for record in records if record["present"] == present]
+        cells += [share(some.count(outcome), len(some)) for outcome in ("found", "absent")]
     return cells
 
 

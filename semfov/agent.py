@@ -15,6 +15,7 @@ from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
 from semfov.belief.observers import Observer, SemanticMap, Target
 from semfov.belief.observers.any_of import TargetLike
+from semfov.belief.prior import PriorLike
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
@@ -332,7 +333,7 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         stop_below: float | None = None,
         closer: int | None = None,
-        prior: float | None = None,
+        prior: PriorLike = None,
         color: Color = "rgb",
         white: White | None = None,
         bands: ChosenBands = None,
@@ -555,7 +556,7 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         stop_below: float | None = None,
         closer: int | None = None,
-        prior: float | None = None,
+        prior: PriorLike = None,
         score_threshold: float | None = None,
         color: Color = "rgb",
         white: White | None = None,
@@ -589,7 +590,6 @@ class ActivePerception(nn.Module):
         )
         classes = class_numbers(target, self.classes[1:], "target")
         is_one = target is not None and not isinstance(target, list | tuple)
-        check(prior is None or is_one, "prior", "None without one class to search for", prior)
         return LivePerception(self, classes[0] if is_one else None, () if is_one else classes, settings, white=white)
 
     def _look(

@@ -58,6 +58,8 @@ class LivePerception(OtherWords):
         white: White | None = None,
     ) -> None:
         settings = settings or StreamSettings()
+        is_known = settings.prior is None or target is not None
+        check(is_known, "prior", "None without one class to search for", settings.prior)
         check_white(white)
         self.how: How = "windows" if targets and settings.how == "auto" else settings.how
         self._white = white

@@ -49,7 +49,7 @@ MOST_PASSES = 1_000_000
 FirstCell = Annotated[int | tuple[int, int], Form("a cell", "as column,row (5,5) or as its number (47)")]
 Passes = Annotated[int, Range(1, MOST_PASSES)]
 CloserLooks = Annotated[int, Range(0, 100)]
-PriorShare = Annotated[float, Range(above=0, below=1, noun="a share, such as 0.15,")]
+PriorShare = Annotated[float | Literal["fit"], Range(above=0, below=1, noun="a share, such as 0.15,", word="fit")]
 Rate = Annotated[float, Range(0, 100)]
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
@@ -146,8 +146,8 @@ class DecisionSettings(CheckedSettings):
         closer: largest number of closer looks, in which a window around a place that seems to hold the target is
             enlarged to the detector's input, each a pass (None: 3 in a photograph, all that there are passes for in a
             large picture, 2 for a fovea); 0 makes none.
-        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (None: as often as in
-            the searches of the fit, nearly always for people and hardly ever for a toaster).
+        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (None: one half);
+            `fit` takes that of the searches that the models were fitted to.
 
     Raises:
         InputError: a value is out of range.
@@ -160,6 +160,11 @@ class DecisionSettings(CheckedSettings):
     stop_below: Probability | None = None
     closer: CloserLooks | None = field(default=None, metadata=_only_for("fovea", "windows", instead="confirm"))
     prior: PriorShare | None = None
+
+    @property
+    def given_share(self) -> float | None:
+        """The prior that was given as a number."""
+        return None if self.prior == "fit" else self.prior
 
 
 @dataclass(frozen=True)
@@ -250,8 +255,8 @@ class StreamSettings(DecisionSettings, StartSettings):
             that fades can reach it, or with rate 0 that of a search).
         closer: largest number of closer looks in the time until half of the evidence has faded (None: 2 for a fovea, 3
             for windows of small frames, as many as there are frames for those of large ones); 0: none.
-        prior: how often the target is there: the share of the frames that hold it (None: as often as in the searches of
-            the fit).
+        prior: how often the target is there: the share of the frames that hold it (None: one half); `fit` takes that of
+            the searches that the models were fitted to.
         score_threshold: probability from which on an object is listed in windows (None: 0.5); with a lower one a
             tracker or a curve of precision over recall gets fainter objects, too.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.

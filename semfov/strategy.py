@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from semfov.belief.grid import Grid
 from semfov.belief.observers import AnyOf, Observer, Target
 from semfov.belief.observers.any_of import TargetLike
-from semfov.belief.prior import Prior
+from semfov.belief.prior import Prior, PriorLike
 from semfov.data.classes import class_index
 from semfov.errors import check
 from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Uniform
@@ -48,24 +48,23 @@ class Strategy(nn.Module):
         """Make the acquisition function of episodes that fixate `cell` `(B,)`."""
         return self.policy(target, grid)
 
-    def with_prior(self, share: float | None, target: int) -> tuple["Strategy", Prior]:
+    def with_prior(self, prior: PriorLike, target: int) -> tuple["Strategy", Prior]:
         """Change a search for a class by how often it is there.
 
         Args:
-            share: share of searches in which the class is there; None leaves the search as it was fitted.
+            prior: share of searches in which the class is there (`Prior.of`).
             target: the class, 1..K.
 
         Returns:
             The strategy of the search, and the prior by which its probabilities change.
         """
         observer = self.observer
-        is_about_several = isinstance(observer, AnyOf) and share is not None
-        check(not is_about_several, "prior", "None for a search for any of several classes", share)
-        prior = Prior.of(share, observer.model.shares if isinstance(observer, Target) else None, target)
-        if share is None:
-            return self, prior
-        assert isinstance(observer, Target)
-        return Strategy(Target(observer.model, together=observer.together, prior=prior), self.policy), prior
+        is_about_several = isinstance(observer, AnyOf) and prior is not None
+        check(not is_about_several, "prior", "None for a search for any of several classes", prior)
+        if not isinstance(observer, Target):
+            return self, Prior.of(prior, None, target)
+        known = Prior.of(prior, observer.model.shares, target)
+        return Strategy(Target(observer.model, together=observer.together, prior=known), self.policy), known
 
     def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
         """Prepare the search for a target.

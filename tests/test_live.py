@@ -107,7 +107,7 @@ def test_a_prior_changes_the_fovea_in_a_search_and_in_a_stream_by_the_odds(one_t
     agent, image = agent_with(Target(model)), scene(100, 80)
     live = agent.live("green", rate=0, start=3, seed=5, how="fovea", prior=0.2)
     with torch.inference_mode():
-        usual = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", stop_below=0.0)
+        usual = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", prior="fit", stop_below=0.0)
         rare = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", prior=0.2, stop_below=0.0)
         several = agent.search(image, ["red", "green"], shifts=1, how="fovea")
     moments = [live.step(image) for _ in range(5)]

@@ -186,7 +186,7 @@ class DecisionRun(ComparedLooking):
         config, target = self.config, search.target
         assert self.windows is not None
         goal = Goal.of(("background", *self.eye.detector.classes), target)
-        decisions = DecisionSettings(config.confirm, config.stop_below, None if config.closer else 0)
+        decisions = DecisionSettings(config.confirm, config.stop_below, None if config.closer else 0, "fit")
         path = WindowEpisode(WindowTask(goal, self.windows, decisions), source, EpisodeLimits(PASSES)).run()
         decision = path.decision
         assert decision is not None

@@ -55,7 +55,7 @@ def decide_all(
     records: list[ResultRecord] = []
     ways = {OURS: closer} if evidence.verification is None else {OURS: closer, UNVERIFIED: 0}
     for target, (way, most) in product(targets, ways.items()):
-        task = WindowTask(Goal.of(classes, target), evidence, DecisionSettings(closer=most))
+        task = WindowTask(Goal.of(classes, target), evidence, DecisionSettings(closer=most, prior="fit"))
         path = WindowEpisode(task, source, EpisodeLimits(passes)).run()
         decision = path.decision
         assert decision is not None

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, no_frame_yet, on_cpu
 from semfov.belief import Belief, Grid, Verification
-from semfov.belief.prior import Prior
+from semfov.belief.prior import Prior, PriorLike
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
 from semfov.decision import MOST_CLOSER, OUTCOMES, CandidateCells, CloseUp, Decision, Verifier
@@ -81,7 +81,7 @@ class GazePlan:
     Attributes:
         thresholds: thresholds of the decision; None if nothing was learned.
         verification: model of the closer looks; None if none are made.
-        given_prior: share of the pictures that hold the target, as it was given; None for none.
+        given_share: share of the pictures that hold the target, as it was given; None for none.
         prior: the share that the probabilities assume, and that of the fit.
         beside: observer of the map of all classes beside the belief of a search; None if the belief is that map.
     """
@@ -102,7 +102,7 @@ class GazePlan:
     ) -> None:
         decisions = decisions or DecisionSettings()
         usual = agent.exploring if target is None else agent.searching
-        self.given_prior = decisions.prior
+        self.given_share = decisions.given_share
         chosen, self.prior = _with_prior(strategy or usual, target, decisions.prior)
         self.agent = agent
         self.target = target
@@ -325,7 +325,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
             decision=decision,
             closer=tuple(criterion.looks),
             ending=self.ending,
-            prior=self._plan.given_prior,
+            prior=self._plan.given_share,
             assumed=self._plan.prior.assumed,
             stimulus=self._stimulus,
             photograph=self._photograph,
@@ -464,19 +464,19 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
             next_cell=int(step.next_cell) if next_cell is None else next_cell,
             closer=tuple(replace(close_up, fixation=0, number=0) for close_up in closer),
             found=decision is not None and decision.outcome == "found",
-            prior=self.plan.given_prior,
+            prior=self.plan.given_share,
             assumed=self.plan.prior.assumed,
             photograph=partial(_reduced, self._pixels, gaze.image),  # type: ignore[arg-type]
             detector=self.plan.agent.eye.detector.name,
         )
 
 
-def _with_prior(strategy: Strategy, target: int | None, share: float | None) -> tuple[Strategy, Prior]:
-    """Give a strategy the share of the searches whose target is there; None leaves it as it was fitted."""
+def _with_prior(strategy: Strategy, target: int | None, prior: PriorLike) -> tuple[Strategy, Prior]:
+    """Give a strategy the share of the searches whose target is there; without a target it stays as it is."""
     if target is None:
-        check(share is None, "prior", "None without a target", share)
+        check(prior is None, "prior", "None without a target", prior)
         return strategy, Prior(known=False)
-    return strategy.with_prior(share, target)
+    return strategy.with_prior(prior, target)
 
 
 def _probability(belief: Belief, target: int | None) -> Tensor:

@@ -125,7 +125,7 @@ class HeadAgent(nn.Module):
             settings: the settings of the search; None for the usual ones. A look that would end after `duration`, as
                 the `speeds` of the scene have it, is not taken.
             foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
-            chance: probability that a cell that was never seen holds the target, without a `prior`.
+            chance: probability that a cell that was never seen holds the target, by the prior of the fit.
             color: order of the channels of an array, a tensor, or the frames of a camera (`semfov.as_image`).
 
         Returns:
@@ -152,7 +152,7 @@ class HeadAgent(nn.Module):
         return HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=_first_action(settings), duration=_duration(settings),
-            seed=settings.seed, prior=settings.prior,
+            seed=settings.seed, prior=settings.given_share,
         ).run()  # fmt: skip
 
     def find_all(

@@ -248,7 +248,7 @@ class WindowSession:
             "lattice": self.source.lattice,
             "classes": task.goal.classes,
             "target": task.goal.target,
-            "prior": task.decisions.prior,
+            "prior": task.decisions.given_share,
             "assumed": self.decisions.prior.assumed,
             "targets": task.goal.targets,
             "looks": tuple(looks),

@@ -2,22 +2,21 @@
 
 import math
 from dataclasses import dataclass
-from typing import Self, TypeVar
+from typing import Any, Literal, Self, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
-from semfov.errors import InputError, check
+from semfov.errors import check
 from semfov.io.schema import Field, is_number
 
 SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
 """Schema of the shares, by class, of the searches of a fit whose target was there, in the file of a model."""
 
+PriorLike: TypeAlias = float | Literal["fit"] | None
+"""A share of the pictures that hold the target, `fit` for that of the searches of the fit, or None for one half."""
+
 _Odds = TypeVar("_Odds", float, Tensor)
-
-
-class UnknownShareError(InputError):
-    """A share of searches was given to models that do not know the share of their fit, with which it is compared."""
 
 
 def with_prior(logit: _Odds, prior: float, fitted: float) -> _Odds:
@@ -62,11 +61,12 @@ class Prior:
     known: bool = True
 
     @classmethod
-    def of(cls, share: float | None, shares: Tensor | None, target: int) -> Self:
+    def of(cls, prior: PriorLike, shares: Tensor | None, target: int) -> Self:
         """Compare a share with that of the fit.
 
         Args:
-            share: share of the searches whose target is there; None takes that of the fit, and changes nothing.
+            prior: share of the searches whose target is there; None for one half, `fit` for that of the fit. Models
+                that do not know the share of their fit stay as they are.
             shares: `(K,)`, by class, those of the fit; None if they are not known.
             target: class 1..K.
 
@@ -74,19 +74,19 @@ class Prior:
             Both shares.
 
         Raises:
-            InputError: the share is no probability between 0 and 1.
-            UnknownShareError: those of the fit are not known.
+            InputError: the share is no probability between 0 and 1, or those of the fit are not known.
         """
-        check_prior(share)
-        if shares is not None:
-            fitted = float(shares[target - 1])
-            return cls(fitted if share is None else float(share), fitted)
-        if share is not None:
+        if prior is not None and prior != "fit":
+            check_share(prior)
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
-            raise UnknownShareError(
-                f"prior: expected None for models without the shares of their fit, got {share}; {remedy}"
-            )
-        return cls(known=False)
+            expected = "None for models without the shares of their fit"
+            check(shares is not None, "prior", expected, f"{prior}; {remedy}")
+        if shares is None:
+            return cls(known=False)
+        fitted = float(shares[target - 1])
+        if prior == "fit":
+            return cls(fitted, fitted)
+        return cls(0.5 if prior is None else float(prior), fitted)
 
     @property
     def assumed(self) -> float | None:
@@ -127,10 +127,9 @@ class Prior:
         return float(self.place(exact[0], exact[1]))
 
 
-def check_prior(prior: float | None) -> None:
-    """Raise `InputError` unless a share of searches is None, or above 0 and below 1."""
-    inside = prior is None or (is_number(prior) and 0 < prior < 1)
-    check(inside, "prior", "a share above 0 and below 1, or None", prior)
+def check_share(prior: Any) -> None:
+    """Raise `InputError` unless a share of searches is a number above 0 and below 1."""
+    check(is_number(prior) and 0 < prior < 1, "prior", "a share above 0 and below 1", prior)
 
 
 def _logit(share: float) -> float:

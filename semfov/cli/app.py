@@ -59,7 +59,6 @@ _NO_PICTURE = "Give it a picture, or take an example."
 _WHICH = "Choose a class: a search looks for one."
 _CLICK = "Point at the picture to see as the fovea does. Click to look: find “{}” in fewer looks than the agent."
 _WHICH_OWN = "Choose a class in the field *Class*, and look for it here."
-_SHARE = "Share of your pictures that hold the class"  # label of a field
 _STYLE = """
 footer { display: none !important; }
 .main.fillable { padding-top: 8px !important; }
@@ -177,7 +176,7 @@ class _Calls:
             target: class, or all of them.
             task: one of `_TASKS`.
             passes: largest number of passes of the detector.
-            prior: for a search, share of such pictures that hold the class; empty as in the fit.
+            prior: for a search, share of such pictures that hold the class; empty for one half.
             visitor: who asks.
 
         Returns:
@@ -257,7 +256,7 @@ def _record_page(record: Record, picture: Tensor) -> str:
     """Make the page of a record, whose title is the outcome."""
     data = record.page_data(picture if record.kind.fine else None)
     data["decision"] = None  # which says it again
-    return page_html(record.words.summary(f"{_SHARE}: 0.5"), [data])
+    return page_html(record.words.summary(), [data])
 
 
 def _framed(page: str) -> str:
@@ -363,7 +362,10 @@ def _lay_out_panel(calls: _Calls) -> _Panel:
         example = gradio.Button("Next example", visible=bool(calls.examples))
         passes = gradio.Slider(1, 64, value=16, step=1, label="Looks at most")
         prior = gradio.Textbox(
-            label=_SHARE, placeholder="as in the fit, or such as 0.2", info="For a search.", interactive=False
+            label="Share of your pictures that hold the class",
+            placeholder="0.5",
+            info="For a search.",
+            interactive=False,
         )
     return _Panel(picture, task, target, go, end, example, passes, prior)
 

@@ -40,7 +40,7 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
     headline = record.words.objects if decision is None else _decision_text(record, decision)
     reason = "" if limit else record.why_it_ended()
     lines = [f"{name}, {width} × {height} px: {headline}", f"  {reason} {looks}.".replace("   ", "  ")]
-    assumption = record.words.assumption("--prior 0.5")
+    assumption = record.words.assumption()
     if assumption:
         lines.append(f"  {assumption}")
     if decision is None:

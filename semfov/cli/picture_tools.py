@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from semfov.agent import ActivePerception
-from semfov.belief.prior import UnknownShareError
 from semfov.cli.options import CheckOptions
 from semfov.data.large import open_large
 from semfov.data.sources import picture_files
@@ -30,7 +29,6 @@ MOST_PASSES = 64
 
 _SECONDS = 60.0  # longest time of one answer
 _MOST_PICTURES = 1000  # names in one answer
-_AS_LIKELY_AS_NOT = 0.5
 _WIDEST = 4096  # longest side in pixels of the picture of which a crop is shown: a wider one is seen by `find`
 _SIDE = 1024  # longest side in pixels of a crop that is shown
 _SMALLEST = 8  # shortest side in pixels of the picture of which a crop is shown
@@ -154,8 +152,7 @@ class PictureTools:
             picture: its name.
             target: the class.
             passes: most passes of the detector.
-            prior: how likely the class is in the picture before anybody looks; None for as likely as not, where the
-                models of the agent know how often it was there in their fit.
+            prior: how likely the class is in the picture before anybody looks; None for as likely as not.
 
         Returns:
             The answer.
@@ -163,12 +160,7 @@ class PictureTools:
         path = self._path(picture)
         _check_passes(passes)
         limits: _Limits = {"passes": passes, "seconds": _SECONDS}
-        if prior is not None:
-            return _answer(self.agent.search(path, target, prior=prior, **limits))
-        try:
-            return _answer(self.agent.search(path, target, prior=_AS_LIKELY_AS_NOT, **limits))
-        except UnknownShareError:
-            return _answer(self.agent.search(path, target, **limits))
+        return _answer(self.agent.search(path, target, prior=prior, **limits))
 
     @_one_at_a_time
     def find(self, picture: str, classes: list[str], passes: int = 24) -> Answer:

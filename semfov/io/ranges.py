@@ -23,6 +23,7 @@ class Range:
         above: number that values are larger than.
         below: number that values are smaller than.
         noun: what the numbers are, in messages (None: `a number`, or `a whole number`).
+        word: a word that may stand in place of a number.
     """
 
     low: float = -math.inf
@@ -30,16 +31,18 @@ class Range:
     above: float | None = None
     below: float | None = None
     noun: str | None = None
+    word: str | None = None
 
     def __repr__(self) -> str:
         """Write the range in words, such as `from 1 to 100`."""
+        word = "" if self.word is None else f", or {self.word!r}"
         if self.above is not None and self.below is not None:
-            return f"above {self.above:g} and below {self.below:g}"
+            return f"above {self.above:g} and below {self.below:g}{word}"
         above = -math.inf if self.above is None else self.above
-        return interval(self.low, self.high, above).removeprefix("numbers ")
+        return interval(self.low, self.high, above).removeprefix("numbers ") + word
 
     def holds(self, value: object, *, whole: bool) -> bool:
-        """Tell whether a value is a number in this range.
+        """Tell whether a value is a number in this range, or the word.
 
         Args:
             value: any value; numbers of NumPy are numbers, `True` and tensors are none.
@@ -48,6 +51,8 @@ class Range:
         Returns:
             Whether it lies in the range, which NaN never does.
         """
+        if isinstance(value, str) and value == self.word:
+            return True
         kind = Integral if whole else Real
         if isinstance(value, bool) or not isinstance(value, kind):
             return False

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.belief.prior import Prior, check_prior
+from semfov.belief.prior import Prior, check_share
 from semfov.data.classes import class_index
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
@@ -154,8 +154,7 @@ class Outcome(ABC):
             record = agent.search("kitchen.jpg", "chair")
             print(record.decision.probability, record.assumed, record.probability_at(0.15))
         """
-        check_prior(prior)
-        check(prior is not None, "prior", "a share above 0 and below 1", prior)
+        check_share(prior)
         decision = self.decision
         known = decision is not None and self.assumed is not None
         expected = "a search by models with the shares of their fit"

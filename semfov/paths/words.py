@@ -191,15 +191,12 @@ class Words(ABC):
         numbers = [look.number for look in self.record.closer if look.box.equal(decision.box)]
         return self._sentences.get("first found", sentence) if numbers == [0] else sentence
 
-    def assumption(self, option: str = "prior=0.5") -> str:
+    def assumption(self) -> str:
         """Say how many pictures the probability assumes to hold the target, and what it would be with half of them.
 
         It is said where it matters: the target was not found, and with half of the pictures the probability would be
         at least 0.1 higher or lower. So nothing is said where the assumed share is near one half, or where what was
         seen leaves no doubt.
-
-        Args:
-            option: how one half is asked for, where no share was given.
 
         Returns:
             The sentence; empty where it does not matter, or where it is not known what is assumed.
@@ -212,21 +209,17 @@ class Words(ABC):
         if abs(at_half - decision.probability) < _MATTERS:
             return ""
         share = f"{min(100 * record.assumed, 99.9):.3g} % of your {self._pictures} hold it"
-        given = f" ({option})" if record.prior is None else ""
-        return f"This assumes that {share}; if half of them did, it would be {at_half:.2f} after these looks{given}."
+        return f"This assumes that {share}; if half of them did, it would be {at_half:.2f} after these looks."
 
-    def summary(self, option: str = "prior=0.5") -> str:
+    def summary(self) -> str:
         """Describe the outcome, explain why it ended, name the best place of doubt, and say what is assumed.
-
-        Args:
-            option: how another share of pictures is asked for (`assumption`).
 
         Returns:
             The sentences.
         """
         text = self.describe() + self._ending
         place = self.best_place.capitalize()
-        sentences = [text, f"{place}." if place else "", self.assumption(option)]
+        sentences = [text, f"{place}." if place else "", self.assumption()]
         return " ".join(sentence for sentence in sentences if sentence)
 
     @property

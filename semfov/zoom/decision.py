@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from semfov.belief.prior import Prior
+from semfov.belief.prior import Prior, PriorLike
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import FOUND, GO_ON, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
@@ -354,9 +354,8 @@ def decisions_of(
     return DecisionsByCloserLooks(belief, thresholds, prior, verifier)
 
 
-def _prior_of(share: float | None, photograph: PhotographEvidence | None, target: int) -> Prior:
+def _prior_of(prior: PriorLike, photograph: PhotographEvidence | None, target: int) -> Prior:
     """Compare the share that was given with that of the fit, which for large pictures is one half."""
-    if photograph is None:
-        # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
-        return Prior() if share is None else Prior(share)
-    return Prior.of(share, photograph.shares, target)
+    # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
+    shares = torch.full((target,), 0.5) if photograph is None else photograph.shares
+    return Prior.of(prior, shares, target)

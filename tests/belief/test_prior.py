@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from semfov.belief import Grid
 from semfov.belief.observers import Target
-from semfov.belief.prior import Prior, check_prior, with_prior
+from semfov.belief.prior import Prior, check_share, with_prior
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.detection import Detections
 from semfov.errors import InputError
@@ -48,17 +48,18 @@ def test_a_place_keeps_its_share_of_the_picture(place, presence, fitted, share):
     assert prior.inverse.place(prior.place(place, whole), prior(whole)) == pytest.approx(place, rel=1e-6)
 
 
-def test_without_a_share_nothing_changes():
-    chances = torch.rand(9)
-    for prior in (Prior(), Prior.of(None, None, 1), Prior(0.3, 0.3)):
+def test_the_share_of_the_fit_changes_nothing_and_without_one_half_is_assumed():
+    chances, shares = torch.rand(9), torch.tensor([0.5, 0.75])
+    unknown = [Prior.of(None, None, 1), Prior.of("fit", None, 1)]
+    fitted = Prior.of("fit", shares, 2)
+    for prior in (Prior(), Prior(0.3, 0.3), fitted, *unknown):
         assert prior(chances) is chances
         assert prior.place(chances, chances) is chances
-    assert Prior.of(0.2, torch.tensor([0.5, 0.75]), 2) == Prior(0.2, 0.75)
-    fitted = Prior.of(None, torch.tensor([0.5, 0.75]), 2)
-    assert fitted(chances) is chances
-    assert [prior.assumed for prior in (fitted, Prior(0.2, 0.75), Prior(), Prior.of(None, None, 1))] == [
-        0.75, 0.2, 0.5, None,
-    ]  # fmt: skip
+    assert (fitted.assumed, [prior.assumed for prior in unknown]) == (0.75, [None, None])
+    assert Prior.of(0.2, shares, 2) == Prior(0.2, 0.75)
+    usual = Prior.of(None, shares, 2)
+    assert (usual, usual.assumed) == (Prior(0.5, 0.75), 0.5)
+    assert usual(0.75) == pytest.approx(0.5)
 
 
 def test_certain_probabilities_stay():
@@ -68,7 +69,8 @@ def test_certain_probabilities_stay():
 
 def test_bad_input():
     for share in (0, 1, 1.5, -0.1, math.nan, True, "0.2"):
-        refused("prior: expected a share above 0 and below 1, or None", check_prior, share)
+        refused("prior: expected a share above 0 and below 1", check_share, share)
+        refused("prior: expected a share above 0 and below 1", Prior.of, share, torch.tensor([0.5]), 1)
     refused("prior: expected None for models without the shares of their fit, got 0.2", Prior.of, 0.2, None, 1)
 
 
@@ -99,7 +101,8 @@ def test_a_strategy_reads_the_shares_of_its_evidence():
     changed, prior = strategy.with_prior(0.3, 2)
     assert prior == Prior(0.3, 0.75)
     assert changed.observer.prior == prior
-    assert strategy.with_prior(None, 2) == (strategy, Prior(0.75, 0.75))
+    assert strategy.with_prior(None, 2)[1] == Prior(0.5, 0.75)
+    assert strategy.with_prior("fit", 2)[1].changes_nothing
     assert strategy.observer.prior == Prior()
     several, _, _ = strategy.sought(["person", "bicycle"], ("background", "person", "bicycle", "car"))
     with pytest.raises(InputError, match="prior: expected None for a search for any of several classes"):

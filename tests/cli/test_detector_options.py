@@ -187,7 +187,6 @@ PRINTED_BY = {
 CONDITIONAL = {
     "--target cup, got none": ["search"],
     "a description needs --embeddings": ["search"],
-    "--prior 0.5": ["search"],
     "a class is given by --target": ["search", "find"],
 }
 """Messages that only some of these commands print."""

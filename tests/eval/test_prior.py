@@ -11,18 +11,18 @@ from eval.prior import PAIR, _best_brier, prior_summary
 pytestmark = pytest.mark.usefixtures("few_samples")
 
 
-def record(scene, question, present, without, half, given=None):
+def record(scene, question, present, of_fit, half, given=None):
     def searched(probability, passes):
-        outcome = "found" if probability > 0.7 else "absent"
+        outcome = "found" if probability > 0.7 else "absent" if probability < 0.55 else "undecided"
         return {"probability": probability, "passes": passes, "outcome": outcome}
 
     return {
         "scene": scene,
         "question": question,
         "present": present,
-        "without": searched(without, 2),
+        "fit": searched(of_fit, 2),
         "half": searched(half, 3),
-        "with": None if given is None else searched(given, 1),
+        **({} if given is None else {"share": searched(given, 1)}),
     }
 
 
@@ -41,15 +41,15 @@ def test_the_table_has_means_errors_and_decisions_of_each_question_and_prior():
     rows = table_rows(prior_summary(records))
     names = [row[:4] for row in rows]
     assert names[:5] == [
-        ["always cup", "-", "2", "0.500"],
+        ["always cup", "fit", "2", "0.500"],
         ["always cup", "0.5", "2", "0.500"],
         ["always cup", "share", "2", "0.500"],
-        [PAIR, "-", "2", "0.500"],
+        [PAIR, "fit", "2", "0.500"],
         [PAIR, "0.5", "2", "0.500"],
     ]
     missing = names[5:]
     assert {tuple(name[2:]) for name in missing} == {("1", "0.000")}
-    assert [name[1] for name in missing] == ["-", "0.5", "share", "-", "0.5"]
+    assert [name[1] for name in missing] == ["fit", "0.5", "share", "fit", "0.5"]
     # Each probability is alone in its bin, so that the calibration error is the mean of the errors.
     errors = [(0.1, 0.5), (0.2, 0.4), (0.4, 0.2), (0.2, 0.4), (0.4, 0.4)]
     usual = [errors[0]] * 3 + [errors[3]] * 2
@@ -59,17 +59,17 @@ def test_the_table_has_means_errors_and_decisions_of_each_question_and_prior():
         assert float(row[5].split(" ± ")[0]) == pytest.approx(brier, abs=1e-3)
         assert float(row[8]) == pytest.approx(sum(wrong) / 2, abs=1e-3)
         assert float(row[9]) == 1.0
-        if row[1] == "-":
+        if row[1] == "fit":
             assert row[6] == ""
         else:
             change = brier - (before[0] ** 2 + before[1] ** 2) / 2
             assert float(row[6].split(" ± ")[0]) == pytest.approx(change, abs=1e-3)
     assert [row[10:] for row in rows[:5]] == [
-        ["100.0", "0.0", "0.0", "100.0", "2.0"],
-        ["100.0", "0.0", "0.0", "100.0", "3.0"],
-        ["0.0", "100.0", "0.0", "100.0", "1.0"],
-        ["100.0", "0.0", "0.0", "100.0", "2.0"],
-        ["0.0", "100.0", "0.0", "100.0", "3.0"],
+        ["100.0", "0.0", "0.0", "100.0", "0.0", "0.0", "100.0", "2.0"],
+        ["100.0", "0.0", "0.0", "100.0", "0.0", "0.0", "100.0", "3.0"],
+        ["50.0", "0.0", "50.0", "0.0", "0.0", "0.0", "100.0", "1.0"],
+        ["100.0", "0.0", "0.0", "100.0", "0.0", "0.0", "100.0", "2.0"],
+        ["50.0", "0.0", "50.0", "0.0", "0.0", "0.0", "100.0", "3.0"],
     ]
     assert rows[5][7] == rows[5][9] == "-"  # nothing is there to be ranked
 

@@ -542,22 +542,25 @@ def evidence_with_shares(**thresholds):
 def test_a_prior_changes_the_log_odds_of_a_search_by_that_of_the_fit(detector, photograph):
     agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
     for number, target in enumerate(("red", "green", "blue")):
-        usual = agent.search(photograph, target, SearchSettings(closer=0)).decision.probability
-        for prior in (0.05, 0.6, float(SHARES[number])):
+        usual = agent.search(photograph, target, SearchSettings(closer=0, prior="fit")).decision.probability
+        for prior in (0.05, 0.6, float(SHARES[number]), None):
             rare = agent.search(photograph, target, SearchSettings(closer=0, prior=prior)).decision.probability
-            expected = usual / (1 - usual) * (prior / (1 - prior)) / (SHARES[number] / (1 - SHARES[number]))
+            odds = 1 if prior is None else prior / (1 - prior)
+            expected = usual / (1 - usual) * odds / (SHARES[number] / (1 - SHARES[number]))
             assert rare / (1 - rare) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_a_record_says_what_its_probability_assumes_and_gives_others(detector, photograph, picture):
     agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
     usual = agent.search(photograph, "green", SearchSettings(closer=0))
-    assert (usual.prior, usual.assumed) == (None, pytest.approx(0.4))
-    for share in (0.05, 0.5, 0.9):
+    assert (usual.prior, usual.assumed) == (None, 0.5)
+    fitted = agent.search(photograph, "green", SearchSettings(closer=0, prior="fit"))
+    assert (fitted.prior, fitted.assumed) == (None, pytest.approx(0.4))
+    for share in (0.05, 0.4, 0.9):
         searched = agent.search(photograph, "green", SearchSettings(closer=0, prior=share))
         assert (searched.prior, searched.assumed) == (share, share)
         assert usual.probability_at(share) == pytest.approx(searched.decision.probability, rel=1e-4)
-        assert searched.probability_at(0.4) == pytest.approx(usual.decision.probability, rel=1e-4)
+        assert searched.probability_at(0.5) == pytest.approx(usual.decision.probability, rel=1e-4)
     assert usual.probability_at(usual.assumed) == usual.decision.probability
     assert agent.search(picture, "green", SearchSettings(passes=1, closer=0)).assumed == 0.5
     assert ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "green").assumed is None
@@ -568,7 +571,7 @@ def test_a_record_says_what_its_probability_assumes_and_gives_others(detector, p
 def test_closer_looks_read_the_probabilities_of_the_fit_and_give_those_of_the_prior(detector, photograph):
     model, share = evidence_with_shares(stop_below=0.0), 0.1
     agent = ZoomAgent(WindowEye(detector), model)
-    usual, rare = agent.search(photograph, "red"), agent.search(photograph, "red", SearchSettings(prior=share))
+    usual, rare = (agent.search(photograph, "red", SearchSettings(prior=prior)) for prior in ("fit", share))
     prior = Prior(share, float(SHARES[0]))
     assert len(usual.closer) == len(rare.closer) > 1
     for before, after in zip(usual.closer, rare.closer, strict=True):
@@ -588,9 +591,11 @@ def test_thresholds_are_compared_with_the_probability_for_the_prior(detector, ph
 
 def test_a_prior_in_a_large_picture_is_compared_with_one_half(detector, picture):
     agent = ZoomAgent(WindowEye(detector), evidence(0.4))
-    usual, rare = (
-        agent.search(picture, "red", SearchSettings(passes=1, closer=0, prior=prior)).decision for prior in (None, 0.1)
+    usual, fitted, rare = (
+        agent.search(picture, "red", SearchSettings(passes=1, closer=0, prior=prior)).decision
+        for prior in (None, "fit", 0.1)
     )
+    assert usual.probability == fitted.probability
     assert rare.probability == pytest.approx(Prior(0.1, 0.5)(usual.probability), rel=1e-5)
 
 
