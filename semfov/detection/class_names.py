@@ -34,9 +34,10 @@ _Name = TypeVar("_Name")
 class UnnamedClasses(InputError):
     """The error of a model with scores of some classes, and no names for them; `count` is the number of the classes."""
 
-    def __init__(self, count: int, file: Path) -> None:
+    def __init__(self, count: int, file: Path, beside: Sequence[str] | None) -> None:
+        got = "None" if beside is None else f"{len(beside)} names in a file beside it"
         super().__init__(
-            f"classes: expected the names of the {count} classes of {file.name} in the order of its scores, got None; "
+            f"classes: expected the names of the {count} classes of {file.name} in the order of its scores, got {got}; "
             f"give them by classes=cat,dog, as the list “classes” in {file.with_suffix('.json')}, or in classes.txt "
             "beside it"
         )
@@ -60,6 +61,15 @@ def names_in_order(names: Mapping[object, _Name]) -> list[_Name] | None:
     if by_number.keys() != set(numbers):
         return None
     return [by_number[number] for number in numbers]
+
+
+def without_placeholders(names: Sequence[str]) -> list[str]:
+    """Leave out the names of outputs that do not stand for a class.
+
+    >>> without_placeholders(["background", "cat"])
+    ['cat']
+    """
+    return [name for name in names if name.lower() not in _PLACEHOLDERS]
 
 
 def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, ...]]:

@@ -11,7 +11,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs
+from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs, without_placeholders
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import choose_layers, landmarks
 from semfov.detection.onnx_cells import Canvas
@@ -263,8 +263,8 @@ def load_onnx(
     """Load a detector from an ONNX file, or a published one by its name.
 
     What an option does not say is taken from `model.json` beside the file, then from the metadata of the model, and
-    then found out: the head by names and shapes of the outputs, and names of classes in `classes.txt` or `data.yaml`
-    beside the file.
+    then found out: the head by names and shapes of the outputs, and names of classes in a file beside it
+    (`names_beside`).
 
     Args:
         name_or_path: the ONNX file, or the name of a published model.
@@ -467,12 +467,14 @@ def _sides(input_size: int | Sequence[int]) -> Canvas:
 
 def _unstated_names(nearby: Sequence[str] | None, count: int, file: Path) -> Sequence[str]:
     """Name scores by a file beside the model, or 80 by COCO's classes, or 91 by COCO's category ids with their gaps."""
-    if nearby is not None and len(nearby) == count:
-        return nearby
+    if nearby is not None:
+        for names in (nearby, without_placeholders(nearby)):  # as of a list that begins with background
+            if len(names) == count:
+                return names
     if count == 80:
         return COCO_CLASSES
     if count == 91:
         from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
 
         return FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
-    raise UnnamedClasses(count, file)
+    raise UnnamedClasses(count, file, nearby)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -149,7 +150,8 @@ def names_beside(path: Path) -> list[str] | None:
     """Read names of classes from a file beside a model.
 
     Args:
-        path: the ONNX file, beside which there may be `data.yaml`, as of a data set for YOLO, or `classes.txt`.
+        path: the ONNX file, beside which there may be `data.yaml`, as of a data set for YOLO, a list of names such as
+            `classes.txt`, or `config.json` of `transformers`.
 
     Returns:
         The names; None where there is no such file.
@@ -164,18 +166,35 @@ def names_beside(path: Path) -> list[str] | None:
     return None
 
 
-def _data_names(text: str) -> list[str | int]:
-    """Parse the names of classes in `data.yaml`: a list, or by their numbers."""
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError):
-        return []
-    return _listed(content.get("names")) if isinstance(content, Mapping) else []
+def _names_under(key: str) -> Callable[[str], list[str | int]]:
+    """Make the reader of names under a key of YAML or JSON: a list, or by their numbers."""
 
+    def names(text: str) -> list[str | int]:
+        try:
+            content = yaml.load(text, yaml.BaseLoader)  # noqa: S506 (it makes texts alone, of `no` and `on`, too)
+        except (yaml.YAMLError, RecursionError, ValueError):
+            return []
+        return _listed(content.get(key)) if isinstance(content, Mapping) else []
+
+    return names
+
+
+def _names_in_lines(text: str) -> list[str]:
+    """List the names of a file with a name a line, which may begin with its number: `0 cat`, `0: cat`."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    numbered = [_NUMBERED.fullmatch(line) for line in lines]
+    numbers = [int(match[1]) for match in numbered if match]
+    if numbers in ([*range(len(lines))], [*range(1, len(lines) + 1)]):
+        return [match[2] for match in numbered if match]
+    return lines
+
+
+_NUMBERED = re.compile(r"\s*(\d{1,6})(?:\s*[:,=]|\s)\s*(.+)")  # a name with its number
 
 _NAMES_BESIDE: dict[str, Callable[[str], list[str | int] | list[str]]] = {
-    "data.yaml": _data_names,
-    "classes.txt": str.splitlines,
+    **dict.fromkeys(("data.yaml", "data.yml"), _names_under("names")),
+    **dict.fromkeys(("classes.txt", "labels.txt", "obj.names"), _names_in_lines),
+    "config.json": _names_under("id2label"),
 }
 """Files beside a model with the names of classes, in the order in which they are looked for, and how they are read."""
 

@@ -17,6 +17,7 @@ from semfov.cli.commands import SUBCOMMANDS
 from semfov.cli.main import _in_command_words, _message_options, main
 from semfov.cli.options import DetectorOptions
 from semfov.detection.load import loader_options
+from tests.refusals import refused
 from tests.small import write_network
 
 SIDE = 64
@@ -119,7 +120,13 @@ NAMES = ("vehicle", "car", "taxi")
         ({"character": "vehicle\ncar\ntaxi\n"}, {}),
         ({}, {"data.yaml": "path: here\nnames:\n  0: vehicle\n  1: car\n  2: taxi\n"}),
         ({}, {"data.yaml": "nc: 3\nnames: [vehicle, car, taxi]\n"}),
+        ({}, {"data.yml": "names: [vehicle, car, taxi]\n"}),
         ({}, {"classes.txt": "vehicle\ncar\ntaxi\n"}),
+        ({}, {"classes.txt": "\ufeff0: vehicle\r\n1: car\r\n2: taxi\r\n"}),
+        ({}, {"labels.txt": "1 vehicle\n2 car\n3 taxi"}),
+        ({}, {"classes.txt": "background\nvehicle\ncar\ntaxi\n"}),
+        ({}, {"obj.names": "vehicle\ncar\ntaxi\n"}),
+        ({}, {"config.json": '{"id2label": {"0": "vehicle", "1": "car", "2": "taxi"}}'}),
         ({}, {"data.yaml": "names: [cat, dog]", "mine.json": '{"classes": ["vehicle", "car", "taxi"]}'}),
     ],
 )
@@ -127,6 +134,16 @@ def test_names_are_found_in_the_metadata_and_beside_the_file(metadata, beside, n
     for name, text in beside.items():
         (tmp_path / name).write_text(text)
     assert load_detector(network(columns(), metadata=metadata), head="yolov8").classes == NAMES
+
+
+def test_names_beside_the_file_that_are_too_many_are_counted(network, tmp_path):
+    (tmp_path / "classes.txt").write_text("# my classes\nvehicle\ncar\ntaxi\n")
+    refused(
+        "classes: expected the names of the 3 classes .* got 4 names in",
+        load_detector,
+        network(columns()),
+        head="yolov8",
+    )
 
 
 def test_a_trial_shows_the_bare_scores_beside_those_that_are_listed(network, tmp_path, capsys):
