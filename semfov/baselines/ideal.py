@@ -129,14 +129,17 @@ def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> 
         `(...)`.
     """
     noise = torch.linspace(-5, 5, nodes, dtype=place.dtype, device=place.device)
-    weight = (-noise.square() / 2).softmax(0)
+    weight = (-noise.square() / 2).softmax(0)  # φ(w) dw
     d = signal.clamp(min=_LEAST_SIGNAL)
+    log_place = place.clamp(min=torch.finfo(place.dtype).tiny).log()
+    half_square = d.square() / 2
     # Dimensions: the cell x of the target, every other cell y, and the noise w in x.
-    log = place.clamp(min=torch.finfo(place.dtype).tiny).log()
-    half = d.square() / 2
-    lead = log[..., :, None] - log[..., None, :] + half[..., :, None] + half[..., None, :]
+    log_odds = log_place[..., :, None] - log_place[..., None, :]
+    lead = log_odds + half_square[..., :, None] + half_square[..., None, :]
     response = (d[..., None] * noise)[..., None, :]
-    beaten = torch.special.ndtr((lead[..., None] + response) / d[..., None, :, None])
+    d_of_other = d[..., None, :, None]
+    beaten = torch.special.ndtr((lead[..., None] + response) / d_of_other)
+    # No cell competes with itself.
     itself = torch.eye(place.shape[-1], dtype=torch.bool, device=place.device)[..., None]
     right = torch.where(itself, 1.0, beaten).prod(-2) @ weight
     return (place * right).sum(-1)

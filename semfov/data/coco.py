@@ -97,16 +97,15 @@ class CocoScenes(Scenes):
 
         criteria = _Criteria(min_instances, max_target_area, coverage)
         targets_by_row = self._select(criteria, self._rows_of(ids), limit)
+        wanted = f"at least {min_instances} boxes and a class that covers at most {max_target_area} of them"
+        got = f"none among {len(self._packed.ids)}; relax min_instances or max_target_area"
+        check_data(bool(targets_by_row), self._name, f"images with {wanted}", got)
         self._rows = list(targets_by_row)
         self._targets = list(targets_by_row.values())
-        expected = (
-            f"images with at least {min_instances} boxes and a class that covers at most {max_target_area} of them"
-        )
-        got = f"none among {len(self._packed.ids)}; relax min_instances or max_target_area"
-        check_data(bool(self._rows), self._name, expected, got)
         self.ids = [self._packed.ids[row] for row in self._rows]
         names = [self._packed.names[row] for row in self._rows]
         self._files = _files_of(root, names)
+
         # Names and sizes tell another copy of the images apart without reading them.
         settings = [file.digest, self.classes, self.ids, max_target_area, coverage, crowd]
         sizes = [path.stat().st_size for path in self._files]
@@ -253,12 +252,10 @@ class _Packed:
         rows = torch.tensor(rows_of_entries, dtype=torch.int64)
         label = torch.tensor([labels[entry["category_id"]] for entry in entries], dtype=torch.int64)
         crowd = torch.tensor([bool(entry["iscrowd"]) for entry in entries], dtype=torch.bool)
-        # In float64, in which a box that ends at the border of its image is not beyond it.
-        numbers = [list(map(float, entry["bbox"])) for entry in entries]
-        bboxes = torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
         sides = torch.tensor(self.sizes, dtype=torch.float64).reshape(-1, 2)[rows]
         limits = torch.cat([sides, sides], -1)
 
+        bboxes = _bboxes_of(entries)
         warn_of_form(bboxes, limits, path, stacklevel=5)
         boxes, is_cut = _cut_to_image(bboxes, limits)
         has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
@@ -273,11 +270,11 @@ class _Packed:
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
 
         # Boxes of all categories count for the number of boxes of an image; those of the detector's are its objects.
-        self.instances: list[int] = rows[valid].bincount(minlength=len(self.ids)).tolist()
+        self.instances: list[int] = _counts_by_row(rows[valid], len(self.ids)).tolist()
         self._boxes = boxes[labelled]
         self._labels = label[labelled]
         self._crowd = crowd[labelled]
-        self._ends: list[int] = rows[labelled].bincount(minlength=len(self.ids)).cumsum(0).tolist()
+        self._ends: list[int] = _counts_by_row(rows[labelled], len(self.ids)).cumsum(0).tolist()
 
     def _count(self, repair: str, which: Tensor) -> None:
         """Note a repair of some boxes, `(N,)` boolean."""
@@ -292,6 +289,18 @@ class _Packed:
         labels = self._labels[objects].clone()
         crowd = self._crowd[objects].clone()
         return Annotation(boxes, labels, crowd, self.sizes[row])
+
+
+def _bboxes_of(entries: Sequence[Entry]) -> Tensor:
+    """Take the boxes of entries, `(N, 4)`: left upper corner, width and height in pixels."""
+    # In float64, in which a box that ends at the border of its image is not beyond it.
+    numbers = [list(map(float, entry["bbox"])) for entry in entries]
+    return torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
+
+
+def _counts_by_row(rows: Tensor, count: int) -> Tensor:
+    """Count the objects `(N,)` of each row; also of the last rows, which may have none, `(count,)`."""
+    return rows.bincount(minlength=count)
 
 
 def _size_of(file: Annotations, image: Id, path: object) -> tuple[int, int]:

@@ -56,7 +56,14 @@ def example_scene(name: str, classes: Sequence[str]) -> Scene:
 
 
 def sheet(classes: Sequence[str]) -> Scene:
-    """Compose a sheet of all photographs, in two rows on white paper, with the boxes of single objects."""
+    """Compose a sheet of all photographs, in two rows on white paper, with the boxes of single objects.
+
+    Args:
+        classes: names of the detector's classes.
+
+    Returns:
+        The sheet as one scene.
+    """
     scenes = EmbeddedScenes(classes, count=len(PHOTOGRAPHS))
     prints = [_single(scenes, index) for index in range(len(scenes))]
     rows = [prints[0::2], prints[1::2]]
@@ -67,6 +74,7 @@ def sheet(classes: Sequence[str]) -> Scene:
     labels: list[Tensor] = []
     top = _MARGIN
     for row in rows:
+        # The same gap between all pictures of a row, and at both ends.
         gap = (width - _width(row)) // (len(row) + 1)
         left = gap
         for scene in row:

@@ -97,7 +97,16 @@ def _largest_grey(image: "Image") -> int:
 def _deep_pixels(
     path: str | PathLike[str], *, upright: bool, white: White | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Read a file with more than 8 bits a channel: pixels `(H, W, 3)` in [0, 1] over white, and the colours alone."""
+    """Read a file with more than 8 bits a channel.
+
+    Args:
+        path: the file.
+        upright: turn the picture upright; False leaves it as it is stored.
+        white: values that are black and white; None for the full range.
+
+    Returns:
+        Pixels `(H, W, 3)` in [0, 1] over white, and the colours alone, without alpha, `(H, W, C)`.
+    """
     with opening(Path(path), "decoded"), open_pillow(path) as image, open_pillow(path) as again:
         transparent = image.info.get("transparency")
         values, most = deep_values((image, again), partial(_loaded, upright=upright))
@@ -107,8 +116,10 @@ def _deep_pixels(
     full_range = (0.0, float(most))
     limits = full_range if white is None else black_and_white(white, shades)
     colours = between(shades, limits)
-    pixels = colours if colours.shape[-1] == 3 else np.repeat(colours, 3, -1)
+    is_grey = colours.shape[-1] != 3
+    pixels = np.repeat(colours, 3, -1) if is_grey else colours
     if has_alpha:
+        # Where black and white are stated, they are those of the colours, and not of the alpha.
         alpha = between(values[..., -1:], full_range)
         pixels = pixels * alpha + (1 - alpha)
     elif transparent is not None:

@@ -228,7 +228,16 @@ def check_local(path: str | PathLike[str], argument: str) -> None:
 
 
 def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
-    """Move the channels to the front, `(B, 3, H, W)`; `choose` takes `(3, H, 3)` as channels first."""
+    """Move the channels to the front.
+
+    Args:
+        pixels: one picture or several, grey or RGB, in one of the usual orders.
+        argument: name of the argument, for the message.
+        choose: take `(3, H, 3)`, which may be both, as channels first.
+
+    Returns:
+        `(B, 3, H, W)`; grey pictures have three equal channels.
+    """
     shape = tuple(pixels.shape)
     check(2 <= len(shape) <= 4, argument, _SHAPES, f"shape {shape}")
     check(pixels.numel() > 0, argument, "at least one pixel", f"shape {shape}")
@@ -239,11 +248,10 @@ def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
         is_first = batch.shape[1] == channels
         is_last = batch.shape[-1] == channels
         if is_first and is_last and not choose:
-            raise InputError(
-                f"{argument}: expected {_SHAPES}, got shape {shape}, which is ambiguous; give a tensor (3, H, W)"
-            )
+            got = f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
+            raise InputError(f"{argument}: expected {_SHAPES}, got {got}")
         if is_first:
-            return batch.expand(-1, 3, -1, -1)  # grey becomes three equal channels
+            return batch.expand(-1, 3, -1, -1)
         if is_last:
             return batch.movedim(-1, 1).expand(-1, 3, -1, -1)
     has_alpha = 4 in (shape[-1], shape[-3])

@@ -154,13 +154,27 @@ def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum
 
 
 def _union_area(x1: Tensor, y1: Tensor, x2: Tensor, y2: Tensor) -> Tensor:
-    """Compute the area that boxes cover together, `()`, by the rectangles between all their edges, `(N,)` each."""
+    """Compute the area that boxes cover together, by the rectangles between all their edges.
+
+    Args:
+        x1: left edges, `(N,)`.
+        y1: upper edges, `(N,)`.
+        x2: right edges, `(N,)`.
+        y2: lower edges, `(N,)`.
+
+    Returns:
+        `()`.
+    """
     xs = torch.cat([x1, x2]).unique()
     ys = torch.cat([y1, y2]).unique()
     # Which of the columns and of the rows between these edges each box covers.
-    columns = (x1[:, None] <= xs[:-1]) & (xs[1:] <= x2[:, None])
-    rows = (y1[:, None] <= ys[:-1]) & (ys[1:] <= y2[:, None])
-    boxes_over = rows.double().T @ columns.double()  # how many boxes cover each rectangle
+    starts_before_column = x1[:, None] <= xs[:-1]
+    ends_after_column = xs[1:] <= x2[:, None]
+    starts_before_row = y1[:, None] <= ys[:-1]
+    ends_after_row = ys[1:] <= y2[:, None]
+    columns = (starts_before_column & ends_after_column).double()
+    rows = (starts_before_row & ends_after_row).double()
+    boxes_over = rows.T @ columns  # how many boxes cover each rectangle
     is_covered = (boxes_over > 0).double()
     return ys.diff() @ is_covered @ xs.diff()
 

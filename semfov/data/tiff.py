@@ -386,6 +386,10 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
 
     Of a stack, such as planes of a microscope or moments, they are those of the first picture.
 
+    Args:
+        file: the file.
+        page: its first page that is no reduced copy.
+
     Returns:
         The pages, and the number of pictures in the stack.
     """
@@ -403,10 +407,18 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
     pictures = len(pages) // channels
     if page.samplesperpixel > 1 or not 2 <= channels <= _MOST_LAYERS:
         return [page], pictures
+
+    # The pages of the first picture: all places along the axis of channels, the first one along all others.
     numbers = np.arange(len(pages)).reshape(lengths)
-    first = numbers[tuple(slice(None) if axis == "C" else 0 for axis in axes)]
-    layers = [layer for number in first.tolist() if (layer := pages[number]) is not None and layer.shape == page.shape]
-    return (layers if len(layers) == channels else [page]), pictures
+    first_picture = tuple(slice(None) if axis == "C" else 0 for axis in axes)
+    layers = []
+    for number in numbers[first_picture].tolist():
+        layer = pages[number]
+        if layer is not None and layer.shape == page.shape:
+            layers.append(layer)
+    if len(layers) < channels:  # one of them is not there, or has another size
+        return [page], pictures
+    return layers, pictures
 
 
 def _check_kind(page: _Page, path: Path, *, has_white: bool) -> None:

@@ -61,19 +61,25 @@ class _Side:
         """
         place = source.place[axis]
         reach = source.place[2 + axis]
-        window = source.window[axis]
-        length = source.window[2 + axis]
+        window_start = source.window[axis]
+        window_length = source.window[2 + axis]
         canvas_start = (place - origin) * scale
         canvas_end = (place + reach - origin) * scale
-        covered = range(max(ceil(canvas_start - 0.5), 0), min(ceil(canvas_end - 0.5), pixels))
-        first = max(ceil(canvas_start - _ROUNDING), 0)
-        last = min(floor(canvas_end + _ROUNDING), pixels)
-        inner = range(first, last) or covered
-        # Back from pixels of the canvas to those of the source, without what rounding adds.
-        start = window + (origin + inner.start / scale - place) * length / reach
-        end = window + (origin + inner.stop / scale - place) * length / reach
-        start = max(start, window)
-        end = min(end, window + length)
+        # A pixel whose middle lies in the source is covered.
+        first_covered = max(ceil(canvas_start - 0.5), 0)
+        end_covered = min(ceil(canvas_end - 0.5), pixels)
+        covered = range(first_covered, end_covered)
+        first_inner = max(ceil(canvas_start - _ROUNDING), 0)
+        end_inner = min(floor(canvas_end + _ROUNDING), pixels)
+        inner = range(first_inner, end_inner) or covered
+
+        def in_source(pixel: int) -> float:
+            """Find the place in the source where a pixel of the canvas begins."""
+            return window_start + (origin + pixel / scale - place) * window_length / reach
+
+        # Without what rounding adds.
+        start = max(in_source(inner.start), window_start)
+        end = min(in_source(inner.stop), window_start + window_length)
         return cls(covered, inner, start, end - start)
 
     @property
@@ -164,20 +170,30 @@ class Mosaic:
         return np.broadcast_to(mask, (len(bands), *mask.shape))
 
     def _composed(self, band: Band, options: WindowOptions) -> Values:
-        """Compose a band in a window, where a source covers the earlier ones, `(h, w)`."""
+        """Compose a band in a window, where a source covers the earlier ones.
+
+        Args:
+            band: the band.
+            options: the window, and the shape that it is read in.
+
+        Returns:
+            `(h, w)`.
+        """
         window = options["window"]
         height, width = options["out_shape"][-2:]
-        nothing = 0 if band.nodata is None else _as_kind(np.array(band.nodata), band.kind)
-        canvas = np.full((height, width), nothing, band.kind)
-        box = window.col_off, window.row_off, window.col_off + window.width, window.row_off + window.height
+        background = 0 if band.nodata is None else _as_kind(np.array(band.nodata), band.kind)
+        canvas = np.full((height, width), background, band.kind)
         x_scale = width / window.width
         y_scale = height / window.height
         is_reduced = max(x_scale, y_scale) < 1
         resampling = options["resampling"] if is_reduced else None
+        left = window.col_off
+        top = window.row_off
+        box = left, top, left + window.width, top + window.height
         for number in _touching(band.places, box):
             source = band.sources[number]
-            columns = _Side.of(source, 0, box[0], x_scale, width)
-            rows = _Side.of(source, 1, box[1], y_scale, height)
+            columns = _Side.of(source, 0, left, x_scale, width)
+            rows = _Side.of(source, 1, top, y_scale, height)
             if not columns.covered or not rows.covered:
                 continue
             values, present = self._values(source, columns, rows, resampling)

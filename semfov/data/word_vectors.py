@@ -202,6 +202,7 @@ def spread(
     similarity = vectors.similarity([description], classes)[0]
     has_words = ~similarity.isnan()
     check(bool(has_words.any()), "classes", "classes with words in the file of word vectors", ", ".join(classes))
-    weights = ((similarity - similarity[has_words].max()) / temperature).exp().nan_to_num(0)
+    largest = similarity[has_words].max()
+    weights = ((similarity - largest) / temperature).exp().nan_to_num(0)  # classes without words have none
     order = weights.argsort(descending=True, stable=True).tolist()
     return {classes[index]: float(weights[index]) for index in order if weights[index] >= least}

@@ -46,11 +46,17 @@ def class_digest(kind: type) -> str:
         sha256 in hexadecimal digits; for a class without a file a text that no other process has.
     """
     bases = [base for base in kind.__mro__ if base is kind or not belongs_to_others(base.__module__)]
-    modules = [str(base.__module__) for base in bases]
-    if any(source_file(module) is None for module in modules):
+    modules = [base.__module__ for base in bases]
+    has_files = all(source_file(module) is not None for module in modules)
+    if not has_files:
         return f"{kind.__qualname__}, process {_THIS_PROCESS}"
     packages = {_topmost(module) for module in modules} - {PACKAGE}
-    files = _closure(modules, lambda name: _topmost(name) in packages or not belongs_to_others(name))
+
+    def is_users(module: str) -> bool:
+        """Tell whether a module is of the packages of the class, or at least of no installed one."""
+        return _topmost(module) in packages or not belongs_to_others(module)
+
+    files = _closure(modules, is_users)
     return hashlib.sha256(f"{kind.__qualname__} {_digest(files)}".encode()).hexdigest()
 
 

@@ -317,6 +317,10 @@ def read_text(path: str | os.PathLike[str], otherwise: str | None = None, *, mos
         return content.decode(otherwise, "replace")
 
 
+JsonObject = dict[str, Any]
+"""An object of JSON: values of JSON by name."""
+
+
 def read_json(
     path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None, unique: bool = False
 ) -> Any:
@@ -343,7 +347,7 @@ def read_json(
         raise DataError(f"{name or path}: cannot be read as JSON ({reason}); correct or replace the file") from None
 
 
-def _with_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _with_unique_names(pairs: list[tuple[str, object]]) -> dict[str, object]:
     """Make an object of JSON from its names and values; raises `ValueError` for a name that stands twice."""
     values = dict(pairs)
     if len(values) < len(pairs):

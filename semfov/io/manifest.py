@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from semfov.errors import DataError, check_data
-from semfov.io.files import inside, read_json, sha256, write_text
+from semfov.io.compatibility import Settings
+from semfov.io.files import JsonObject, inside, read_json, sha256, write_text
 from semfov.io.schema import CLASSES, Array, Flag, Json, Maybe, Number, Object, Text, check_content
 from semfov.io.storage import check_version, checksum
 from semfov.version import __version__
@@ -67,7 +68,7 @@ class Part:
     sha256: str | None
     used: bool
     why: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: JsonObject = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,11 @@ class Manifest:
     """
 
     classes: tuple[str, ...]
-    detector: Mapping[str, Any]
-    sensor: Mapping[str, Any]
+    detector: Settings
+    sensor: Settings
     grid: tuple[int, int]
     parts: Mapping[str, Part]
-    training: Mapping[str, Any] = field(default_factory=dict)
+    training: JsonObject = field(default_factory=dict)
 
     def write(self, folder: str | PathLike[str]) -> Path:
         """Write the record into the folder atomically, and return the path of its file."""
@@ -118,11 +119,11 @@ class Manifest:
 _AGAIN = "run semfov fit again, or copy the folder again"
 
 
-def _read_record(path: Path) -> dict[str, Any]:
+def _read_record(path: Path) -> JsonObject:
     """Read the record of a folder, and verify its checksum, its version and its values."""
     if not path.exists():
         raise DataError(f"{path}: no such file; expected {_expected_folder(path.parent)}")
-    record: dict[str, Any] = read_json(path, most=_MOST_BYTES)
+    record: JsonObject = read_json(path, most=_MOST_BYTES)
     check_data(isinstance(record, dict), path, "an object", f"{type(record).__name__}; {_AGAIN}")
     recorded = record.pop("sha256", None)
     if recorded != checksum({}, record):

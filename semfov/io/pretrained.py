@@ -4,12 +4,13 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 from torch import Tensor
 
 from semfov.errors import DataError, InputError, check, lookup
 from semfov.io.compatibility import Settings, check_grid, check_same_detector, check_sensor
+from semfov.io.files import JsonObject
 from semfov.io.schema import Json, Object, Schema, Text
 from semfov.io.state import StatedModule, without_settings
 from semfov.io.storage import checksum, read, write_file
@@ -38,23 +39,23 @@ class Pretrained(StatedModule):
     title: ClassVar[str]
     shipped: ClassVar[Path]
     schema: ClassVar[Schema]
-    metadata: dict[str, Any]
+    metadata: JsonObject
 
     @abstractmethod
-    def _record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, object]:
         """List the JSON values that `_restore` needs in addition to tensors and metadata."""
 
     def _tensors(self) -> dict[str, Tensor]:
         """List the tensors that are saved."""
         return without_settings(self.state_dict())
 
-    def _stated(self) -> dict[str, Any]:
+    def _stated(self) -> dict[str, object]:
         """Select the values of the record that tell what the numbers are of."""
         return {name: value for name, value in self._record().items() if name in _STATED}
 
     @classmethod
     @abstractmethod
-    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: JsonObject, tensors: dict[str, Tensor]) -> Self:
         """Make the module from a record and tensors; raise any error where something is missing or does not fit."""
 
     def save(self, path: str | PathLike[str]) -> None:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,7 @@ class StatedModule(nn.Module):
     _setting_names: ClassVar[tuple[str, ...]] = ()
     """Names of the settings that are no parameters."""
 
-    def _stated(self) -> dict[str, Any]:
+    def _stated(self) -> dict[str, object]:
         """List the settings that are no parameters, as JSON values."""
         return {name: getattr(self, name) for name in self._setting_names}
 

@@ -6,13 +6,12 @@ import re
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from semfov.errors import DataError
-from semfov.io.files import check_regular, write_bytes
+from semfov.io.files import JsonObject, check_regular, write_bytes
 from semfov.io.schema import Schema
 from semfov.version import __version__
 
@@ -42,7 +41,7 @@ def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record:
     write_bytes(path, content)
 
 
-def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], JsonObject]:
     """Read a file that `write_file` made, and verify its checksum; nothing in the file is executed.
 
     Args:

@@ -2,12 +2,12 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from semfov.errors import check
+from semfov.io.files import JsonObject
 from semfov.observation.mle import Method, mle, shrink, vacuous
 from semfov.observation.statistics import DirichletStatistics
 
@@ -24,7 +24,7 @@ def fit_tables(
     shrinkage: float = 10.0,
     minimum: int = 100,
     enough: int | None = None,
-) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+) -> tuple[Tensor, Tensor, Tensor, JsonObject]:
     r"""Fit the parameters of an observation model, the maximum a posteriori.
 
     The mean log scores of a class at a level are shrunk to those of the class, and these by one sample to Dir(1, …, 1):

@@ -13,6 +13,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from semfov.detection.detector import Detector
 from semfov.errors import InputError, check, check_finite, check_shape, check_tensor, lookup, values_known
 from semfov.io import compatibility
+from semfov.io.files import JsonObject
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Field, Number, Schema
 from semfov.observation.dirichlet import floor, log_normaliser
@@ -120,14 +121,15 @@ class FovealObservationModel(Pretrained):
         miss_odds: Tensor | None = None,
         refutation: float | Tensor = 0.0,
         cell: Sequence[float] | Tensor = (0.001, 1.0, 0.25),
-        metadata: Mapping[str, Any] | None = None,
+        metadata: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__()
         check_tensor(alpha, "alpha")
         check(not isinstance(classes, str), "classes", "a sequence of names", repr(classes))
         components = len(classes) + 1
         borders = _checked_borders(edges, alpha)
-        shape = (components, len(borders) + 1, components)
+        levels = len(borders) + 1
+        shape = (components, levels, components)
         check(tuple(alpha.shape) == shape, "alpha", f"shape (K+1, N, K+1) = {shape}", tuple(alpha.shape))
         check_finite(alpha, "alpha")
         check(bool((alpha > 0).all()), "alpha", "positive numbers", float(alpha.detach().min()))
@@ -136,30 +138,33 @@ class FovealObservationModel(Pretrained):
         self.classes = tuple(classes)
         self.epsilon = epsilon
         self.metadata = dict(metadata or {})
-        self.log_alpha = nn.Parameter(alpha.detach().log())
-        self.register_buffer("edges", borders)
-        priors = _table(log_prior, "log_prior", shape[:2], alpha)
-        rates = _table(miss_rate, "miss_rate", shape[:2], alpha)
-        odds = _table(miss_odds, "miss_odds", shape[:2], alpha)
-        powers = _table(exponents, "exponents", shape[1:2], alpha)
-        refuted = torch.as_tensor(refutation).detach().to(alpha).clone()
-        of_cells = _table(torch.as_tensor(cell), "cell", (3,), alpha)
-        assert of_cells is not None
+
+        by_class_and_level = (components, levels)
+        priors = _table(log_prior, "log_prior", by_class_and_level, alpha)
+        if priors is None:
+            priors = alpha.new_zeros(by_class_and_level)
+        rates = _table(miss_rate, "miss_rate", by_class_and_level, alpha)
         if rates is not None:
             are_probabilities = bool(((rates >= 0) & (rates <= 1)).all())
             check(are_probabilities, "miss_rate", "probabilities", "numbers outside [0, 1]")
-        check(0 <= float(refuted) <= 1, "refutation", "a number from 0 to 1", refutation)
+        odds = _table(miss_odds, "miss_odds", by_class_and_level, alpha)
+        powers = _table(exponents, "exponents", (levels,), alpha)
+        if powers is None:
+            powers = alpha.new_ones(levels)
+        rho = torch.as_tensor(refutation).detach().to(alpha).clone()
+        check(0 <= float(rho) <= 1, "refutation", "a number from 0 to 1", refutation)
+        of_cells = _table(torch.as_tensor(cell), "cell", (3,), alpha)
+        assert of_cells is not None
+
+        self.log_alpha = nn.Parameter(alpha.detach().log())
+        self.register_buffer("edges", borders)
         self.register_buffer("expected", _table(expected, "expected", shape, alpha))
         self.register_buffer("miss_rate", rates)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
-        if priors is None:
-            priors = alpha.new_zeros(shape[:2])
-        if powers is None:
-            powers = alpha.new_ones(shape[1:2])
         self.log_prior = nn.Parameter(priors)
         self.log_exponents = nn.Parameter(powers.log())
         self.log_miss = None if odds is None else nn.Parameter(odds.log())
-        self.refutation = nn.Parameter(refuted)
+        self.refutation = nn.Parameter(rho)
         self.log_cell = nn.Parameter(of_cells.log())
 
     @classmethod
@@ -325,7 +330,7 @@ class FovealObservationModel(Pretrained):
         prior: bool = False,
         tempering: float = 1.0,
         expected: Literal["dirichlet", "empirical"] = "dirichlet",
-        **metadata: Any,
+        **metadata: object,
     ) -> Self:
         """Set α to its maximum a posteriori estimate, given the statistics of a training set.
 
@@ -371,7 +376,7 @@ class FovealObservationModel(Pretrained):
 
     def check_compatible(
         self,
-        settings: Mapping[str, Any] | None = None,
+        settings: compatibility.Settings | None = None,
         classes: Sequence[str] | None = None,
         background: str | None = None,
     ) -> None:
@@ -396,12 +401,12 @@ class FovealObservationModel(Pretrained):
         compatibility.check_same_detector(fitted, eye["detector"], self.title)
         compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}), self.title)
 
-    def _record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, object]:
         """List what a file holds beside tensors."""
         return {"classes": self.classes, "epsilon": self.epsilon}
 
     @classmethod
-    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: JsonObject, tensors: dict[str, Tensor]) -> Self:
         """Make the model of a file."""
         model = cls(
             tensors["log_alpha"].exp(),

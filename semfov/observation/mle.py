@@ -70,15 +70,9 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
     check(max_precision > 0, "max_precision", "a positive number", max_precision)
     solve = _METHODS[lookup(method, get_args(Method), "method")]
     rows = mean_log.detach().to(torch.float64).reshape(-1, components)
-    total = rows.exp().sum(-1)
-    largest = float(total.max()) if len(rows) else 0.0
-    expected = "mean logarithms of scores that sum to 1, so Σ exp(mean_log) up to 1"
-    check(largest <= 1 + _FEASIBLE, "mean_log", expected, f"Σ exp(mean_log) = {largest}")
-    # The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left, and it never
-    # exceeds A Σ exp(g) + K/2: so most rows are known to stay below the largest precision.
-    capped = 1 - total <= components / (2 * max_precision)
-    level = total.new_tensor(max_precision).digamma()
-    capped[capped.clone()] = inverse_digamma(level + rows[capped]).sum(-1) >= max_precision
+    _check_feasible(rows)
+
+    capped = _are_capped(rows, max_precision)
     alpha = torch.empty_like(rows)
     alpha[capped] = _at_precision(rows[capped], max_precision)
     # L-BFGS needs gradients of its own, which inference mode does not record.
@@ -90,6 +84,28 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
         change = mean_log.to(torch.float64).reshape(-1, components) - rows
         alpha = alpha + _response(alpha, change, capped)
     return alpha.reshape(mean_log.shape).to(mean_log.dtype)
+
+
+def _check_feasible(rows: Tensor) -> None:
+    """Raise `InputError` for mean logarithms `(N, K)` that no scores have which sum to 1."""
+    largest = float(rows.exp().sum(-1).max()) if len(rows) else 0.0
+    expected = "mean logarithms of scores that sum to 1, so Σ exp(mean_log) up to 1"
+    check(largest <= 1 + _FEASIBLE, "mean_log", expected, f"Σ exp(mean_log) = {largest}")
+
+
+def _are_capped(rows: Tensor, max_precision: float) -> Tensor:
+    """Tell for which mean logarithms `(N, K)` the maximum has at least the largest precision, `(N,)` boolean.
+
+    The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left.
+    """
+    # The right side never exceeds A Σ exp(g) + K/2: so most rows are known to stay below the largest precision.
+    slack = 1 - rows.exp().sum(-1)
+    capped = slack <= rows.shape[-1] / (2 * max_precision)
+    doubtful = capped.clone()
+    level = rows.new_tensor(max_precision).digamma()
+    precision = inverse_digamma(level + rows[doubtful]).sum(-1)
+    capped[doubtful] = precision >= max_precision
+    return capped
 
 
 def shrink(mean_log: Tensor, count: Tensor, parent: Tensor, strength: float) -> Tensor:
@@ -162,29 +178,51 @@ def _guess(y: Tensor) -> Tensor:
 
 
 def _at_precision(rows: Tensor, precision: float) -> Tensor:
-    """Find the maximum under the constraint Σ α = precision: ψ(α_k) = y + g_k, with y chosen to satisfy it."""
+    """Find the maximum under the constraint Σ α = precision: ψ(α_k) = y + g_k, with y chosen to satisfy it.
+
+    Args:
+        rows: g, `(N, K)`.
+        precision: the sum.
+
+    Returns:
+        α, `(N, K)`.
+    """
     level = math.log(precision) - rows.logsumexp(-1, keepdim=True)
     for _ in range(_ROUNDS):
         alpha = inverse_digamma(level + rows)
         total = alpha.sum(-1, keepdim=True)
-        step = (precision / total).log() * total / torch.polygamma(1, alpha).reciprocal().sum(-1, keepdim=True)
+        # Newton's method on ln Σ α, whose derivative by y is the sum of 1 / ψ'(α) over Σ α.
+        rates = torch.polygamma(1, alpha).reciprocal()
+        step = (precision / total).log() * total / rates.sum(-1, keepdim=True)
         level = level + step
-        if bool((step.abs() <= 1e-12 * level.abs().clamp(min=1)).all()):
+        has_converged = step.abs() <= 1e-12 * level.abs().clamp(min=1)
+        if bool(has_converged.all()):
             break
     return alpha * (precision / total)
 
 
 def _first_guess(rows: Tensor) -> Tensor:
-    """Guess α within about ten per cent: A = Σ ψ⁻¹(ψ(A) + g), solved with an approximate inverse of ψ."""
-    slack = (-torch.expm1(rows.logsumexp(-1, keepdim=True))).clamp(min=torch.finfo(rows.dtype).eps)
+    """Guess α within about ten per cent: A = Σ ψ⁻¹(ψ(A) + g), solved with an approximate inverse of ψ.
+
+    Args:
+        rows: g, `(N, K)`.
+
+    Returns:
+        α, `(N, K)`.
+    """
+    # For large A the slack 1 - Σ exp(g) is about (K - 1) / 2A.
+    slack = -torch.expm1(rows.logsumexp(-1, keepdim=True))
+    slack = slack.clamp(min=torch.finfo(rows.dtype).eps)
     log_precision = ((rows.shape[-1] - 1) / 2 / slack).log()
     for _ in range(3):
+        # Newton's method on ln A.
         precision = log_precision.exp()
         level = precision.digamma() + rows
         alpha = _guess(level)
-        rates = torch.where(level >= _KNEE, alpha - 0.5, alpha.square())
+        rates = torch.where(level >= _KNEE, alpha - 0.5, alpha.square())  # dα / d level
         total = alpha.sum(-1, keepdim=True)
-        slope = precision * torch.polygamma(1, precision) * rates.sum(-1, keepdim=True) / total - 1
+        total_rate = rates.sum(-1, keepdim=True)
+        slope = precision * torch.polygamma(1, precision) * total_rate / total - 1
         step = (total.log() - log_precision) / slope.clamp(max=-1e-9)
         log_precision = log_precision - step.clamp(-_LONGEST, _LONGEST)
     return _guess(log_precision.exp().digamma() + rows)
@@ -258,7 +296,14 @@ def _climbing(alpha: Tensor, step: Tensor, rows: Tensor) -> Tensor:
 
 
 def _fixed_point(rows: Tensor) -> Tensor:
-    """Maximise by Minka's fixed-point iteration, extrapolated; rows that have converged leave the iteration."""
+    """Maximise by Minka's fixed-point iteration, extrapolated; rows that have converged leave the iteration.
+
+    Args:
+        rows: g, `(N, K)`.
+
+    Returns:
+        α, `(N, K)`.
+    """
     result = torch.empty_like(rows)
     active = torch.arange(len(rows), device=rows.device)
     precision = _first_guess(rows).sum(-1)
@@ -267,10 +312,14 @@ def _fixed_point(rows: Tensor) -> Tensor:
         result[active] = alpha
         total = alpha.sum(-1)
         # Share of an error that is left after the round: d ln(Σ α) / d ln(A).
-        share = precision * torch.polygamma(1, precision) * torch.polygamma(1, alpha).reciprocal().sum(-1) / total
-        step = (total / precision).log() / (1 - share).clamp(min=torch.finfo(rows.dtype).eps)
+        total_rate = torch.polygamma(1, alpha).reciprocal().sum(-1)
+        share = precision * torch.polygamma(1, precision) * total_rate / total
+        # The changes of all further rounds are a geometric series.
+        change = (total / precision).log()
+        step = change / (1 - share).clamp(min=torch.finfo(rows.dtype).eps)
         going = step.abs() > _tolerance(total)
-        precision = (precision * step.clamp(-_LONGEST, _LONGEST).exp())[going]
+        precision = precision * step.clamp(-_LONGEST, _LONGEST).exp()
+        precision = precision[going]
         active = active[going]
         rows = rows[going]
         if len(active) == 0:

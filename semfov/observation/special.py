@@ -93,9 +93,12 @@ def _expand(c: float) -> tuple[tuple[float, ...], ...]:
     series = Polynomial([0.0])
     for k, term in enumerate(_STIRLING):
         series = series + term * inverse ** (2 * k + 1) * Polynomial([1 / (2 * k + 1), 1.0])
+    # The first coefficients are the values at c, where g is 0: they cancel in h.
+    rise = product.coef[1:]
+    slope = (fall * product.deriv()).coef
     rest = -series.coef[1:]
     rest[0] -= _SHIFT - 0.5
-    return tuple(product.coef[1:].tolist()), tuple((fall * product.deriv()).coef.tolist()), tuple(rest.tolist())
+    return tuple(rise.tolist()), tuple(slope.tolist()), tuple(rest.tolist())
 
 
 @lru_cache

@@ -3,12 +3,13 @@
 import math
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from semfov.errors import DataError, InputError, check, check_finite, check_shape
+from semfov.io.files import JsonObject
 from semfov.io.schema import Field, Number, Schema
 from semfov.io.storage import read, write_file
 
@@ -72,17 +73,21 @@ class DirichletStatistics:
         """
         self._check_simplex(scores)
         scores = scores.reshape(-1, self.components)
-        cells = self._cells(index, len(scores)).to(self.count.device)
-        count = self.count + torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
+        device = self.count.device
+        cells = self._cells(index, len(scores)).to(device)
+        added = torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
+        count = self.count + added
         self._check_room(count)
-        raised = scores.to(self.count.device, torch.float64).clamp(min=self.epsilon).contiguous()
+
+        raised = scores.to(device, torch.float64).clamp(min=self.epsilon).contiguous()
         # The sum is computed over integers, too: the last bit of a sum of floats can depend on the layout of the batch.
         total = (raised * 2.0**48).round().to(torch.int64).sum(-1, keepdim=True)
         shares = raised / (total.to(torch.float64) / 2.0**48)
-        terms = torch.stack([shares.log(), shares, shares.square()]) * 2.0**_FRACTION_BITS
+        terms = torch.stack([shares.log(), shares, shares.square()])
+        whole_terms = (terms * 2.0**_FRACTION_BITS).round().to(torch.int64)
         self.count = count
         sums_by_cell = self.sums.view(3, -1, self.components)
-        sums_by_cell.index_add_(1, cells, terms.round().to(torch.int64))
+        sums_by_cell.index_add_(1, cells, whole_terms)
         return self
 
     def _check_simplex(self, scores: Tensor) -> None:
@@ -95,8 +100,12 @@ class DirichletStatistics:
 
     def _cells(self, index: Tensor | Sequence[Tensor], samples: int) -> Tensor:
         """Check the cells of samples (`update`), and number them row by row, `(samples,)`."""
-        indices = (index,) if isinstance(index, Tensor) else tuple(index)
-        sizes = (self.count.numel(),) if isinstance(index, Tensor) else self.shape
+        if isinstance(index, Tensor):
+            indices: tuple[Tensor, ...] = (index,)
+            sizes: tuple[int, ...] = (self.count.numel(),)
+        else:
+            indices = tuple(index)
+            sizes = self.shape
         check(len(indices) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(indices))
         cells = torch.zeros(samples, dtype=torch.int64, device=indices[0].device)
         for row, size in zip(indices, sizes, strict=True):
@@ -164,7 +173,7 @@ class DirichletStatistics:
         self._check_room(pooled.count)
         return pooled
 
-    def save(self, path: str | PathLike[str], **record: Any) -> None:
+    def save(self, path: str | PathLike[str], **record: object) -> None:
         """Write the statistics to a safetensors file, atomically; the same sums give the same bytes.
 
         Args:
@@ -175,7 +184,7 @@ class DirichletStatistics:
         write_file(path, {"count": self.count, "sums": self.sums}, {**record, **settings})
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> tuple[Self, dict[str, Any]]:
+    def load(cls, path: str | PathLike[str]) -> tuple[Self, JsonObject]:
         """Load statistics that `save` wrote.
 
         Args:

@@ -64,18 +64,32 @@ def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: t
 
 @constant
 def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Lines:
-    """Make the matrix of Keys' cubic interpolation (a = -0.75) of pixels as areas; border pixels are repeated."""
+    """Make the matrix of Keys' cubic interpolation (a = -0.75) of pixels as areas; border pixels are repeated.
+
+    Args:
+        count: number of input pixels.
+        length: number of output pixels.
+        dtype: dtype of the matrix.
+        device: device of the matrix.
+
+    Returns:
+        The matrix.
+    """
     place = (torch.arange(length).double() + 0.5) * (count / length) - 0.5
     index = place.floor().long()[:, None] + torch.arange(-1, 3)
     distance = (place[:, None] - index).abs()
     a = -0.75
+    # Keys' two cubics: up to a distance of one pixel, and from one to two.
     inner = ((a + 2) * distance - (a + 3)) * distance**2 + 1
     outer = a * (((distance - 5) * distance + 8) * distance - 4)
-    taps = Taps(index.clamp(0, count - 1), torch.where(distance <= 1, inner, outer))
+    weight = torch.where(distance <= 1, inner, outer)
+    taps = Taps(index.clamp(0, count - 1), weight)
     ratio, rest = divmod(length, count)
-    # Tiles are evenly spaced only where the ratio is a whole number.
-    shift = count if rest else max(_TILE // ratio, 1)
-    return banded(taps, count, length if rest else shift * ratio, shift, 2, dtype, device)
+    if rest:
+        # Tiles are evenly spaced only where the ratio is a whole number: without it all is one tile.
+        return banded(taps, count, length, count, 2, dtype, device)
+    shift = max(_TILE // ratio, 1)
+    return banded(taps, count, shift * ratio, shift, 2, dtype, device)
 
 
 def rescale(saliency: Tensor, flat: float = 0.0) -> Tensor:

@@ -49,32 +49,52 @@ def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
     y = place[:, None]
     x = place[None, :]
     envelope = torch.exp(-(x**2 + y**2) / (2 * _SIGMA**2))
-    angles = torch.tensor(_ORIENTATIONS, dtype=torch.float64) * (pi / 180)
-    wave = 2 * pi / _PERIOD * (x * angles.cos()[:, None, None] + y * angles.sin()[:, None, None])
-    kernels = torch.stack([wave.cos(), -wave.sin()], 1).flatten(0, 1) * envelope
+    theta = torch.tensor(_ORIENTATIONS, dtype=torch.float64) * (pi / 180)
+    u = x * theta.cos()[:, None, None] + y * theta.sin()[:, None, None]
+    phase = 2 * pi / _PERIOD * u
+    waves = torch.stack([phase.cos(), -phase.sin()], 1).flatten(0, 1)
+    kernels = waves * envelope
     kernels = kernels - kernels.mean((-2, -1), keepdim=True)
-    return (kernels / kernels.abs().sum((-2, -1), keepdim=True)).to(device, dtype)[:, None]
+    kernels = kernels / kernels.abs().sum((-2, -1), keepdim=True)
+    return kernels.to(device, dtype)[:, None]
 
 
 def _promote(maps: Tensor) -> Tensor:
-    """Promote maps `(..., h, w)` with few peaks: `N(M) = M (1 - m)²` of Itti, Koch and Niebur (1998).
+    """Promote maps with few peaks: `N(M) = M (1 - m)²` of Itti, Koch and Niebur (1998).
 
     m is the mean of the local maxima above 0.1 other than the largest; a map of rounding errors alone becomes 0.
+
+    Args:
+        maps: M, `(..., h, w)`.
+
+    Returns:
+        N(M), `(..., h, w)`.
     """
     maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)
-    # Peaks are above their earlier neighbours and no less than their later ones, in row-major order.
+    peaks = _local_maxima(maps) & (maps > _PEAK)
+    count = peaks.sum((-2, -1), keepdim=True)
+    total = (maps * peaks).sum((-2, -1), keepdim=True)
+    # The largest maximum is exactly 1, and is always among the peaks.
+    mean_of_others = (total - 1) / (count - 1).clamp(min=1)
+    m = torch.where(count > 1, mean_of_others, 0.0)
+    return maps * (1 - m) ** 2
+
+
+def _local_maxima(maps: Tensor) -> Tensor:
+    """Tell which pixels of maps `(..., h, w)` are above their earlier neighbours and no less than their later ones.
+
+    Earlier and later are in row-major order, so that of equal neighbours one alone is a maximum.
+    """
     height, width = maps.shape[-2:]
     padded = F.pad(maps, (1, 1, 1, 1), value=-torch.inf)
     west = padded[..., :width]
     east = padded[..., 2:]
     rows = torch.maximum(torch.maximum(west, east), padded[..., 1:-1])
-    earlier = torch.maximum(rows[..., :height, :], west[..., 1:-1, :])
-    later = torch.maximum(rows[..., 2:, :], east[..., 1:-1, :])
-    peaks = (maps > earlier) & (maps >= later) & (maps > _PEAK)
-    count = peaks.sum((-2, -1), keepdim=True)
-    # The largest maximum is exactly 1, and is always among the peaks.
-    mean = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
-    return maps * (1 - torch.where(count > 1, mean, 0.0)) ** 2
+    row_above = rows[..., :height, :]
+    row_below = rows[..., 2:, :]
+    earlier = torch.maximum(row_above, west[..., 1:-1, :])
+    later = torch.maximum(row_below, east[..., 1:-1, :])
+    return (maps > earlier) & (maps >= later)
 
 
 def _conspicuity(image: Tensor) -> Tensor:

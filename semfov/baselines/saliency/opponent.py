@@ -84,11 +84,11 @@ def _opponencies(image: Tensor, intensity: Tensor, least: Tensor) -> Tensor:
     visible = intensity > least
     gain = visible / torch.where(visible, intensity, 1.0)
     r, g, b = (image * gain[:, None]).unbind(1)
-    mean = (r + g) / 2
+    mean_rg = (r + g) / 2
     red = F.relu(r - (g + b) / 2)
     green = F.relu(g - (r + b) / 2)
-    blue = F.relu(b - mean)
-    yellow = F.relu(mean - (r - g).abs() / 2 - b)
+    blue = F.relu(b - mean_rg)
+    yellow = F.relu(mean_rg - (r - g).abs() / 2 - b)
     return torch.stack([intensity, red - green, blue - yellow], 1)
 
 

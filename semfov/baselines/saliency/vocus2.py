@@ -46,21 +46,24 @@ def _twin_pyramids(
         The scales of each layer, largest first.
     """
     # Variances of successive blurs add up, so the surround is a further blur of the centre.
-    wider = (surround_sigma**2 - centre_sigma**2) ** 0.5
+    further_sigma = (surround_sigma**2 - centre_sigma**2) ** 0.5
     # From one scale to the next the variance grows by this factor.
     growth = 2 ** (2 / scales)
+
+    def step_from(scale: int) -> float:
+        """Compute the blur of the centre from a scale to the next one."""
+        return 2 ** (scale / scales) * centre_sigma * (growth - 1) ** 0.5
+
     centre = gaussian_blur(channels, centre_sigma)
     pyramids: list[list[_Twin]] = []
     for layer in range(min(layers, min(channels.shape[-2:]).bit_length())):
         if layer > 0:
-            centre = gaussian_blur(
-                centre, 2 ** ((scales - 1) / scales) * centre_sigma * (growth - 1) ** 0.5, halve=True
-            )
-        twins = [_Twin(centre, gaussian_blur(centre, wider))]
+            centre = gaussian_blur(centre, step_from(scales - 1), halve=True)
+        twins = [_Twin(centre, gaussian_blur(centre, further_sigma))]
         for scale in range(1, scales):
-            step = 2 ** ((scale - 1) / scales) * centre_sigma * (growth - 1) ** 0.5
-            centre = gaussian_blur(centre, step)
-            twins.append(_Twin(centre, gaussian_blur(centre, 2 ** (scale / scales) * wider)))
+            centre = gaussian_blur(centre, step_from(scale - 1))
+            surround = gaussian_blur(centre, 2 ** (scale / scales) * further_sigma)
+            twins.append(_Twin(centre, surround))
         pyramids.append(twins)
     return pyramids
 

@@ -200,22 +200,28 @@ class Fixations:
 
     def __post_init__(self) -> None:
         """Check that the arrays belong together; lists and tensors become arrays."""
+        points = as_array(self.points, "points")
         # The only way to set an attribute of a frozen dataclass.
-        object.__setattr__(self, "points", as_array(self.points, "points"))
+        object.__setattr__(self, "points", points)
         if self.durations is not None:
             object.__setattr__(self, "durations", as_array(self.durations, "durations"))
-        shape = self.points.shape
-        check(len(shape) == 2 and shape[1] == 2 and shape[0] > 0, "points", "(n, 2), at least one fixation", shape)
-        check(bool(np.isfinite(self.points).all()), "points", "finite numbers", "NaN or infinite ones")
+        are_points = points.ndim == 2 and points.shape[1] == 2 and len(points) > 0
+        check(are_points, "points", "(n, 2), at least one fixation", points.shape)
+        check(bool(np.isfinite(points).all()), "points", "finite numbers", "NaN or infinite ones")
         check_sides("size", self.size)
         if self.durations is not None:
-            check(self.durations.shape == shape[:1], "durations", f"{shape[0]} numbers", self.durations.shape)
-            are_times = bool(np.isfinite(self.durations).all() and (self.durations >= 0).all())
-            check(are_times, "durations", "milliseconds, 0 or more", self.durations.tolist()[:5])
+            self._check_durations(self.durations)
         if self.box is not None:
             x1, y1, x2, y2 = self.box
-            ordered = bool(np.isfinite(self.box).all()) and x1 <= x2 and y1 <= y2
-            check(ordered, "box", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", self.box)
+            is_finite = bool(np.isfinite(self.box).all())
+            check(is_finite and x1 <= x2 and y1 <= y2, "box", "(x1, y1, x2, y2) with x1 <= x2 and y1 <= y2", self.box)
+
+    def _check_durations(self, durations: _Values) -> None:
+        """Raise `InputError` unless durations `(n,)` are times, one for each fixation."""
+        count = len(self.points)
+        check(durations.shape == (count,), "durations", f"{count} numbers", durations.shape)
+        are_times = bool(np.isfinite(durations).all() and (durations >= 0).all())
+        check(are_times, "durations", "milliseconds, 0 or more", durations.tolist()[:5])
 
     def __len__(self) -> int:
         """Count the fixations, the first included."""
@@ -231,8 +237,11 @@ class Fixations:
             The converted record.
         """
         scale = np.array(size) / np.array(self.size)
-        box = None if self.box is None else _box(np.array(self.box).reshape(2, 2) * scale)
-        return replace(self, points=(self.points + 0.5) * scale - 0.5, size=size, box=box)
+        points = (self.points + 0.5) * scale - 0.5
+        box = None
+        if self.box is not None:
+            box = _box(np.array(self.box).reshape(2, 2) * scale)
+        return replace(self, points=points, size=size, box=box)
 
     def in_picture(
         self,
@@ -262,17 +271,25 @@ class Fixations:
         """
         check(scale is None or place is None, "place", "None beside scale, or scale=None", place)
         corner, scales = self._placement(size, scale, place)
-        box = None if self.box is None else _box((np.array(self.box).reshape(2, 2) - corner) / scales)
-        return replace(self, points=(self.points + 0.5 - corner) / scales - 0.5, size=size, box=box)
+        points = (self.points + 0.5 - corner) / scales - 0.5
+        box = None
+        if self.box is not None:
+            box = _box((np.array(self.box).reshape(2, 2) - corner) / scales)
+        return replace(self, points=points, size=size, box=box)
 
     def _placement(
         self, size: tuple[int, int], scale: float | None, place: tuple[float, float, float, float] | None
     ) -> tuple[_Values, _Values]:
-        """Find the corner of a picture on the frame, and screen pixels per picture pixel along x and y, `(2,)` both."""
-        letterbox = Letterbox(self.size, size)
+        """Find where a picture was shown; the arguments are those of `in_picture`.
+
+        Returns:
+            The corner of the picture on the frame, and screen pixels per picture pixel along x and y, `(2,)` both.
+        """
+        letterbox = Letterbox(self.size, size)  # which checks the sizes
         if scale is not None:
             check_number(scale, "scale", 1e-6, 1e6)
-            return (np.array(self.size) - scale * np.array(size)) / 2, np.array((scale, scale))
+            borders = np.array(self.size) - scale * np.array(size)
+            return borders / 2, np.array((scale, scale))
         if place is not None:
             sides = as_array(place, "place", finite=True)
             is_box = sides.shape == (4,) and bool((sides[2:] > 0).all())
