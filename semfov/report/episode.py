@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.placement import resize
+from semfov.io.compatibility import Settings
 from semfov.io.files import MADE_HERE
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import confident_detections
@@ -68,7 +69,7 @@ def episode_data(
     views: Sequence[Tensor] | None,
     *,
     name: str,
-    settings: Mapping[str, Any] | None = None,
+    settings: Settings | None = None,
     boxes: Tensor | None = None,
     classes: int | None = None,
     width: int = 416,
@@ -172,7 +173,7 @@ def object_data(record: Record) -> Data:
     }
 
 
-def _about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
+def _about_data(scanpath: Scanpath, settings: Settings | None) -> Data:
     """Tell detector, sensor and decision in words; None for parts that were not kept."""
     if settings is None and scanpath.stimulus is not None:
         settings = scanpath.stimulus.settings
@@ -199,7 +200,7 @@ def _cell_in_words(scanpath: Scanpath, cell: int) -> str:
     return f"column {column}, row {row}"
 
 
-def _sensor_in_words(sensor: Mapping[str, Any]) -> str:
+def _sensor_in_words(sensor: Settings) -> str:
     """Describe a fovea, or a sensor of another kind by its numbers."""
     if "sigma" in sensor and "growth" in sensor:
         return f"fovea of {sensor['sigma']:.0f} px in {sensor['reference']:.0f}, growth {sensor['growth']:g}"
@@ -208,21 +209,31 @@ def _sensor_in_words(sensor: Mapping[str, Any]) -> str:
 
 
 def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
-    """Tell the most confident detections of a look, each with its best classes and the place of its label."""
-    looked = confident_detections(scanpath.fixated[fixation].detections, _DETECTIONS)[0]
+    """Collect the most confident detections of a look.
+
+    Args:
+        scanpath: the record.
+        fixation: number of the look, from 0.
+
+    Returns:
+        Data of each: its box, its best classes with their scores, and the place of its label.
+    """
+    found = confident_detections(scanpath.fixated[fixation].detections, _DETECTIONS)[0]
     detections = []
-    for box, scores in zip(looked.boxes, looked.class_scores, strict=True):
+    for box, scores in zip(found.boxes, found.class_scores, strict=True):
         best = scores.topk(min(_SCORES, len(scores)))
-        named = [
-            [scanpath.classes[index + 1], rounded(score, 9)]
-            for score, index in zip(best.values.tolist(), best.indices.tolist(), strict=True)
-        ]
-        detections.append({"box": [round(x, 1) for x in box.tolist()], "label": named[0][0], "scores": named})
+        classes = []
+        for score, index in zip(best.values.tolist(), best.indices.tolist(), strict=True):
+            classes.append([scanpath.classes[index + 1], rounded(score, 9)])
+        best_class = classes[0][0]
+        detections.append({"box": [round(x, 1) for x in box.tolist()], "label": best_class, "scores": classes})
     width, height = scanpath.grid.extent.tolist()
     texts = [f"{number} {detection['label']}" for number, detection in enumerate(detections, 1)]
+    # No label covers the mark of the gaze.
     x, y = (scanpath.fixations[fixation] + 0.5).tolist()
-    reach = 14 * width / 640  # of the mark of the gaze, which no label covers
-    return tagged(detections, texts, (width, height), [(x - reach, y - reach, x + reach, y + reach)])
+    reach = 14 * width / 640
+    mark = (x - reach, y - reach, x + reach, y + reach)
+    return tagged(detections, texts, (width, height), [mark])
 
 
 def tagged(
@@ -271,9 +282,11 @@ def _map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
 
 def _quantised(values: Tensor) -> Data:
     """Encode numbers of 0 or more in 255 steps of their maximum, in row-major order, in base 64."""
-    greatest = max(float(values.max()), 1e-12)
-    steps = (values.detach().cpu().double() / greatest * 255).round().to(torch.uint8)
-    return {"max": rounded(greatest), "data": base64.b64encode(np.ascontiguousarray(steps.numpy()).tobytes()).decode()}
+    greatest = max(float(values.max()), 1e-12)  # a map of zeros is not divided by 0
+    shares = values.detach().cpu().double() / greatest
+    steps = (shares * 255).round().to(torch.uint8)
+    data = np.ascontiguousarray(steps.numpy()).tobytes()
+    return {"max": rounded(greatest), "data": base64.b64encode(data).decode()}
 
 
 def rounded(value: float, digits: int = 4) -> float | None:

@@ -34,8 +34,9 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
         `picture`, for the script: its result in words, shares of the fixations as bytes, borders and scanpaths; and
         `facts`, HTML.
     """
-    steps = min(max(map(len, scanpaths)), _MOST_STEPS)
-    maps = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
+    longest = max(map(len, scanpaths))
+    steps = min(longest, _MOST_STEPS)
+    densities = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
     boxes = {} if areas is None else prediction.areas(areas)
     shares = {} if areas is None else prediction.share(areas)
     picture = {
@@ -44,13 +45,18 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
         "size": list(prediction.size),
         "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
         "cells": list(prediction.cells.shape),
-        "maps": [_bytes_of_map(density) for density in maps],
-        "borders": [_borders(density, prediction.size) for density in maps],
-        "paths": [[[round(x, 1), round(y, 1)] for x, y in path.points.tolist()] for path in scanpaths],
+        "maps": [_bytes_of_map(density) for density in densities],
+        "borders": [_borders(density, prediction.size) for density in densities],
+        "paths": [_rounded_points(scanpath) for scanpath in scanpaths],
         "first": [[place["x"], place["y"]] for place in prediction.first_fixations()],
         "areas": [[f"{name} {percent(shares[name])}", *box] for name, box in boxes.items()],
     }
     return {"picture": picture, "facts": _facts(prediction, shares)}
+
+
+def _rounded_points(scanpath: Fixations) -> list[list[float]]:
+    """List the points of a scanpath to a tenth of a pixel, which is finer than the page shows."""
+    return [[round(x, 1), round(y, 1)] for x, y in scanpath.points.tolist()]
 
 
 def _bytes_of_map(density: Tensor) -> str:

@@ -72,21 +72,30 @@ def _legend(data: Data) -> list[tuple[str, str]]:
 
 
 def _overview(data: Data, place: str) -> str:
-    """Draw the picture with named objects and numbered windows."""
+    """Draw the picture with named objects and numbered windows.
+
+    Args:
+        data: data of the record.
+        place: id of the article.
+
+    Returns:
+        SVG.
+    """
     width, height = data["size"]
     unit = max(width, height) / 640  # the drawing is about 640 pixels of the screen wide
     windows = [(number, look["box"]) for number, look in enumerate(data["looks"], 1) if not look["whole"]]
-    sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
-    tags = place_labels([_corners(box) for _, box in windows], sizes, (width, height))
+    tag_sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
+    window_boxes = [_corners(box) for _, box in windows]
+    tags = place_labels(window_boxes, tag_sizes, (width, height))
+
+    # What comes later lies over what was drawn before.
     shapes = [rect(box, "truth") for box in data["truth"]]
     shapes += _object_shapes(data, unit, tags)
     if data["best"]:
         shapes.append(f'<g class="best"><title>best place</title>{framed(data["best"])}</g>')
     for (number, box), tag in zip(windows, tags, strict=True):
-        x = (tag[0] + tag[2]) / 2
-        y = (tag[1] + tag[3]) / 2
-        text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
-        shapes.append(f'<g class="window" data-look="{number - 1}">{framed(box)}{rect(tag, "tag")}{text}</g>')
+        shapes.append(_window_shape(number, box, tag, unit))
+
     objects = f"{data['count']} object{'s' if data['count'] != 1 else ''}"
     label = f"The picture with {len(windows)} numbered {_view_word(data)}s and {objects}"
     return (
@@ -94,6 +103,15 @@ def _overview(data: Data, place: str) -> str:
         f"{picture(data['image'], (width, height), f'{place}-picture')}{''.join(shapes)}"
         f'<g class="chosen"></g></svg>'
     )
+
+
+def _window_shape(number: int, box: Sequence[float], tag: LabelBox, unit: float) -> str:
+    """Draw the window of a look, with the look's number in the middle of a rectangle, its tag."""
+    left, top, right, bottom = tag
+    x = (left + right) / 2
+    y = (top + bottom) / 2
+    text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
+    return f'<g class="window" data-look="{number - 1}">{framed(box)}{rect(tag, "tag")}{text}</g>'
 
 
 def _corners(box: Sequence[float]) -> LabelBox:
@@ -113,27 +131,38 @@ def _object_shapes(data: Data, unit: float, obstacles: Sequence[LabelBox]) -> li
         SVG of each object.
     """
     width, height = data["size"]
-    names = [f"{found['label']} {found['score']:.2f}" for found in data["objects"]]
+    objects = data["objects"]
+    names = [f"{found['label']} {found['score']:.2f}" for found in objects]
     sizes = [(unit * (6.3 * len(name) + 4), unit * 13) for name in names]
-    corners = [_corner_places(found["box"], size) for found, size in zip(data["objects"], sizes, strict=True)]
-    places = place_within(corners, sizes, (width, height), obstacles)
+    candidates = [_corner_places(found["box"], size) for found, size in zip(objects, sizes, strict=True)]
+    labels = place_within(candidates, sizes, (width, height), obstacles)
     shapes = []
-    for order, (found, name, label) in enumerate(zip(data["objects"], names, places, strict=True), 1):
-        x = label[0] + 2 * unit
-        y = (label[1] + label[3]) / 2
+    for order, (found, name, label) in enumerate(zip(objects, names, labels, strict=True), 1):
+        left, top, _, bottom = label
+        x = left + 2 * unit
+        y = (top + bottom) / 2
         text = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{escape(name)}</text>'
         kind = "object confirmed" if found["confirmed"] else "object"
         confirmed = ", confirmed" if found["confirmed"] else ""
         title = f"<title>{escape(name)}{confirmed}, look {found['look']}</title>"
-        inside = f"{title}{framed(found['box'])}{text}"
-        shapes.append(f'<g class="{kind}" data-look="{found["look"] - 1}" data-object="{order}">{inside}</g>')
+        content = f"{title}{framed(found['box'])}{text}"
+        shapes.append(f'<g class="{kind}" data-look="{found["look"] - 1}" data-object="{order}">{content}</g>')
     return shapes
 
 
 def _corner_places(box: Sequence[float], size: tuple[float, float]) -> list[tuple[float, float]]:
-    """List the places of a name of `(width, height)` at the borders of a box and beside it, left upper corners."""
+    """List the places of a name at the borders of a box and beside it.
+
+    Args:
+        box: `(x1, y1, x2, y2)`.
+        size: `(width, height)` of the name.
+
+    Returns:
+        Left upper corners of the name.
+    """
     x1, y1, x2, y2 = box
     width, height = size
+    # Middles of the name: inside and outside at the left and at the right, on the upper and on the lower border.
     columns = (x1 + width / 2, x2 - width / 2, x1 - width / 2, x2 + width / 2)
     rows = (y1 - height / 2, y2 + height / 2)
     return [(x - width / 2, y - height / 2) for x in columns for y in rows]
@@ -158,7 +187,15 @@ def _look(data: Data, index: int, place: str) -> str:
 
 
 def _detection_shapes(look: Data, target: str | None) -> str:
-    """Draw the detections of a look, and over all boxes their numbers."""
+    """Draw the detections of a look, and over all boxes their numbers.
+
+    Args:
+        look: data of the look.
+        target: name of the class that was searched for; None for none.
+
+    Returns:
+        SVG.
+    """
     unit = look["size"][0] / 640
     boxes = []
     tags = []
@@ -166,10 +203,13 @@ def _detection_shapes(look: Data, target: str | None) -> str:
         kind = "detection target" if detection["label"] == target else "detection"
         boxes.append(f'<g class="{kind}">{framed(detection["box"])}</g>')
         left, top, right, bottom = detection["tag"]
+        x = left + 4 * unit
+        y = (top + bottom) / 2
         # Fonts of browsers differ: the text is stretched or squeezed into its rectangle.
+        length = max(right - left - 8 * unit, 0)
         text = (
-            f'<text x="{left + 4 * unit:.1f}" y="{(top + bottom) / 2:.1f}" font-size="{19 * unit:.1f}" '
-            f'textLength="{max(right - left - 8 * unit, 0):.1f}" lengthAdjust="spacingAndGlyphs">{order}</text>'
+            f'<text x="{x:.1f}" y="{y:.1f}" font-size="{19 * unit:.1f}" '
+            f'textLength="{length:.1f}" lengthAdjust="spacingAndGlyphs">{order}</text>'
         )
         tags.append(f'<g class="{kind}">{rect(detection["tag"], "tag")}{text}</g>')
     return "".join(boxes + tags)

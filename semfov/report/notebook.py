@@ -8,6 +8,7 @@ from torch import Tensor
 from semfov.paths import Record, Scanpath
 from semfov.report.episode import episode_data, jpeg_uri
 from semfov.report.page import page_html
+from semfov.viz.labels import at_both_ends
 from semfov.viz.style import FOUND, GAZE, TARGET
 
 _MOST_CHARACTERS = 3_000_000  # largest number of bytes that a scanpath adds to a notebook's file
@@ -67,21 +68,17 @@ def _object_shapes(record: Record, unit: float) -> list[str]:
     shapes = []
     for row in record.object_rows()[:_MOST]:
         name = escape(f"{row['class']} {row['score']:.2f}")
-        title = f"<title>{name}{', confirmed' * row['confirmed']}</title>"
-        colour, line = (FOUND, 2 * unit) if row["confirmed"] else (TARGET, 1.2 * unit)
+        confirmed = ", confirmed" if row["confirmed"] else ""
+        title = f"<title>{name}{confirmed}</title>"
+        colour = FOUND if row["confirmed"] else TARGET
+        line = 2 * unit if row["confirmed"] else 1.2 * unit
         box = (row["x1"], row["y1"], row["x2"], row["y2"])
-        shapes += [_rect(part, colour, line, title) for part in _at_both_ends(box, width)]
+        shapes += [_rect(part, colour, line, title) for part in at_both_ends(box, width)]
     if record.best_place is not None:
         place, chance = record.best_place
         title = f"<title>best place {chance:.2f}</title>"
-        shapes += [_rect(box, FOUND, 2 * unit, title, dashed=True) for box in _at_both_ends(place.tolist(), width)]
+        shapes += [_rect(box, FOUND, 2 * unit, title, dashed=True) for box in at_both_ends(place.tolist(), width)]
     return shapes
-
-
-def _at_both_ends(box: Sequence[float], width: float) -> list[tuple[float, float, float, float]]:
-    """Repeat a box that crosses the seam of a panorama at its other end."""
-    x1, y1, x2, y2 = box
-    return [(x1 - shift, y1, x2 - shift, y2) for shift in ((0, width) if x2 > width else (0,))]
 
 
 def _key(record: Record) -> str:

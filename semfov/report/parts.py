@@ -137,11 +137,14 @@ class Part(ABC):
         source, left, top = self.crop_source(found)
         x1, y1, x2, y2 = found["box"]
         margin = 0.1 * max(x2 - x1, y2 - y1, 1)
-        across = x2 - x1 + 2 * margin
-        down = y2 - y1 + 2 * margin
-        view = f"{x1 - left - margin:.1f} {y1 - top - margin:.1f} {across:.1f} {down:.1f}"
-        width = f"width: {min(4.0, 3 * across / down):.2f}rem"
-        return f'<svg class="crop" viewBox="{view}" style="{width}" aria-hidden="true"><use href="#{source}"/></svg>'
+        x = x1 - left - margin
+        y = y1 - top - margin
+        width = x2 - x1 + 2 * margin
+        height = y2 - y1 + 2 * margin
+        view = f"{x:.1f} {y:.1f} {width:.1f} {height:.1f}"
+        rem = min(4.0, 3 * width / height)  # a crop is 3 rem high, and narrower where it is wide
+        style = f"width: {rem:.2f}rem"
+        return f'<svg class="crop" viewBox="{view}" style="{style}" aria-hidden="true"><use href="#{source}"/></svg>'
 
 
 class EpisodePart(Part):

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from semfov.errors import check
 from semfov.io.files import write_text
@@ -43,7 +43,7 @@ def write_html(path: Path, html: str) -> Path:
     return path
 
 
-def filled(name: str, data: Mapping[str, Any], contents: Mapping[str, str]) -> str:
+def filled(name: str, data: Mapping[str, object], contents: Mapping[str, str]) -> str:
     """Fill a template: head, controls, foot and script of all pages, its own, data, and contents.
 
     Args:

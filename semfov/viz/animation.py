@@ -159,23 +159,46 @@ def write_webp(
 
 
 def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[PillowImage]:
-    """Convert frames `(H, W, 3)` to Pillow images with a common palette, without which static parts would flicker."""
+    """Convert frames to images with a common palette, without which static parts would flicker.
+
+    Args:
+        frames: `(H, W, 3)` each.
+        most: number of frames that the palette is made from.
+
+    Returns:
+        The images.
+    """
     from PIL import Image
 
-    chosen = [frames[round(n)] for n in np.linspace(0, len(frames) - 1, min(most, len(frames)))]
-    palette = Image.fromarray(np.concatenate([frame[::2, ::2] for frame in chosen])).quantize(256)
+    numbers = np.linspace(0, len(frames) - 1, min(most, len(frames)))
+    # Every second pixel of a few frames has all colours.
+    samples = [frames[round(number)][::2, ::2] for number in numbers]
+    palette = Image.fromarray(np.concatenate(samples)).quantize(256)
     colours = np.array(palette.getpalette()).reshape(-1, 3)
     # Most of a figure is white, but the palette's mean of nearly white pixels is not: make it white.
-    colours[(colours >= 244).all(-1)] = 255
+    is_nearly_white = (colours >= 244).all(-1)
+    colours[is_nearly_white] = 255
     palette.putpalette(colours.flatten().tolist())
     return [Image.fromarray(frame).quantize(palette=palette) for frame in frames]
 
 
 def _save_mp4(ffmpeg: str, frames: Sequence[_Frame], path: Path, seconds: float, hold: float) -> Path:
-    """Write frames as an MP4 by ffmpeg; the last one is repeated to hold it."""
+    """Write frames as an MP4.
+
+    Args:
+        ffmpeg: the program.
+        frames: `(H, W, 3)` each.
+        path: the file.
+        seconds: duration of a frame.
+        hold: additional seconds of the last frame.
+
+    Returns:
+        The path.
+    """
     height, width = frames[0].shape[:2]
-    repeated = 1 + round(hold / seconds)
-    pixels = b"".join(frame.tobytes() for frame in [*frames[:-1], *[frames[-1]] * repeated])
+    # The last frame is repeated to hold it.
+    repeats = round(hold / seconds)
+    pixels = b"".join(frame.tobytes() for frame in [*frames, *[frames[-1]] * repeats])
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{1 / seconds:g}", "-i", "-"]
     # Players need even sizes, 4:2:0 colour and more than one frame per second.
     options = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-r", "10", "-f", "mp4"]
@@ -183,5 +206,6 @@ def _save_mp4(ffmpeg: str, frames: Sequence[_Frame], path: Path, seconds: float,
         command = [ffmpeg, "-loglevel", "error", "-y", *source, *options, str(temporary)]
         done = subprocess.run(command, input=pixels, capture_output=True, check=False)
         if done.returncode:
-            raise DataError(f"{path}: ffmpeg failed: {done.stderr.decode(errors='replace').strip()}")
+            reason = done.stderr.decode(errors="replace").strip()
+            raise DataError(f"{path}: ffmpeg failed: {reason}")
     return path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
+    from mpl_toolkits.mplot3d import Axes3D
 
 
 def class_posterior(scanpath: Scanpath, target: int | None = None) -> tuple[Tensor, str]:
@@ -156,7 +157,7 @@ def plot_belief_bars(
     return root(panels[0])
 
 
-def _solid_axes(axes: Sequence[Axes] | None, count: int) -> list[Any]:
+def _solid_axes(axes: Sequence[Axes] | None, count: int) -> list[Axes3D]:
     """Check the given axes in 3D, of which there are `count`, or make a figure with them in a row."""
     from matplotlib.figure import Figure
 
@@ -169,7 +170,7 @@ def _solid_axes(axes: Sequence[Axes] | None, count: int) -> list[Any]:
     return list(axes)
 
 
-def _draw_bars(panel: Any, grid: Grid, bars: NDArray[np.float32], highest: float) -> None:
+def _draw_bars(panel: Axes3D, grid: Grid, bars: NDArray[np.float32], highest: float) -> None:
     """Draw a bar for each cell.
 
     Args:
@@ -180,17 +181,21 @@ def _draw_bars(panel: Any, grid: Grid, bars: NDArray[np.float32], highest: float
     """
     from matplotlib import colormaps
 
-    column, row = (index.ravel() for index in np.meshgrid(np.arange(grid.columns), np.arange(grid.rows)))
+    columns = np.arange(grid.columns)
+    rows = np.arange(grid.rows)
+    column, row = (index.ravel() for index in np.meshgrid(columns, rows))
     # Rows grow downwards in the picture and backwards in the plot.
     depth = grid.rows - 1 - row
     colours = colormaps[PROBABILITY](bars / highest)
     panel.bar3d(column + 0.1, depth + 0.1, 0, 0.8, 0.8, bars, color=colours, shade=True)
     panel.view_init(elev=32, azim=-65)
     panel.set(xlim=(0, grid.columns), ylim=(0, grid.rows), zlim=(0, highest), xlabel="column", ylabel="row")
-    columns = range(0, grid.columns, max(1, grid.columns // 5))
-    rows = range(0, grid.rows, max(1, grid.rows // 5))
-    panel.set_xticks([n + 0.5 for n in columns], [str(n) for n in columns])
-    panel.set_yticks([grid.rows - 0.5 - n for n in rows], [str(n) for n in rows])
+
+    # About five numbers on each axis, in the middles of their cells.
+    numbered_columns = columns[:: max(1, grid.columns // 5)]
+    numbered_rows = rows[:: max(1, grid.rows // 5)]
+    panel.set_xticks(numbered_columns + 0.5, [str(n) for n in numbered_columns])
+    panel.set_yticks(grid.rows - 0.5 - numbered_rows, [str(n) for n in numbered_rows])
     panel.tick_params(labelsize=7, pad=-1)
     panel.xaxis.labelpad = panel.yaxis.labelpad = -5
     panel.set_box_aspect((4, 4, 2.6), zoom=1.05)

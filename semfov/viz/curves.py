@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.errors import check
 from semfov.metrics.calibration import reliability
-from semfov.viz.style import COLOURS, line_style, make_figure, only, styled
+from semfov.viz.style import COLOURS, LineStyle, line_style, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,22 +58,12 @@ def plot_curves(
     check(len(curves) > 0, "curves", "at least one curve", 0)
     figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, axes=only(ax))
     named = highlighted(curves)
-    rest = [name for name in curves if name not in named]
-    label_of_rest: str | None = f"{len(rest)} other{'s' if len(rest) != 1 else ''}"
-    for name in rest:
-        shifts = np.arange(len(curves[name]))
-        axes.plot(shifts, 100 * curves[name], color=_REST, linewidth=0.8, label=label_of_rest, zorder=1)
-        label_of_rest = None  # one entry of the legend stands for all
+    _draw_grey_curves(axes, [curve for name, curve in curves.items() if name not in named])
     for order, name in enumerate(named):
-        style = line_style(order, len(named))
-        shifts = np.arange(len(curves[name]))
-        axes.plot(shifts, 100 * curves[name], label=name, linewidth=1.6, **style)
         error = None if errors is None else errors.get(name)
-        if error is not None and np.isfinite(error).all():
-            low = 100 * (curves[name] - error)
-            high = 100 * (curves[name] + error)
-            axes.fill_between(shifts, low, high, color=style["color"], alpha=0.15, lw=0)
-    axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
+        _draw_curve(axes, name, curves[name], error, line_style(order, len(named)))
+    longest = max(len(curve) for curve in curves.values())
+    axes.set_xlim(0, longest - 1)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3, linewidth=0.5)
     axes.set(xlabel="gaze shifts", ylabel=label, title=title)
@@ -86,6 +76,31 @@ def plot_curves(
     if most is not None:
         axes.set_ylim(0, most)
     return figure
+
+
+def _draw_grey_curves(axes: Axes, curves: Sequence[NDArray[np.float64]]) -> None:
+    """Draw the curves that the legend does not name, with one entry that counts them."""
+    text: str | None = f"{len(curves)} other{'s' if len(curves) != 1 else ''}"
+    for curve in curves:
+        shifts = np.arange(len(curve))
+        axes.plot(shifts, 100 * curve, color=_REST, linewidth=0.8, label=text, zorder=1)
+        text = None  # the entry of the first stands for all
+
+
+def _draw_curve(
+    axes: Axes,
+    name: str,
+    curve: NDArray[np.float64],
+    error: NDArray[np.float64] | None,
+    style: LineStyle,
+) -> None:
+    """Draw a curve of shares with its band of one standard error, where all errors are known."""
+    shifts = np.arange(len(curve))
+    axes.plot(shifts, 100 * curve, label=name, linewidth=1.6, **style)
+    if error is not None and np.isfinite(error).all():
+        low = 100 * (curve - error)
+        high = 100 * (curve + error)
+        axes.fill_between(shifts, low, high, color=style["color"], alpha=0.15, lw=0)
 
 
 def highlighted(curves: _Curves) -> list[str]:
@@ -117,15 +132,17 @@ def plot_reliability(
     """
     figure, (above, below) = make_figure(2, 1, width=4.4, height=5.4, ratios=[3, 1], axes=axes)
     above.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfectly calibrated")
+    borders = np.linspace(0, 1, bins + 1)
     for order, (name, (probabilities, labels)) in enumerate(predictions.items()):
         confidence, predicted = probabilities.detach().cpu().max(-1)
-        count, confident, right = reliability(confidence, predicted == labels.cpu(), bins).numpy()
-        filled = count >= _LEAST_IN_BIN
+        is_right = predicted == labels.cpu()
+        count, confidence_sum, right = reliability(confidence, is_right, bins).numpy()
+        enough = count >= _LEAST_IN_BIN
+        mean_confidence = confidence_sum[enough] / count[enough]
+        accuracy = right[enough] / count[enough]
         style = line_style(order, len(predictions))
-        mean_confidence = confident[filled] / count[filled]
-        accuracy = right[filled] / count[filled]
         above.plot(mean_confidence, accuracy, marker="o", markersize=4, label=name, **style)
-        below.stairs(count / count.sum(), np.linspace(0, 1, bins + 1), linewidth=1.4, **style)
+        below.stairs(count / count.sum(), borders, linewidth=1.4, **style)
     above.set(xlim=(0, 1), ylim=(0, 1), ylabel="fraction correct")
     above.legend(loc="upper left")
     above.grid(alpha=0.3, linewidth=0.5)

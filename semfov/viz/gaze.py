@@ -93,13 +93,15 @@ def draw_gaze(axes: Axes, prediction: GazePrediction, cells: Tensor) -> None:
     width, height = prediction.size
     draw_image(axes, prediction.image, Grid(1, 1, prediction.size))
     # Between cells the logarithm is interpolated, as for the density over the pixels.
-    finer = F.interpolate(cells.double().log()[None, None], scale_factor=_FINER, mode="bilinear")[0, 0].exp()
+    log_density = cells.double().log()
+    finer = F.interpolate(log_density[None, None], scale_factor=_FINER, mode="bilinear")[0, 0].exp()
     shares = shares_around(finer / finer.sum()).numpy()
     rows, columns = shares.shape
     x = (np.arange(columns) + 0.5) * width / columns
     y = (np.arange(rows) + 0.5) * height / rows
     axes.contourf(x, y, shares, levels=[0, *_BANDS], cmap=share_colours(), vmin=0, vmax=1)
-    lines = axes.contour(x, y, shares, levels=[*_BORDERS], colors="white", linewidths=[*_BORDERS.values()])
+    widths = [*_BORDERS.values()]
+    lines = axes.contour(x, y, shares, levels=[*_BORDERS], colors="white", linewidths=widths)
     lines.set(path_effects=[withStroke(linewidth=2.8, foreground="black", alpha=0.5)])
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
 

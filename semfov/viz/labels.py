@@ -10,6 +10,21 @@ _Size = tuple[float, float]
 _Point = tuple[float, float]
 
 
+def at_both_ends(box: Sequence[float], width: float) -> list[LabelBox]:
+    """Repeat a box that crosses the seam of a panorama at its other end.
+
+    Args:
+        box: `(x1, y1, x2, y2)`.
+        width: width of the picture.
+
+    Returns:
+        The box, and where it reaches beyond the right border a second one.
+    """
+    x1, y1, x2, y2 = box
+    shifts = (0, width) if x2 > width else (0,)
+    return [(x1 - shift, y1, x2 - shift, y2) for shift in shifts]
+
+
 def place_labels(
     boxes: Sequence[LabelBox], sizes: Sequence[_Size], frame: _Size, obstacles: Sequence[LabelBox] = ()
 ) -> list[LabelBox]:
@@ -48,19 +63,32 @@ def place_numbers(
         The rectangle of each number; None where there is no room.
     """
     placed: list[LabelBox] = []
-    places: list[LabelBox | None] = [None] * len(points)
+    labels: list[LabelBox | None] = [None] * len(points)
     ends = [len(points) - 1, 0] if len(points) > 1 else [0]
     for number in [*ends, *range(1, len(points) - 1)]:
-        width, height = sizes[number]
-        others = [point for point in points if point != points[number]]
-        for x, y in _around(points[number], (width, height), reach):
-            label = _into(x - width / 2, y - height / 2, width, height, frame)
-            covers_label = any(boxes_meet(label, other) for other in placed)
-            if not covers_label and not any(_inside(point, label) for point in others):
-                places[number] = label
-                placed.append(label)
-                break
-    return places
+        other_points = [point for point in points if point != points[number]]
+        label = _free_place(points[number], sizes[number], frame, reach, placed, other_points)
+        if label is not None:
+            labels[number] = label
+            placed.append(label)
+    return labels
+
+
+def _free_place(
+    point: _Point,
+    size: _Size,
+    frame: _Size,
+    reach: float,
+    placed: Sequence[LabelBox],
+    points: Sequence[_Point],
+) -> LabelBox | None:
+    """Find the first rectangle around a point that covers neither one that is placed nor some points; None for none."""
+    width, height = size
+    for x, y in _around(point, size, reach):
+        label = _into(x - width / 2, y - height / 2, width, height, frame)
+        if not _covered(label, placed) and not any(_inside(other, label) for other in points):
+            return label
+    return None
 
 
 def _inside(point: _Point, box: LabelBox) -> bool:

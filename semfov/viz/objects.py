@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.paths import Record
+from semfov.paths.conversion import Values
 from semfov.viz.drawing import Tag, draw_boxes, draw_grid, draw_image, draw_tags
-from semfov.viz.labels import LabelBox
+from semfov.viz.labels import LabelBox, at_both_ends
 from semfov.viz.style import FOUND, TARGET, TRUTH
 
 if TYPE_CHECKING:
@@ -23,11 +24,15 @@ _LABELLED = 60  # largest number of objects that have labels
 _LEGEND_LETTERS = 115  # largest number of letters of a legend in one line
 
 
+_Dashes = Literal["-", "--", ":"]
+"""Styles of lines, as matplotlib names them: solid, dashed and dotted."""
+
+
 class LegendEntry(NamedTuple):
     """Entry of a legend: colour, line style and text."""
 
     colour: str
-    line: str
+    line: _Dashes
     text: str
 
 
@@ -39,7 +44,7 @@ class Mark(NamedTuple):
 
     box: LabelBox
     colour: str
-    line: str
+    line: _Dashes
     width: float
     text: str | None = None
 
@@ -96,10 +101,10 @@ def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:
 
     if not entries:
         return
-    styles: list[dict[str, Any]] = [{"color": entry.colour, "linestyle": entry.line} for entry in entries]
+    lines = [Line2D([], [], linewidth=1.8, color=entry.colour, linestyle=entry.line) for entry in entries]
     letters = sum(len(entry.text) + 6 for entry in entries)
     legend = axes.legend(
-        [Line2D([], [], linewidth=1.8, **style) for style in styles],
+        lines,
         [entry.text for entry in entries],
         loc="upper center",
         bbox_to_anchor=(0.5, 0),
@@ -127,31 +132,44 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
     last = len(record) if last is None else last
     marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.of_look <= last]
     rows = [row for row in record.object_rows() if row["look"] - 1 <= last]
-    many = len(rows) > _NAMED
-    # Names would only repeat the class that was searched for, and take room that many labels do not have.
-    one_class = many and record.target is not None
-    thin = 0.8 if many else 1.2
-    width = record.size[0]
     for row in reversed(rows):
-        score = f"{row['score']:.2f}"
-        text = score if one_class else f"{row['class']} {score}"
-        colour = FOUND if row["confirmed"] else TARGET
-        line_width = 2.0 if row["confirmed"] else thin
-        for shift in (0, width) if row["x2"] > width else (0,):
-            box = (row["x1"] - shift, row["y1"], row["x2"] - shift, row["y2"])
-            marks.append(Mark(box, colour, "-", line_width, text))
+        marks += _marks_of_object(row, record, many=len(rows) > _NAMED)
     if record.best_place is not None and last >= len(record) - 1:
         best, chance = record.best_place
         has_label = bool((record.objects.boxes == best).all(-1).any())
-        marks.append(Mark(_corners(best), FOUND, "--", 2.4, None if has_label else f"best place {chance:.2f}"))
+        text = None if has_label else f"best place {chance:.2f}"
+        marks.append(Mark(_corners(best), FOUND, "--", 2.4, text))
     return marks
+
+
+def _marks_of_object(row: Values, record: Record, *, many: bool) -> list[Mark]:
+    """Make the box of an object, at both ends of a panorama where it crosses the seam.
+
+    Args:
+        row: the row of the object (`Record.object_rows`).
+        record: its record.
+        many: whether there are too many objects for long names and thick lines.
+
+    Returns:
+        The box, or both.
+    """
+    score = f"{row['score']:.2f}"
+    # The name would only repeat the class that was searched for, and take room that many labels do not have.
+    one_class = many and record.target is not None
+    text = score if one_class else f"{row['class']} {score}"
+    colour = FOUND if row["confirmed"] else TARGET
+    thin = 0.8 if many else 1.2
+    line_width = 2.0 if row["confirmed"] else thin
+    box = (row["x1"], row["y1"], row["x2"], row["y2"])
+    return [Mark(part, colour, "-", line_width, text) for part in at_both_ends(box, record.size[0])]
 
 
 def draw_marks(axes: Axes, marks: Sequence[Mark]) -> list[Artist]:
     """Draw boxes without their labels; returns what was drawn."""
-    return [
-        artist for mark in marks for artist in draw_boxes(axes, Tensor([mark.box]), mark.colour, mark.line, mark.width)
-    ]
+    drawn: list[Artist] = []
+    for mark in marks:
+        drawn += draw_boxes(axes, Tensor([mark.box]), mark.colour, mark.line, mark.width)
+    return drawn
 
 
 def draw_mark_labels(axes: Axes, record: Record, marks: Sequence[Mark], obstacles: Sequence[LabelBox]) -> None:

@@ -99,10 +99,20 @@ def _number_place(region: Box, room: float, others: list[tuple[float, float]]) -
         The middle of the number.
     """
     x1, y1, x2, y2 = region
-    corners = [(x, y) for y in (y1 + room / 2, y2 - room / 2) for x in (x1 + room / 2, x2 - room / 2)]
-    places = [*corners, ((x1 + x2) / 2, (y1 + y2) / 2)]
-    distances = [min([room, *(max(abs(u - x), abs(v - y)) for x, y in others)]) for u, v in places]
-    return places[distances.index(max(distances))]
+    left = x1 + room / 2
+    right = x2 - room / 2
+    top = y1 + room / 2
+    bottom = y2 - room / 2
+    middle = ((x1 + x2) / 2, (y1 + y2) / 2)
+    places = [(left, top), (right, top), (left, bottom), (right, bottom), middle]
+
+    def free_distance(place: tuple[float, float]) -> float:
+        """Measure the distance to the nearest other number, up to the width of one."""
+        u, v = place
+        distances = [max(abs(u - x), abs(v - y)) for x, y in others]
+        return min([room, *distances])
+
+    return max(places, key=free_distance)
 
 
 class GazePath:

@@ -150,13 +150,15 @@ def plot_foveated_strip(
     check(columns >= 1, "columns", "at least 1", columns)
     fixations = choose_fixations(scanpath, most)
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
-    rows = -(-len(fixations) // columns)
-    height = rows * (2.6 * views[0].shape[-2] / views[0].shape[-1] + 0.3)
+    rows = -(-len(fixations) // columns)  # rounded up
+    aspect = views[0].shape[-2] / views[0].shape[-1]
+    height = rows * (2.6 * aspect + 0.3)
     figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", axes=axes)
     for panel, fixation in zip(panels, fixations, strict=False):
         draw_image(panel, views[fixation], scanpath.grid)
         panel.set_title(f"fixation {fixation + 1}")
-    for panel in panels[len(fixations) :]:
+    unused = panels[len(fixations) :]
+    for panel in unused:
         panel.remove()
     _label_views(panels, scanpath, fixations, views)
     return figure

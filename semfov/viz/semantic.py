@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -90,8 +90,9 @@ def _draw_entropy(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor |
         draw_image(axes, image, scanpath.grid, grey=True)
     values = cell_entropy(scanpath)
     alpha = None if image is None else 0.65
-    style: dict[str, Any] = {"cmap": UNCERTAINTY, "vmin": float(values.min()), "vmax": float(values.max())}
-    drawn = draw_cells(axes, scanpath.grid, values[fixation], alpha=alpha, **style)
+    lowest = float(values.min())
+    highest = float(values.max())
+    drawn = draw_cells(axes, scanpath.grid, values[fixation], alpha=alpha, cmap=UNCERTAINTY, vmin=lowest, vmax=highest)
     draw_cross(axes, scanpath.fixations[fixation])
     axes.set_title(f"uncertainty after fixation {fixation + 1}")
     return drawn
@@ -109,11 +110,21 @@ def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tens
 
 
 def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artist]:
-    """Draw borders and names of regions, each name on a cell where it covers no other; the figure must be laid out."""
+    """Draw borders and names of regions, each name on a cell where it covers no other.
+
+    Args:
+        axes: axes of a figure that is laid out.
+        grid: the cells.
+        regions: the regions.
+
+    Returns:
+        What was drawn.
+    """
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
-    borders = LineCollection([side for region in regions for side in _borders(grid, region.cells)], colors="white")
+    sides = [side for region in regions for side in _borders(grid, region.cells)]
+    borders = LineCollection(sides, colors="white")
     borders.set(linewidths=1.3, zorder=3)
     drawn: list[Artist] = [axes.add_collection(borders, autolim=False)]
     candidates = []
@@ -121,14 +132,17 @@ def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artis
     for region in regions:
         # The name stands on a cell of the region, as near as there is room to the middle.
         centres = grid.centres[region.cells] + 0.5
-        order = (centres - centres.mean(0)).norm(dim=-1).argsort(stable=True)
+        from_middle = (centres - centres.mean(0)).norm(dim=-1)
+        nearest_first = centres[from_middle.argsort(stable=True)].tolist()
         width, height = text_size(axes, region.name, _NAME_POINTS)
-        candidates.append([(x - width / 2, y - height / 2) for x, y in centres[order].tolist()])
+        candidates.append([(x - width / 2, y - height / 2) for x, y in nearest_first])
         sizes.append((width, height))
     frame_width, frame_height = grid.extent.tolist()
     places = place_within(candidates, sizes, (frame_width, frame_height))
     for region, (x1, y1, x2, y2) in zip(regions, places, strict=True):
-        text = axes.text((x1 + x2) / 2, (y1 + y2) / 2, region.name, color="black", fontsize=_NAME_POINTS, clip_on=True)
+        x = (x1 + x2) / 2
+        y = (y1 + y2) / 2
+        text = axes.text(x, y, region.name, color="black", fontsize=_NAME_POINTS, clip_on=True)
         text.set(ha="center", va="center", parse_math=False)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         drawn.append(text)
