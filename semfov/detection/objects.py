@@ -61,10 +61,13 @@ class Objects(OtherWords):
         """Write the number of objects, and a line for each of the most confident ones."""
         lines = [f"{len(self)} object{'s' if len(self) != 1 else ''}"]
         shown = self[:_PRINTED]
-        columns = (shown.labels.tolist(), shown.scores.tolist(), shown.boxes.tolist(), shown.passes.tolist())
-        for label, score, box, index in zip(*columns, strict=True):
+        labels = shown.labels.tolist()
+        scores = shown.scores.tolist()
+        boxes = shown.boxes.tolist()
+        looks = shown.passes.tolist()
+        for label, score, box, look in zip(labels, scores, boxes, looks, strict=True):
             name = self.classes[label] if self.classes else f"class {label}"
-            lines.append(f"{name} {score:.2f}, box {box_text(box)}, look {index + 1}")
+            lines.append(f"{name} {score:.2f}, box {box_text(box)}, look {look + 1}")
         if len(self) > _PRINTED:
             lines.append(f"and {len(self) - _PRINTED} more")
         return "\n  ".join(lines)

@@ -8,7 +8,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import yaml
 
@@ -17,7 +17,7 @@ from semfov.detection.onnx_cells import STRIDES, Canvas, cells
 from semfov.detection.onnx_check import check_file
 from semfov.detection.scores import BackgroundPolicy
 from semfov.errors import DataError, check, check_data
-from semfov.io.files import cache_folder, read_text, sha256, write_bytes
+from semfov.io.files import JsonObject, cache_folder, read_text, sha256, write_bytes
 from semfov.io.schema import Array, Flag, Json, Maybe, Number, Object, Text, check_content, is_plain
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class OnnxSettings(TypedDict, total=False):
     stride: int | None
     logits: bool
     per_class: bool
-    preprocessing: dict[str, Any]
+    preprocessing: JsonObject
     licence: object
     source: object
 
@@ -95,7 +95,7 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> OnnxSettings:
     if settings_file.exists():
         texts[str(settings_file)] = read_text(settings_file, most=_MOST_BYTES)
     settings: OnnxSettings = {**_names_of_exporter(metadata), **_ultralytics(metadata)}
-    preprocessing: dict[str, Any] = {}
+    preprocessing: JsonObject = {}
     for place, text in texts.items():
         stated = _parsed(place, text)
         preprocessing |= stated.get("preprocessing", {})
@@ -115,14 +115,14 @@ def _parsed(place: str, text: str) -> OnnxSettings:
     return settings
 
 
-def _state_both_sides(settings: dict[str, Any]) -> None:
+def _state_both_sides(settings: JsonObject) -> None:
     """Replace an `input_size` that is one number, as people write it, by width and height."""
     side = settings.get("input_size")
     if isinstance(side, int):
         settings["input_size"] = [side, side]
 
 
-def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
+def write_settings(path: Path, options: JsonObject) -> Path:
     """Add options of `load_detector` to the settings in `model.json` beside an ONNX file.
 
     Args:
@@ -133,7 +133,7 @@ def write_settings(path: Path, options: Mapping[str, Any]) -> Path:
         The file of the settings.
     """
     settings_file = path.with_suffix(".json")
-    stored: dict[str, Any] = {}
+    stored: JsonObject = {}
     if settings_file.exists():
         stored = json.loads(read_text(settings_file, most=_MOST_BYTES))
     chosen = {name: value for name, value in options.items() if name in _SETTINGS.keys}

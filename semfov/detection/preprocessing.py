@@ -96,7 +96,7 @@ class Preprocessing:
             lookup(name, [field.name for field in fields(self)], "preprocessing setting")
         return replace(self, **settings)
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """List all settings as JSON values."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 

@@ -177,7 +177,16 @@ def _survivors(boxes: Tensor, labels: Tensor, selection: Selection) -> Tensor:
 
 
 def _overlaps(boxes: NDArray[np.floating], others: NDArray[np.floating], iou: float) -> NDArray[np.bool_]:
-    """Tell whether the intersection over union of each two boxes is above a limit; boxes `(M, 4)`, others `(N, 4)`."""
+    """Tell of which pairs of boxes the intersection over union is above a limit.
+
+    Args:
+        boxes: `(M, 4)`.
+        others: `(N, 4)`.
+        iou: the limit.
+
+    Returns:
+        `(M, N)`.
+    """
     x1, y1, x2, y2 = boxes.T[:, :, None]
     left, top, right, bottom = others.T[:, None]
     width = np.minimum(x2, right) - np.maximum(x1, left)

@@ -1,7 +1,7 @@
 """Policies: where to look, by an acquisition function, for any target on any grid."""
 
 from collections.abc import Mapping
-from typing import Any, get_args
+from typing import get_args
 
 from torch import Tensor, nn
 
@@ -53,7 +53,7 @@ class Policy(nn.Module):
         *,
         samples: int | None = None,
         calibrated: bool = True,
-        **settings: Any,
+        **settings: object,
     ) -> None:
         super().__init__()
         if not isinstance(function, type):
@@ -115,14 +115,16 @@ class Policy(nn.Module):
         Raises:
             InputError: the function needs a target or a setting, and has none, or has one of another type.
         """
+        parameters = self.function.takes
         scene = {"target": target, "model": self.model, "grid": grid}
-        takes = self.function.takes
-        arguments: dict[str, Any] = {name: part for name, part in scene.items() if part is not None and name in takes}
+        wanted = [name for name in scene if name in parameters]
+        arguments: dict[str, object] = {name: scene[name] for name in wanted if scene[name] is not None}
         arguments |= {name: getattr(self, name) for name in self._settings}
-        for name, parameter in takes.items():
-            if arguments.get(name) is None and parameter.default is parameter.empty:
-                needed = "a target to search for" if name == "target" else f"{name} of a scene"
-                raise InputError(f"policy {self.name!r}: expected {needed}, got none")
+        for name, parameter in parameters.items():
+            is_needed = parameter.default is parameter.empty
+            if is_needed and arguments.get(name) is None:
+                expected = "a target to search for" if name == "target" else f"{name} of a scene"
+                raise InputError(f"policy {self.name!r}: expected {expected}, got none")
         try:
             return self.function(**arguments)
         except TypeError as error:

@@ -202,18 +202,28 @@ class _Finding:
 
 
 def _particular_densities(names: Sequence[str], densities: Mapping[str, Tensor]) -> dict[str, _Array]:
-    """Compute d of each picture, `(_SIDE, _SIDE)`, row by row from the top left."""
+    """Compute d of each picture, `(_SIDE, _SIDE)`, row by row from the top left.
+
+    Args:
+        names: the pictures.
+        densities: density of fixations in each, `(rows, columns)`.
+
+    Returns:
+        In bits: how much denser fixations are at a place of this picture than in the others.
+    """
     logs = []
     for name in names:
         density = densities[name]
         check(density.ndim == 2, "densities", "a map (rows, columns) for each picture", tuple(density.shape))
         uniform = 1 / density.numel()
-        bits = (density.detach().cpu().double() / uniform).log2().clamp(min=_FAINTEST)
-        logs.append(interpolate(bits[None, None], size=(_SIDE, _SIDE), mode="bilinear")[0, 0])
+        ratio = density.detach().cpu().double() / uniform
+        bits = ratio.log2().clamp(min=_FAINTEST)
+        on_grid = interpolate(bits[None, None], size=(_SIDE, _SIDE), mode="bilinear")
+        logs.append(on_grid[0, 0])
     stacked = torch.stack(logs)
     mean_of_other_pictures = (stacked.sum(0) - stacked) / (len(logs) - 1)
     particular = stacked - mean_of_other_pictures
-    return {name: particular[number].numpy() for number, name in enumerate(names)}
+    return {name: density.numpy() for name, density in zip(names, particular, strict=True)}
 
 
 class _BestShift(NamedTuple):
@@ -292,14 +302,24 @@ def _densities_at(particular: _Array, places: _Array) -> _Array:
 
 
 def _fit_by_shift(particular: _Array, places: _Array) -> _Array:
-    """Compute the fit of fixations for all shifts up to `_REACH` cells, `(2 · _REACH + 1, 2 · _REACH + 1)`."""
-    padded = np.pad(particular, 2 * _REACH)  # beyond the picture the fit is 0
-    cells = np.floor(places * _SIDE).astype(np.int64) + 2 * _REACH
+    """Compute the fit of fixations for all shifts up to `_REACH` cells along both axes.
+
+    Args:
+        particular: d of the picture, `(_SIDE, _SIDE)`.
+        places: the fixations, `(n, 2)` in shares of the sides.
+
+    Returns:
+        `(2 · _REACH + 1, 2 · _REACH + 1)`, by the shift down and the shift to the right.
+    """
+    margin = 2 * _REACH
+    padded = np.pad(particular, margin)  # beyond the picture the fit is 0
+    cells = np.floor(places * _SIDE).astype(np.int64) + margin
     # Fixations far outside the frame stay outside under every shift.
     cells = cells.clip(_REACH, _SIDE + 3 * _REACH - 1)
+    column, row = cells.T
     steps = np.arange(-_REACH, _REACH + 1)
-    rows = cells[:, 1, None, None] + steps[:, None]
-    columns = cells[:, 0, None, None] + steps
+    rows = row[:, None, None] + steps[:, None]
+    columns = column[:, None, None] + steps
     return np.asarray(padded[rows, columns].mean(0))
 
 

@@ -4,20 +4,17 @@ import contextlib
 import io
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.annotations import ABSENT, PARTIAL, Annotations, Id
+from semfov.data.annotations import ABSENT, PARTIAL, Annotations, Entry, Id
 from semfov.data.classes import canonical_name
-
-_Entry = Mapping[str, Any]
 
 
 def average_precision(
     annotations: Annotations,
-    results: Sequence[_Entry],
+    results: Sequence[Entry],
     *,
     images: Collection[Id] | None = None,
     classes: Collection[str] | None = None,
@@ -65,9 +62,9 @@ def average_precision(
     return float(judged.mean()), float(judged[0].mean())
 
 
-def _objects(annotations: Annotations, images: Iterable[Id]) -> list[_Entry]:
+def _objects(annotations: Annotations, images: Iterable[Id]) -> list[Entry]:
     """List the objects of images that have an area, each with the id of its image."""
-    objects: list[_Entry] = []
+    objects: list[Entry] = []
     for image in images:
         for entry in annotations.objects[image]:
             width_and_height = entry["bbox"][2:]
@@ -84,9 +81,9 @@ def _class_ids(annotations: Annotations, classes: Collection[str] | None) -> dic
     return {category: numbers[name] for category, name in names.items() if name in judged}
 
 
-def _copies(entries: Iterable[_Entry], image_ids: Mapping[Id, int], class_ids: Mapping[Id, int]) -> list[_Entry]:
+def _copies(entries: Iterable[Entry], image_ids: Mapping[Id, int], class_ids: Mapping[Id, int]) -> list[Entry]:
     """Copy the entries of images and classes that are judged, as COCOeval reads them rightly."""
-    copies: list[_Entry] = []
+    copies: list[Entry] = []
     for entry in entries:
         if entry["image_id"] not in image_ids or entry["category_id"] not in class_ids:
             continue
@@ -105,12 +102,12 @@ def _copies(entries: Iterable[_Entry], image_ids: Mapping[Id, int], class_ids: M
     return copies
 
 
-def _pair(entry: _Entry) -> tuple[int, int]:
+def _pair(entry: Entry) -> tuple[int, int]:
     """Name the image and the class of an entry."""
     return entry["image_id"], entry["category_id"]
 
 
-def _pairs(entries: Iterable[_Entry]) -> set[tuple[int, int]]:
+def _pairs(entries: Iterable[Entry]) -> set[tuple[int, int]]:
     """List the images, each with a class of which it has entries."""
     return {_pair(entry) for entry in entries}
 
@@ -128,8 +125,8 @@ def _named(
 
 
 def _precision(
-    truth: Sequence[_Entry],
-    boxes: Sequence[_Entry],
+    truth: Sequence[Entry],
+    boxes: Sequence[Entry],
     partial: Collection[tuple[int, int]],
     images: int,
     limit: int | None,
@@ -144,7 +141,7 @@ def _precision(
 
     classes = sorted({entry["category_id"] for entry in (*truth, *boxes)})
 
-    def indexed(entries: Sequence[_Entry]) -> COCO:
+    def indexed(entries: Sequence[Entry]) -> COCO:
         """Put entries into the form of an annotation file, which pycocotools reads."""
         side = COCO()
         side.dataset = {

@@ -1,7 +1,7 @@
 """Outcomes, scores and labels as people give them: tensors, arrays and lists of any type."""
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,7 @@ def as_outcomes(values: object, argument: str) -> Tensor:
     return tensor == 1
 
 
-def as_labels(labels: Any, argument: str, *, least: int = 0) -> list[Hashable]:
+def as_labels(labels: Iterable[object], argument: str, *, least: int = 0) -> list[Hashable]:
     """Take labels as values that are equal where they are; the elements of a tensor equal themselves alone.
 
     Args:

@@ -125,14 +125,14 @@ class Sensor(StatedModule, ABC):
         return boxes
 
     @abstractmethod
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """List the settings that the views depend on, for the keys of caches and the metadata of fitted models.
 
         Returns:
             JSON values by name.
         """
 
-    def _stated(self) -> dict[str, Any]:
+    def _stated(self) -> dict[str, object]:
         """List the constructor's settings, without those that are parameters."""
         learned = {name.removeprefix("log_") for name in self._parameters}
         return {name: value for name, value in self.settings().items() if name in {*self.names} - learned}

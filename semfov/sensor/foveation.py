@@ -9,7 +9,7 @@ of a large image without its finest band (`_foveate_large`).
 import warnings
 from collections.abc import Iterator, Sequence
 from numbers import Real
-from typing import Any, TypeGuard, get_args
+from typing import TypeGuard, get_args
 
 import numpy as np
 import torch
@@ -233,18 +233,18 @@ def _foveate_large(
     Returns:
         Views `(B, 1, C, H, W)`; those of half precision in float32.
     """
-    image = widened(images)
-    half = reduce(image, convention)
+    image = widened(images)  # G_0
+    half = reduce(image, convention)  # G_1
     rest = laplacian_pyramid(half, levels - 1, convention)
     size = (image.shape[-2], image.shape[-1])
     finest, *coarser = fovea.windows((size, *rest.sizes), convention, image.dtype)
-    coarse = _collapse(rest, tuple(coarser))[:, 0]
+    coarse = _collapse(rest, tuple(coarser))[:, 0]  # R_1
     lines = expanding(rest.shape, size, convention, half.dtype, half.device)
-    views = torch.empty_like(image, memory_format=torch.contiguous_format)
+    differences = torch.empty_like(image, memory_format=torch.contiguous_format)
     weights = zip(finest.rows.flatten(1), finest.columns.flatten(1), strict=True)
-    for coarse_planes, half_planes, weight, view in zip(coarse, half, weights, views, strict=True):
-        difference(coarse_planes, half_planes, *lines, weight, view)
-    return _blend(views[:, None], finest.plane(), image[:, None], into)
+    for coarse_planes, half_planes, weight, result in zip(coarse, half, weights, differences, strict=True):
+        difference(coarse_planes, half_planes, *lines, weight, result)
+    return _blend(differences[:, None], finest.plane(), image[:, None], into)
 
 
 def _slices(count: int, step: int) -> Iterator[slice]:
@@ -346,7 +346,7 @@ class Foveation(Sensor):
         bands, sigma = state
         return foveate(bands, gaze[None], sigma=sigma, growth=self.growth)[0]
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """List the settings that the views depend on."""
         return {
             "sigma": float(self.sigma.detach()),

@@ -189,15 +189,17 @@ def _fill(result: Tensor, weight: Tensor, part: Tensor, start: float, end: float
     """
     count, length = weight.shape
     step = (end - start) / count
-    reach = max(step, 1.0) + 1  # and a pixel for rounding
+    reach = max(step, 1.0) + 1  # of a triangle, and a pixel for rounding
     together = _TOGETHER if length > 4 * _TOGETHER else count
     for first in range(0, count, together):
         last = min(first + together, count)
         first_centre = start + (first + 0.5) * step
         last_centre = start + (last - 0.5) * step
+        first_shown = math.floor(first_centre - reach)
+        end_shown = math.ceil(last_centre + reach)
         # At least one pixel, also for a part that shows none.
-        begin = min(max(math.floor(first_centre - reach), 0), length - 1)
-        stop = min(max(math.ceil(last_centre + reach), begin + 1), length)
+        begin = min(max(first_shown, 0), length - 1)
+        stop = min(max(end_shown, begin + 1), length)
         matrix = weight[first:last, begin:stop].expand(len(part), -1, -1)
         torch.bmm(matrix, part[:, begin:stop], out=result[:, first:last])
 

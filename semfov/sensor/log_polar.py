@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from math import ceil, exp, hypot, inf, log1p, log2, pi, sqrt
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -222,7 +221,7 @@ class LogPolar(Sensor):
         fixation = fixations(gaze[None], levels[0])
         return _project(_sample(levels, fixation, retina), fixation, _size(levels[0]), retina)[0]
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """List the settings that the views depend on."""
         retina = self.retina
         return {"kind": self.kind, "fovea": retina.fovea, "spacing": retina.spacing, "pooling": retina.pooling}

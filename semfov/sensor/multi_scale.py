@@ -1,7 +1,5 @@
 """The multi-scale fovea: square crops around the fixation, each twice as wide as the one before, all of one size."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -70,12 +68,15 @@ class MultiScaleFovea(Sensor):
         check_shape(image, "image", None, None, None, None)
         check(image.numel() > 0 or not len(image), "image", "at least one pixel", tuple(image.shape))
         # A border of one pixel is black; it stands for everything that is farther outside.
-        means = [F.pad(image, (1, 1, 1, 1))]
+        plane = F.pad(image, (1, 1, 1, 1))
+        means = [plane]
         for scale in range(self.scales - 1):
+            # The mean of a square is that of four squares of half its side, at all places.
             step = 2**scale
-            wider = F.pad(means[-1], (step, step, step, step))
-            wider = (wider[..., step:] + wider[..., :-step]) / 2
-            means.append((wider[..., step:, :] + wider[..., :-step, :]) / 2)
+            padded = F.pad(plane, (step, step, step, step))
+            pairs = (padded[..., step:] + padded[..., :-step]) / 2
+            plane = (pairs[..., step:, :] + pairs[..., :-step, :]) / 2
+            means.append(plane)
         return tuple(means)
 
     def forward(self, image: Tensor | _Planes, gaze: Tensor) -> Tensor:
@@ -155,7 +156,7 @@ class MultiScaleFovea(Sensor):
         pixels = (windows[..., 2:] - corner) / self.side  # of the canvas, for one of the crop
         return boxes * pixels.repeat(1, 1, 2) + corner.repeat(1, 1, 2)
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """List the settings that the views depend on."""
         return {"kind": self.kind, "side": self.side, "scales": self.scales}
 

@@ -202,16 +202,19 @@ class Lookahead(AcquisitionFunction):
         expected = self.model.expected_scores() if self.likelihoods is None else None
 
         def values(maps: Tensor, fixated: Tensor) -> Tensor:
+            """Compute the values in maps `(..., X·Y, K+1)`, of which `(..., X·Y)` were fixated."""
             after = self._after_drawn(maps, fixated) if expected is None else self._after_expected(maps, expected)
             change = after - self._at_present(maps)[..., None]
-            fixations = self.levels.split(_block(_PAIRS, maps, maps.shape[-2]), -1)
-            return torch.cat([self.pool(at_levels(change, levels)) for levels in fixations], -1)
+            # As many fixations at once as stay in the processor's cache.
+            blocks = self.levels.split(_block(_PAIRS, maps, maps.shape[-2]), -1)
+            return torch.cat([self.pool(at_levels(change, levels)) for levels in blocks], -1)
 
         if beta.ndim == 2 or self.levels.ndim > 2:
             return values(beta, visited)
         # One map at a time stays in the processor's cache; a batch at once takes four times as long.
-        by_map = visited.expand(beta.shape[:-1]).flatten(0, -2)
-        return one_by_one(values, beta.flatten(0, -3), by_map).view(beta.shape[:-1])
+        maps = beta.flatten(0, -3)
+        fixated = visited.expand(beta.shape[:-1]).flatten(0, -2)
+        return one_by_one(values, maps, fixated).view(beta.shape[:-1])
 
     def _at_present(self, beta: Tensor) -> Tensor:
         """Compute `present`, a block of cells at a time."""

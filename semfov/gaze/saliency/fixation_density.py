@@ -5,7 +5,7 @@ from copy import deepcopy
 from functools import cache
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,7 @@ from semfov.gaze.saliency.likeness import PictureLikeness
 from semfov.gaze.saliency.oculomotor import OculomotorBias
 from semfov.gaze.saliency.on_picture import on_picture, sides_of
 from semfov.io.compatibility import check_same_detector
+from semfov.io.files import JsonObject
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Schema, Text
 from semfov.io.schema import Number as JsonNumber
@@ -106,7 +107,7 @@ class FixationDensity(Pretrained):
         readouts: int = 1,
         units: int = 16,
         centre: Tensor | None = None,
-        metadata: Mapping[str, Any] | None = None,
+        metadata: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__()
         check(len(layers) > 0, "layers", "at least one feature map", "none")
@@ -200,18 +201,16 @@ class FixationDensity(Pretrained):
             InputError: a feature map is missing or has another number of channels, or there is no such term.
         """
         if size is None:
-            if isinstance(features, FeatureMaps):
-                size = features.placement.size[1], features.placement.size[0]
-            else:
-                size = max((int(maps.shape[-2]), int(maps.shape[-1])) for maps in features.values())
+            size = _size_of(features)
         terms = self.terms(features, size, scanpath)
         for name in without:
             check(name in ("map", "centre bias", "oculomotor biases"), "without", "terms of the model", repr(name))
         summands = [term for name, term in terms.items() if name not in without]
-        total = torch.stack(summands).sum(0) if summands else torch.zeros_like(terms["map"])
-        if total.shape[-2:] != size:
-            total = F.interpolate(total[:, None], size, mode="bilinear", align_corners=False)[:, 0]
-        return total - total.flatten(1).logsumexp(1)[:, None, None]
+        log_weights = torch.stack(summands).sum(0) if summands else torch.zeros_like(terms["map"])
+        if log_weights.shape[-2:] != size:
+            log_weights = F.interpolate(log_weights[:, None], size, mode="bilinear", align_corners=False)[:, 0]
+        # Normalised over the pixels, after the interpolation.
+        return log_weights - log_weights.flatten(1).logsumexp(1)[:, None, None]
 
     def terms(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], scanpath: Tensor | None = None
@@ -404,12 +403,12 @@ class FixationDensity(Pretrained):
         tensors = super()._tensors()
         return tensors | {name: tensors[name].to(_HALF) for name in ("read", "mix")}
 
-    def _record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, object]:
         """List what a file holds beside tensors."""
         return {"layers": [[name, channels] for name, channels in self.layers.items()]}
 
     @classmethod
-    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: JsonObject, tensors: dict[str, Tensor]) -> Self:
         """Make the model of a file."""
         readouts, units = tensors["mix"].shape[:2]
         model = cls(dict(record["layers"]), readouts=readouts, units=units, metadata=record["metadata"])
@@ -441,6 +440,14 @@ def shared_density(detector: Detector) -> FixationDensity:
     model = _read(path)
     model.check_compatible(detector)
     return model
+
+
+def _size_of(features: FeatureMaps | Mapping[str, Tensor]) -> tuple[int, int]:
+    """Find `(height, width)` of the picture of feature maps; of maps by name, that of the finest one."""
+    if isinstance(features, FeatureMaps):
+        width, height = features.placement.size
+        return height, width
+    return max((int(maps.shape[-2]), int(maps.shape[-1])) for maps in features.values())
 
 
 def cells_of(size: tuple[int, int]) -> tuple[int, int]:

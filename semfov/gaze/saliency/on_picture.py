@@ -30,17 +30,30 @@ class Side(NamedTuple):
 
 
 def sides_of(features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]) -> tuple[Side, Side]:
-    """Find the picture along the rows and the columns of maps of a shape `(h, w)`."""
+    """Find where the picture is in maps.
+
+    Args:
+        features: as for `FixationDensity.forward`; plain maps are of the whole picture.
+        shape: `(h, w)` of the maps.
+
+    Returns:
+        The picture along the rows and along the columns, in pixels of the maps.
+    """
+    height, width = shape
     if not isinstance(features, FeatureMaps):
-        return Side(0, shape[0], 0, shape[0], shape[0]), Side(0, shape[1], 0, shape[1], shape[1])
+        return Side(0, height, 0, height, height), Side(0, width, 0, width, width)
     placement: Placement = features.placement
     sides = []
-    for axis, length in ((1, shape[0]), (0, shape[1])):
-        pixels = features.canvas[axis] / length
-        start = placement.offset[axis] / pixels
-        end = start + placement.size[axis] * placement.scale[axis] / pixels
-        sides.append(Side(start, end, max(floor(start - 0.5), 0), min(ceil(end + 0.5), length), length))
-    return sides[0], sides[1]
+    for axis, length in ((1, height), (0, width)):
+        stride = features.canvas[axis] / length
+        start = placement.offset[axis] / stride
+        end = start + placement.size[axis] * placement.scale[axis] / stride
+        # Between its pixels' centres a map is interpolated: half a pixel beyond the picture is read, too.
+        first = max(floor(start - 0.5), 0)
+        stop = min(ceil(end + 0.5), length)
+        sides.append(Side(start, end, first, stop, length))
+    vertical, horizontal = sides
+    return vertical, horizontal
 
 
 def on_picture(

@@ -140,21 +140,23 @@ def picture_terms(
     maps: list[Tensor] = []
     distances: list[float] = []
     for view in views:
-        part = _pixels_of(view, image, cells)
-        features = _features(detector, part, model)
-        maps.append(model.map(features, (int(part.shape[-2]), int(part.shape[-1])))[0])
-        # Windows of a photograph are closer than the pictures of the fit are.
+        pixels = _pixels_of(view, image, cells)
+        features = _features(detector, pixels, model)
+        size_of_view = (int(pixels.shape[-2]), int(pixels.shape[-1]))
+        maps.append(model.map(features, size_of_view)[0])
+        # Windows of a photograph are closer than the pictures of the fit are: the first view, the whole, tells.
         if model.likeness is not None and (panorama or not distances):
             values = pooled(features, model.layers).to(model.likeness.mean)
             distances.append(float(model.likeness(values)[0]))
+    unlikeness = digits(sum(distances) / len(distances)) if distances else None
+
+    map = joined(maps, views, cells)
+    if _GAIN[quality] != 1:
+        map = _GAIN[quality] * map
     centre = model.centre_bias(size)
     if panorama:
         # People turn round, so that no direction is the middle; how high they look stays.
         centre = centre.logsumexp(1, keepdim=True).expand(cells) - math.log(cells[1])
-    unlikeness = digits(sum(distances) / len(distances)) if distances else None
-    map = joined(maps, views, cells)
-    if _GAIN[quality] != 1:
-        map = _GAIN[quality] * map
     return PictureTerms({"map": map[None], "centre bias": centre[None]}, unlikeness)
 
 
@@ -204,22 +206,25 @@ def joined(maps: Sequence[Tensor], views: Iterable[PictureView], cells: tuple[in
     >>> joined([torch.ones(39, 52)] * 4, views, (26, 52)).unique()
     tensor([1.])
     """
-    whole: list[Tensor] = []
-    values = maps[0].new_zeros(cells)
-    weights = maps[0].new_zeros(cells)
+    maps_of_whole: list[Tensor] = []
+    weighted_sum = maps[0].new_zeros(cells)
+    weight_sum = maps[0].new_zeros(cells)
     for map, view in zip(maps, views, strict=True):
         upright = map.flip(-1) if view.mirrored else map
         if view.covers(cells):
-            whole.append(upright)
+            maps_of_whole.append(upright)
             continue
         on_cells = cell_saliency(upright[None], view.columns, view.rows).view(view.rows, view.columns)
         weight = view.weight.to(map)
+        rows = slice(view.top, view.top + view.rows)
+        # Across the seam of a panorama the columns go on at its left edge.
         columns = (view.left + torch.arange(view.columns, device=map.device)) % cells[1]
-        values[view.top : view.top + view.rows].index_add_(1, columns, weight * on_cells)
-        weights[view.top : view.top + view.rows].index_add_(1, columns, weight)
-    of_whole = torch.stack(whole).mean(0) if whole else None
-    if len(whole) == len(maps):
-        assert of_whole is not None
-        return of_whole
-    of_windows = values / weights
-    return of_windows if of_whole is None else _WHOLE * of_whole + (1 - _WHOLE) * of_windows
+        weighted_sum[rows].index_add_(1, columns, weight * on_cells)
+        weight_sum[rows].index_add_(1, columns, weight)
+    if len(maps_of_whole) == len(maps):
+        return torch.stack(maps_of_whole).mean(0)
+    of_windows = weighted_sum / weight_sum
+    if not maps_of_whole:
+        return of_windows
+    of_whole = torch.stack(maps_of_whole).mean(0)
+    return _WHOLE * of_whole + (1 - _WHOLE) * of_windows

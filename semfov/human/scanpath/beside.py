@@ -292,13 +292,24 @@ def _map_points(points: _Points, size: tuple[int, int], shape: tuple[int, ...]) 
 
 
 def _people_density(points: _Points, size: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Add up a Gaussian around each point in a map of `(rows, columns)`; points `(n, 2)` of the picture."""
+    """Add up a Gaussian around each point.
+
+    Args:
+        points: `(n, 2)` in pixels of the picture.
+        size: `(width, height)` of the picture.
+        shape: `(rows, columns)` of the map.
+
+    Returns:
+        The map, not normalised.
+    """
     rows, columns = (np.arange(side) for side in shape)
     x, y = _map_points(points, size, shape).T
-    width = 2 * (_BLUR * max(shape)) ** 2  # twice the variance
-    across = np.exp(-((columns[:, None] - x) ** 2) / width)
-    down = np.exp(-((rows[:, None] - y) ** 2) / width)
-    return np.asarray(down @ across.T)
+    sigma = _BLUR * max(shape)
+    twice_variance = 2 * sigma**2
+    # A Gaussian is the product of one along the rows and one along the columns.
+    of_columns = np.exp(-((columns[:, None] - x) ** 2) / twice_variance)
+    of_rows = np.exp(-((rows[:, None] - y) ** 2) / twice_variance)
+    return np.asarray(of_rows @ of_columns.T)
 
 
 def compare_density(prediction: GazePrediction, people: _People) -> dict[str, float]:

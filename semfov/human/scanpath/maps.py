@@ -228,10 +228,11 @@ def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     values, fixated = _looked_up(maps, x, y)
     check(bool(np.isfinite(values).all()), "maps", "finite numbers", "infinity; give densities, not their logarithms")
     flat = values.reshape(*values.shape[:-2], -1)
+    mean = flat.mean(-1)[..., None]
     # By rounding the mean of equal values may differ from them, and their deviation from 0.
     is_constant = (np.ptp(flat, axis=-1) == 0)[..., None]
     deviation = np.where(is_constant, 1, flat.std(-1)[..., None])
-    return np.where(is_constant, 0, (fixated - flat.mean(-1)[..., None]) / deviation)
+    return np.where(is_constant, 0, (fixated - mean) / deviation)
 
 
 def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:

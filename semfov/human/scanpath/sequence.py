@@ -2,7 +2,8 @@
 
 import warnings
 from collections.abc import Hashable, Sequence
-from typing import Any, Protocol
+from types import ModuleType
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -158,7 +159,7 @@ def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
     return int(_rapidfuzz().Levenshtein.distance(a, b))
 
 
-def _rapidfuzz() -> Any:
+def _rapidfuzz() -> ModuleType:
     """Import the distances of rapidfuzz, which has no types."""
     try:
         from rapidfuzz import distance
