@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from PIL import Image
@@ -28,6 +28,9 @@ from semfov.paths import Record
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.page import page_html
+
+if TYPE_CHECKING:
+    import gradio
 
 
 class _Task(NamedTuple):
@@ -123,7 +126,7 @@ def serve(options: AppOptions) -> int:
     return 0
 
 
-def _launched(page: Any, host: str, port: int | None, token: str | None = None) -> str:
+def _launched(page: "gradio.Blocks", host: str, port: int | None, token: str | None = None) -> str:
     """Serve a page, with one look at a time; returns its address, with the token that it asks for."""
     import gradio
     from starlette.middleware import Middleware
@@ -223,7 +226,7 @@ class _Calls:
         """Choose the class that a person looks for: the chosen one, else that of most objects; empty for none."""
         return target if target in self.classes else usual
 
-    def click(self, path: str | None, target: str, cells: list[int], point: tuple[float, float]) -> tuple[Any, ...]:
+    def click(self, path: str | None, target: str, cells: list[int], point: tuple[float, float]) -> tuple[object, ...]:
         """Look at the cell of a point.
 
         Args:
@@ -245,7 +248,7 @@ class _Calls:
             # What follows the end of a search is no look of it.
             return looks.record.cells.tolist(), looks.marks(), looks.describe()
 
-    def fresh(self, path: str | None, target: str) -> tuple[Any, ...]:
+    def fresh(self, path: str | None, target: str) -> tuple[object, ...]:
         """Begin anew: no cells, the picture as the fovea sees it, no marks, and what to do."""
         with _errors_on_page():
             scene = "" if path is None else scene_json(self.agent, _read(path))
@@ -299,27 +302,27 @@ def _errors_on_page() -> Iterator[None]:
 class _Panel(NamedTuple):
     """What a person sets: components of Gradio."""
 
-    picture: Any
-    task: Any
-    target: Any
-    go: Any
-    end: Any
-    example: Any
-    passes: Any
-    prior: Any
+    picture: "gradio.Image"
+    task: "gradio.Radio"
+    target: "gradio.Dropdown"
+    go: "gradio.Button"
+    end: "gradio.Button"
+    example: "gradio.Button"
+    passes: "gradio.Slider"
+    prior: "gradio.Textbox"
 
 
 class _Views(NamedTuple):
     """What a person sees: components of Gradio, of the tab with the agent's looks and of that with the person's own."""
 
-    words: Any
-    shown: Any
-    about: Any
-    own: Any
-    again: Any
+    words: "gradio.Markdown"
+    shown: "gradio.HTML"
+    about: "gradio.Markdown"
+    own: "gradio.HTML"
+    again: "gradio.Button"
 
 
-def _make_page(agent: ActivePerception) -> Any:
+def _make_page(agent: ActivePerception) -> "gradio.Blocks":
     """Make the page, a `gradio.Blocks`; pictures that it is given are removed within about an hour."""
     import gradio
 
@@ -389,18 +392,20 @@ def _lay_out_views() -> _Views:
 _PRIVATE: dict[str, Any] = {"api_visibility": "private"}  # calls of the page that are no interface for programs
 
 
-def _connect_agent(page: Any, calls: _Calls, panel: _Panel, views: _Views, usual: Any) -> None:
+def _connect_agent(page: "gradio.Blocks", calls: _Calls, panel: _Panel, views: _Views, usual: "gradio.State") -> None:
     """Connect the panel with the agent's looks; `usual` keeps the class of most objects in an example."""
     import gradio
 
-    def look(path: Any, target: str, task: str, passes: float, prior: str, request: gradio.Request) -> tuple[Any, str]:
+    def look(
+        path: str | None, target: str, task: str, passes: float, prior: str, request: gradio.Request
+    ) -> tuple[object, str]:
         words, page_of_record = calls.look(path, target, task, passes, prior, request.session_hash)
         return gradio.update(value=words, visible=bool(words)), page_of_record
 
     def stop(request: gradio.Request) -> None:
         calls.stop(request.session_hash)
 
-    def suit(task: str, target: str, usual: str) -> tuple[Any, ...]:
+    def suit(task: str, target: str, usual: str) -> tuple[object, ...]:
         used = _TASKS[task]
         chosen = calls.sought(target, usual) or _EVERY if task == "search" else target
         return (
@@ -421,17 +426,19 @@ def _connect_agent(page: Any, calls: _Calls, panel: _Panel, views: _Views, usual
     panel.end.click(stop, [], [], queue=False, **_PRIVATE)
 
 
-def _connect_person(calls: _Calls, panel: _Panel, views: _Views, usual: Any) -> None:
+def _connect_person(calls: _Calls, panel: _Panel, views: _Views, usual: "gradio.State") -> None:
     """Connect the picture with the looks of a person, which begin anew with another picture or class."""
     import gradio
 
-    def fresh(path: Any, target: str, usual: str) -> tuple[Any, ...]:
+    def fresh(path: str | None, target: str, usual: str) -> tuple[object, ...]:
         cells, scene, marks, about = calls.fresh(path, calls.sought(target, usual))
         return cells, gradio.update(value=scene, marks=marks), about
 
-    def click(path: Any, target: str, usual: str, cells: list[int], event: gradio.EventData) -> tuple[Any, ...]:
-        cells, marks, about = calls.click(path, calls.sought(target, usual), cells, event.index)
-        return cells, gradio.update(marks=marks), about
+    def click(
+        path: str | None, target: str, usual: str, cells: list[int], event: gradio.EventData
+    ) -> tuple[object, ...]:
+        looked, marks, about = calls.click(path, calls.sought(target, usual), cells, event.index)
+        return looked, gradio.update(marks=marks), about
 
     cells = gradio.State([])
     sought = [panel.picture, panel.target, usual]

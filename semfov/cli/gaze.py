@@ -4,7 +4,7 @@ import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from semfov.paths.areas import boxes_of, percent
 from semfov.paths.drafts import Drafts
 from semfov.paths.gaze import GazePrediction
 from semfov.report.drafts import drafts_section
+from semfov.report.episode import Data
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.template import page_path, write_html
 from semfov.runs.config import WHERE
@@ -37,8 +38,20 @@ _DENSITIES = (".npy", ".tif", ".tiff", ".png")
 _PICTURES = "pictures.csv"  # name of the table of pictures, after that of the scanpaths
 _COMPARED = Path("semfov-compare.html")  # page of a comparison for which no file is named
 
-_Outcome = dict[str, Any]
-"""What is written of a picture, as JSON values: text, drawn viewers, facts, part of a page, and file of the density."""
+
+class _Outcome(TypedDict):
+    """What is written of a picture, as JSON values.
+
+    `text` is printed; `size` is `(width, height)`; `viewers` are the drawn ones, each a name, points and durations;
+    `facts` stand in the table of pictures; `part` is that of the page, None without one; `density` is its file.
+    """
+
+    text: str
+    size: tuple[int, int]
+    viewers: list[tuple[str, list[list[float]], list[float]]]
+    facts: dict[str, object]
+    part: Data | None
+    density: NotRequired[str]
 
 
 def predict_gaze(options: GazeOptions) -> int:
@@ -78,19 +91,19 @@ class _GazeJob:
         check_apart(options.out, "out", [source.file for source in self.sources])
         self.table = _table_of(options.out, self.kind)
         self.areas = None if options.areas is None else boxes_of(options.areas)
-        self.report = (
-            _COMPARED if options.compare and options.out is None and options.report is None else options.report
-        )
+        self.report = options.report
+        if options.compare and options.out is None and options.report is None:
+            self.report = _COMPARED  # a comparison is always written somewhere
         if self.report is not None:
             check_writable(page_path(self.report))
         check_detector(options.detector)
         check_onnx_options(options, options.detector)
         loading = detector_options(options)
         # A model that cannot be read is reported before the detector is loaded.
-        given_model = None if options.model is None else FixationDensity.from_pretrained(options.model)
+        stated_model = None if options.model is None else FixationDensity.from_pretrained(options.model)
         self.detector = load_detector(options.detector, **loading)
         remember(options, options.detector)
-        self.model = FixationDensity.for_detector(self.detector) if given_model is None else given_model
+        self.model = FixationDensity.for_detector(self.detector) if stated_model is None else stated_model
         if not self.sources:
             self.sources = [example_source(EXAMPLES[0])]
             print(f"no picture was given: looking at {self.sources[0].name}, which comes with semfov")
@@ -122,20 +135,22 @@ class _GazeJob:
         source = self.sources[number]
         image = OpenedPicture.of(source.picture()).image(torch.zeros(1))[0]
         file = None if source.file is None else str(source.file)
-        given = None if self.options.model is None else self.model
+        stated_model = None if options.model is None else self.model
         prediction = GazePrediction.of(
-            self.detector, image, model=given, source=file, quality=options.quality, panorama=options.panorama
+            self.detector, image, model=stated_model, source=file, quality=options.quality, panorama=options.panorama
         )
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
         shares = {} if self.areas is None else prediction.share(self.areas)
         outcome: _Outcome = {
             "text": _text(source.name, prediction, paths, shares),
             "size": prediction.size,
-            "viewers": [[path.subject, path.points.tolist(), np.asarray(path.durations).tolist()] for path in paths],
+            "viewers": [_viewer(path) for path in paths],
             "facts": _facts(prediction, shares),
             "part": None if self.report is None else gaze_part(prediction, paths, self.areas),
         }
-        if options.out is not None and self.kind != ".csv" and not (options.compare and self.kind):
+        # A comparison writes a folder with both maps, or the file of its own figure.
+        is_figure_of_comparison = options.compare and bool(self.kind)
+        if options.out is not None and self.kind != ".csv" and not is_figure_of_comparison:
             outcome["density"] = str(self._save_density(options.out, number, prediction))
         if options.compare:
             self.predictions[number] = prediction
@@ -158,14 +173,15 @@ class _GazeJob:
     def keep(self, number: int) -> None:
         """Keep what was predicted of a picture for the same command, until all pictures are looked at."""
         if self.finished is not None:
-            self.finished.save(number, [self.outcomes[number]], {})
+            self.finished.save(number, [dict(self.outcomes[number])], {})
 
     def write(self, *, complete: bool) -> None:
         """Write scanpaths, table of pictures and page of the pictures so far, and list all files."""
         outcomes = dict(sorted(self.outcomes.items()))
-        written: list[object] = [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
+        written: list[object] = []
         if self.table is not None and outcomes:
-            written[:0] = self._write_tables(self.table, outcomes)
+            written += self._write_tables(self.table, outcomes)
+        written += [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
         drafts = Drafts(*self.predictions.values()) if len(self.predictions) == 2 else None
         if drafts is not None:
             print(drafts.describe(self.areas))
@@ -174,7 +190,8 @@ class _GazeJob:
         is_whole = drafts is not None or not self.options.compare
         if self.report is not None and outcomes and is_whole:
             written.append(self._write_page(self.report, outcomes, drafts))
-        tell_written(written, self.finished, None if complete else f"{len(outcomes)} of {len(self.sources)}")
+        progress = None if complete else f"{len(outcomes)} of {len(self.sources)}"
+        tell_written(written, self.finished, progress)
 
     def _write_tables(self, table: Path, outcomes: Mapping[int, _Outcome]) -> list[Path]:
         """Write the table of scanpaths, and beside it that of the pictures."""
@@ -190,9 +207,12 @@ class _GazeJob:
     def _write_page(self, report: Path, outcomes: Mapping[int, _Outcome], drafts: Drafts | None) -> Path:
         """Write the page of all pictures, which begins with the comparison of two drafts where there are some."""
         names = self._names()
+        parts = []
         for number, outcome in outcomes.items():
-            outcome["part"]["picture"]["name"] = names[number]
-        parts = [outcome["part"] for outcome in outcomes.values()]
+            part = outcome["part"]
+            assert part is not None  # there is one of each picture where a page is written
+            part["picture"]["name"] = names[number]
+            parts.append(part)
         before = "" if drafts is None else drafts_section(drafts, self.areas)
         return write_html(report, gaze_page_html("semfov: where people look", parts, before))
 
@@ -234,11 +254,21 @@ def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], sha
 
 def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> dict[str, object]:
     """List what the table of pictures says of a prediction."""
-    facts: dict[str, object] = {"width": prediction.size[0], "height": prediction.size[1], "unlike": prediction.unlike}
-    facts |= {"unlikeness": prediction.unlikeness, "caution": prediction.caution}
+    width, height = prediction.size
+    facts: dict[str, object] = {
+        "width": width,
+        "height": height,
+        "unlike": prediction.unlike,
+        "unlikeness": prediction.unlikeness,
+        "caution": prediction.caution,
+    }
     for number, place in enumerate(prediction.first_fixations(), 1):
-        facts |= {f"x {number}": place["x"], f"y {number}": place["y"], f"viewers {number}": place["share"]}
-    return facts | {f"share of {area}": digits(share) for area, share in shares.items()}
+        facts[f"x {number}"] = place["x"]
+        facts[f"y {number}"] = place["y"]
+        facts[f"viewers {number}"] = place["share"]
+    for area, share in shares.items():
+        facts[f"share of {area}"] = digits(share)
+    return facts
 
 
 def _table_of_pictures(facts: Mapping[str, Mapping[str, object]]) -> str:
@@ -267,11 +297,16 @@ def _table_of(out: Path | None, kind: str) -> Path | None:
     return out if kind else out / "scanpaths.csv"
 
 
+def _viewer(path: Fixations) -> tuple[str, list[list[float]], list[float]]:
+    """List name, points and durations of a drawn viewer, from which `_fixations` makes the scanpath again."""
+    return path.subject, path.points.tolist(), np.asarray(path.durations).tolist()
+
+
 def _fixations(name: str, outcome: _Outcome) -> list[Fixations]:
     """Make the scanpaths of the viewers that were drawn for a picture."""
-    size = tuple(outcome["size"])
+    width, height = outcome["size"]
     return [
-        Fixations(name, subject, np.array(points), size, np.array(durations))
+        Fixations(name, subject, np.array(points), (width, height), np.array(durations))
         for subject, points, durations in outcome["viewers"]
     ]
 

@@ -39,10 +39,10 @@ from semfov.report.template import page_path
 from semfov.runs.config import WHERE
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 
-_Options = TypeVar("_Options", bound=PictureOptions)
+_Options_co = TypeVar("_Options_co", bound=PictureOptions, covariant=True)
 
 
-class PictureJob(ABC, Generic[_Options]):
+class PictureJob(ABC, Generic[_Options_co]):
     """Looks at pictures as the options say; any process can make it from the options.
 
     Attributes:
@@ -60,7 +60,7 @@ class PictureJob(ABC, Generic[_Options]):
     every: ClassVar[bool] = False
     drawings: ClassVar[tuple[Drawing, ...]] = ALL_DRAWINGS
 
-    def __init__(self, options: _Options, agent: ActivePerception | None = None) -> None:
+    def __init__(self, options: _Options_co, agent: ActivePerception | None = None) -> None:
         self.options = options
         self.title = ""
         self.target: str | None = None
@@ -70,6 +70,22 @@ class PictureJob(ABC, Generic[_Options]):
         self.several = len(self.sources) > 1
         self._check_names()
         self.truth = None if options.annotations is None else Truth(options.annotations)
+        self._check_before_loading()
+
+        # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
+        self.aim(detector_classes(options) if agent is None else agent.classes[1:])
+        self.agent = make_agent(options) if agent is None else agent
+        classes = self.agent.classes[1:]
+        self.aim(classes)
+        if self.truth is not None:
+            self.truth.categories(self.targets or classes)
+        if not self.sources:
+            name = "sheet" if self.every else example_with(self.target, classes)
+            self.sources = [example_source(name, classes, self.target)]
+
+    def _check_before_loading(self) -> None:
+        """Raise an error for options that cannot be followed, before anything is loaded."""
+        options = self.options
         if self.truth is not None:
             # A picture that the annotations lack is reported now, and not after hours.
             for source in self.sources:
@@ -81,16 +97,6 @@ class PictureJob(ABC, Generic[_Options]):
         check_apart(options.figure, "out", [source.file for source in self.sources])
         expected = f"a folder for the figures of {len(self.sources):,} pictures"
         check(options.figure is None or not self.several, "out", expected, options.figure)
-        # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
-        self.aim(detector_classes(options) if agent is None else agent.classes[1:])
-        self.agent = make_agent(options) if agent is None else agent
-        classes = self.agent.classes[1:]
-        self.aim(classes)
-        if self.truth is not None:
-            self.truth.categories(self.targets or classes)
-        if not self.sources:
-            name = "sheet" if self.every else example_with(self.target, classes)
-            self.sources = [example_source(name, classes, self.target)]
 
     def _check_names(self) -> None:
         """Raise `InputError` where files that are named as their pictures would have the same name."""
@@ -108,7 +114,7 @@ class PictureJob(ABC, Generic[_Options]):
         """
         self.title = "exploration"
 
-    def depends_on(self) -> dict[str, Any]:
+    def depends_on(self) -> dict[str, object]:
         """List what outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
         agent = self.agent
         folder = self.options.models
@@ -264,7 +270,7 @@ class ExploreJob(PictureJob[ExploreOptions]):
         return self.agent.explore(picture, **settings)
 
 
-def make_again(kind: type[PictureJob[Any]], options: PictureOptions) -> PictureJob[Any]:
+def make_again(kind: type[PictureJob[PictureOptions]], options: PictureOptions) -> PictureJob[PictureOptions]:
     """Make a job in a process that works for another one.
 
     Args:

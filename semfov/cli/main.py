@@ -12,22 +12,25 @@ from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import TYPE_CHECKING
 
 from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
 from semfov.words import COMMANDS, FORMER, OPTIONS, dashed, meant_options, note_of_former
 
+if TYPE_CHECKING:
+    from semfov.runs.settings import Settings
+
 _LOOKING = tuple(name for name, command in SUBCOMMANDS.items() if command.looking)
 """Subcommands that look at pictures or frames."""
 
 
-def _options_of(name: str) -> type[Any]:
+def _options_of(name: str) -> "type[Settings]":
     """Import the options of a subcommand when they are asked for: help and mistakes need no tensors."""
     return resolve_name(f"semfov.{SUBCOMMANDS[name].options}")
 
 
-def _run(name: str, options: Any) -> int | None:
+def _run(name: str, options: "Settings") -> int | None:
     """Run a subcommand, without its texts if it is to be quiet, or with them beside results in standard output."""
     command = SUBCOMMANDS[name]
     stream = sys.stdout
@@ -76,10 +79,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         make_parser(options, command.help.partition("\nusage:")[0], positional, program).print_help()
         return 0
     words = partial(_in_command_words, options=_message_options(name))
-    names: dict[str, Any] = {"positional": positional, "program": program, "goes_on": name == "fit"}
     with warnings.catch_warnings():  # each is one line in the words of the command, without the place in the code
         warnings.showwarning = lambda message, *_, **__: print(f"warning: {words(str(message))}", file=sys.stderr)
-        return run_command(partial(_run, name), options, command.help, rest, words=words, **names)
+        return run_command(
+            partial(_run, name),
+            options,
+            command.help,
+            rest,
+            positional=positional,
+            program=program,
+            words=words,
+            goes_on=name == "fit",
+        )
 
 
 def _text(name: str, rest: Sequence[str]) -> str | None:

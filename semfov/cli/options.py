@@ -6,7 +6,7 @@ agent, the pictures and the files that are written.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from semfov.data.tone import White
 from semfov.errors import InputError
@@ -374,9 +374,10 @@ def white_of(text: str | None) -> White | None:
     """Read the values that are black and white."""
     if text is None:
         return None
+    if text == "auto":
+        return "auto"
+    first, separator, second = text.partition(",")
     try:
-        values: Any = "auto" if text == "auto" else tuple(float(each) for each in text.split(","))
+        return (float(first), float(second)) if separator else float(first)
     except ValueError:
         raise InputError(f"white: expected 4095, 300,3000 or auto, got {text!r}") from None
-    white: White = values[0] if len(values) == 1 else values
-    return white

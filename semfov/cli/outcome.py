@@ -21,9 +21,10 @@ from semfov.detection.objects import box_text
 from semfov.io.files import plain_name
 from semfov.kinds import Drawing
 from semfov.paths import Record
+from semfov.paths.conversion import Values
 from semfov.paths.look import CONFIDENT, RecordedLook, detections_in_words
 from semfov.paths.regions import Region
-from semfov.report.episode import jpeg
+from semfov.report.episode import Data, jpeg
 from semfov.viz import save_figure
 
 _OBJECTS_LISTED = 20  # largest number of objects that are listed
@@ -84,11 +85,13 @@ def _regions_lines(record: Record) -> list[str]:
     """Write a line for each class that was looked for and that the final map names, with its most probable cell."""
     by_class: dict[str, list[Region]] = {}
     for region in record.regions():
-        if not record.targets or record.classes.index(region.name) in record.targets:
+        is_sought = not record.targets or record.classes.index(region.name) in record.targets
+        if is_sought:
             by_class.setdefault(region.name, []).append(region)
     counts = {name: sum(len(region.cells) for region in regions) for name, regions in by_class.items()}
+    largest_first = sorted(counts, key=lambda name: -counts[name])
     lines = []
-    for name in sorted(counts, key=lambda name: -counts[name]):
+    for name in largest_first:
         best = max(by_class[name], key=lambda region: region.probability)
         x, y = best.place
         cells = f"{counts[name]} cell{'s' if counts[name] != 1 else ''}"
@@ -143,8 +146,8 @@ class PictureOutcome:
 
     ended: str
     text: str
-    row: dict[str, Any]
-    episode: dict[str, Any] | None = None
+    row: Values
+    episode: Data | None = None
     names: tuple[str, ...] = ()
     figures: Mapping[str, bytes] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
@@ -223,7 +226,7 @@ def _crops(record: Record, source: PictureSource, options: PictureOptions) -> di
     return files
 
 
-def _result_row(record: Record, source: PictureSource, seconds: float, form: ResultsFormat | None) -> dict[str, Any]:
+def _result_row(record: Record, source: PictureSource, seconds: float, form: ResultsFormat | None) -> Values:
     """Make the entry of a picture in a file of results.
 
     Args:

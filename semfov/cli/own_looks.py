@@ -133,18 +133,25 @@ def scene_json(agent: ActivePerception, image: Tensor) -> str:
         Size of the picture in pixels, its levels as JPEGs, and the widths along x and y in pixels of the picture.
     """
     sensor = agent.eye.sensor
+    sigma = [1.0, 1.0]
+    growth = 1.0
     with torch.inference_mode():
         view = agent.eye.open(image)
-        scale = torch.tensor(view.placement.scale)
         width, height = view.placement.size
-        size = [max(1, round(side)) for side in (scale * torch.tensor([width, height])).tolist()]
-        small = resize(image[None].float(), (size[0], size[1]))
-        scene = {"size": [width, height], "pixels": size, "sigma": [1.0, 1.0], "growth": 1.0}
-        levels: tuple[Tensor, ...] = (small,)
+        scale = torch.tensor(view.placement.scale)
+        columns, rows = (max(1, round(side)) for side in (scale * torch.tensor([width, height])).tolist())
+        sharp = resize(image[None].float(), (columns, rows))
+        levels: tuple[Tensor, ...] = (sharp,)
         if isinstance(sensor, Foveation):
-            levels = gaussian_pyramid(small, sensor.levels, sensor.convention)
-            _, sigma = view.state
-            scene["sigma"] = (sigma.flatten().cpu() / scale).tolist()
-            scene["growth"] = float(torch.as_tensor(sensor.growth))
-    scene["levels"] = [jpeg_uri(level[0], level.shape[-1], _QUALITY) for level in levels]
+            levels = gaussian_pyramid(sharp, sensor.levels, sensor.convention)
+            _, sigma_on_canvas = view.state
+            sigma = (sigma_on_canvas.flatten().cpu() / scale).tolist()
+            growth = float(torch.as_tensor(sensor.growth))
+    scene = {
+        "size": [width, height],
+        "pixels": [columns, rows],
+        "sigma": sigma,
+        "growth": growth,
+        "levels": [jpeg_uri(level[0], level.shape[-1], _QUALITY) for level in levels],
+    }
     return json.dumps(scene)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from semfov.cli.formats import FORMATS, CocoResults, JsonLines, ResultsFormat, Row, suffix_of, suffixes
 from semfov.cli.options import FIGURES
@@ -131,7 +131,7 @@ def held_outputs(options: object) -> AbstractContextManager[None]:
     return written_alone([path for path in outputs if path not in folders], folders)
 
 
-def unfinished(file: Path, depends_on: Mapping[str, Any], sources: Sequence[PictureSource]) -> SceneResults:
+def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[PictureSource]) -> SceneResults:
     """Open what a command has finished of pictures that are the same, with all that it depends on.
 
     Args:

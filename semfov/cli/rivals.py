@@ -265,14 +265,26 @@ class Scores:
             self._found[way][image] = of_way
 
     def _annotated(self, entries: Iterable[Entry], size: tuple[int, int]) -> Annotation:
-        """Make the annotation of a picture from the entries of the file, those of the classes that are sought."""
-        labels = {id_: label for label, id_ in self._ids.items()}
-        kept = [entry for entry in entries if entry["category_id"] in labels and min(entry["bbox"][2:]) > 0]
-        corners = torch.tensor([entry["bbox"] for entry in kept], dtype=torch.float32).view(-1, 4)
-        corners[:, 2:] += corners[:, :2]
-        numbers = torch.tensor([labels[entry["category_id"]] for entry in kept], dtype=torch.long)
-        crowd = torch.tensor([bool(entry["iscrowd"]) for entry in kept], dtype=torch.bool)
-        return Annotation(corners, numbers, crowd, size)
+        """Make the annotation of a picture from the entries of the file, those of the classes that are sought.
+
+        Args:
+            entries: the entries of the picture.
+            size: `(width, height)` of the picture.
+
+        Returns:
+            The annotation, without boxes that have no area.
+        """
+        label_of_category = {category: label for label, category in self._ids.items()}
+        sought = []
+        for entry in entries:
+            has_area = min(entry["bbox"][2:]) > 0
+            if entry["category_id"] in label_of_category and has_area:
+                sought.append(entry)
+        boxes = torch.tensor([entry["bbox"] for entry in sought], dtype=torch.float32).view(-1, 4)
+        boxes[:, 2:] += boxes[:, :2]  # a file has width and height, and not the right lower corner
+        labels = torch.tensor([label_of_category[entry["category_id"]] for entry in sought], dtype=torch.long)
+        crowd = torch.tensor([bool(entry["iscrowd"]) for entry in sought], dtype=torch.bool)
+        return Annotation(boxes, labels, crowd, size)
 
     def points(self) -> list[Point]:
         """List what each way finds after each number of passes.

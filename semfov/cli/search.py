@@ -23,10 +23,11 @@ from semfov.cli.results import held_outputs
 from semfov.cli.written import PictureFiles
 from semfov.data.classes import counted
 from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
+from semfov.paths.conversion import Values
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
 
-_TASKS: dict[str, tuple[type[PictureOptions], type[PictureJob[Any]]]] = {
+_TASKS: dict[str, tuple[type[PictureOptions], type[PictureJob[PictureOptions]]]] = {
     "search": (SearchOptions, SearchJob),
     "find": (FindOptions, FindJob),
     "explore": (ExploreOptions, ExploreJob),
@@ -181,14 +182,14 @@ def _check_agent_is_made(options: Mapping[str, Any]) -> None:
     check(is_one, "workers", "1 for an agent that is made already", options.get("workers"))
 
 
-def _look_at_pictures(job: PictureJob[Any], stream: TextIO) -> list[dict[str, Any]]:
+def _look_at_pictures(job: PictureJob[PictureOptions], stream: TextIO) -> list[Values]:
     """Look at all pictures, print the outcomes, and write the files that the options name; `--out -` is the stream."""
     job.check_drawings()
     with held_outputs(job.options):  # no other command writes the same files meanwhile
         return _look_and_write(job, stream)
 
 
-def _look_and_write(job: PictureJob[Any], stream: TextIO) -> list[dict[str, Any]]:
+def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Values]:
     """Look at all pictures, and write what is known of those so far, whenever the command ends."""
     count = len(job.sources)
     if not job.options.pictures:
@@ -232,7 +233,7 @@ def _found_in_all(files: PictureFiles) -> str:
     return f"{', '.join(counted(number, name) for name, number in counts.most_common())} found" if counts else ""
 
 
-def _skip(job: PictureJob[Any], files: PictureFiles, number: int, fault: SemfovError) -> None:
+def _skip(job: PictureJob[PictureOptions], files: PictureFiles, number: int, fault: SemfovError) -> None:
     """Leave out one picture of several, and say why; the fault of a single picture is raised."""
     if not job.several:
         raise fault
@@ -241,7 +242,7 @@ def _skip(job: PictureJob[Any], files: PictureFiles, number: int, fault: SemfovE
 
 
 def _outcomes(
-    job: PictureJob[Any], before: Mapping[int, PictureOutcome]
+    job: PictureJob[PictureOptions], before: Mapping[int, PictureOutcome]
 ) -> Iterator[tuple[int, PictureOutcome | SemfovError]]:
     """Yield the outcomes of all pictures with their numbers: those of before, then the others as they are made."""
     yield from before.items()

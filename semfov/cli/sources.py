@@ -2,11 +2,10 @@
 
 import os
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from glob import glob
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, TypedDict, cast
 
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large, picture_size
 from semfov.data.scenes import CLASSES
 from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
+from semfov.data.tone import White
 from semfov.data.windowed import LargePicture
 from semfov.errors import DataError, InputError, SemfovError, check, printable
 from semfov.head import Flat, Panorama
@@ -28,6 +28,13 @@ _DEBUG = "SEMFOV_DEBUG"  # variable of the environment that also prints where in
 FlatPicture = str | Tensor | LargePicture  # a picture that is no scene: a file, pixels, or one that is open
 
 _EXAMPLE = "example:"  # before the name of a picture that comes with the package
+
+
+class _Shown(TypedDict, total=False):
+    """Values and bands of a picture that are shown, as arguments of `semfov.data.large.open_large`."""
+
+    white: White
+    bands: tuple[int, ...]
 
 
 class PictureSource(NamedTuple):
@@ -45,7 +52,7 @@ class PictureSource(NamedTuple):
     file: Path | None = None
     scene: Picture | None = None
     place: Path = Path("example")
-    shown: Mapping[str, Any] = MappingProxyType({})
+    shown: _Shown = _Shown()  # never changed
 
     def picture(self) -> FlatPicture:
         """Open the picture, with the values and bands that are to be shown."""
@@ -134,10 +141,7 @@ def picture_sources(options: PictureOptions | GazeOptions | CompareOptions) -> l
     """
     sources: dict[str, PictureSource] = {}
     shown = _shown_by(options)
-    names = [name for word in options.pictures for name in _matching(word)]
-    # What a shell makes of `flight/*` is what is in a folder, where other files than photographs are left out.
-    photos = {*photographs([Path(name) for name in names], "pictures")} if len(names) > 1 else set()
-    for name in [name for name in names if Path(name) in photos] or names:
+    for name in _names_of_pictures(options.pictures):
         if name.startswith(_EXAMPLE):
             sources.setdefault(name, example_source(name.removeprefix(_EXAMPLE)))
             continue
@@ -149,6 +153,16 @@ def picture_sources(options: PictureOptions | GazeOptions | CompareOptions) -> l
             # A picture that is named twice, such as by its name and by its folder, is looked at once.
             sources.setdefault(os.path.abspath(file), source)
     return [*sources.values()]
+
+
+def _names_of_pictures(words: Iterable[str]) -> list[str]:
+    """List the files and folders that words name or match; of several, those that may be photographs."""
+    names = [name for word in words for name in _matching(word)]
+    if len(names) <= 1:
+        return names
+    # What a shell makes of `flight/*` is what is in a folder, where other files than photographs are left out.
+    photos = {*photographs([Path(name) for name in names], "pictures")}
+    return [name for name in names if Path(name) in photos] or names
 
 
 def _matching(word: str) -> list[str]:
@@ -169,9 +183,9 @@ def _check_may_be_picture(name: str, *, has_target: bool) -> None:
     check(not is_video, "picture", "photographs; `semfov live` takes videos", name)
 
 
-def _shown_by(options: PictureOptions | GazeOptions | CompareOptions) -> dict[str, Any]:
+def _shown_by(options: PictureOptions | GazeOptions | CompareOptions) -> _Shown:
     """Take the values and the bands that are to be shown, as arguments of `semfov.data.large.open_large`."""
-    shown: dict[str, Any] = {}
+    shown: _Shown = {}
     white = white_of(options.white)
     if white is not None:
         shown["white"] = white

@@ -46,18 +46,22 @@ class Trial:
         eye = agent.zoom.eye
         detector = agent.eye.detector
         view = eye.open(photo)
-        canvas, frames = eye.glimpse(view, torch.tensor([Window.overview(view.lattice).fixation]))
+        overview = torch.tensor([Window.overview(view.lattice).fixation])
+        canvas, frames = eye.glimpse(view, overview)
         proposals = detector.propose(canvas).precise()
         confidence = proposals.confidence[0]
         labels = proposals.classes[0].argmax(-1)
+
         confident = (confidence >= SCORE_THRESHOLD).nonzero()[:, 0]
         boxes = proposals.boxes[0, confident]
-        chosen = suppress(boxes, confidence[confident], labels[confident], detector.selection)
+        survivors = suppress(boxes, confidence[confident], labels[confident], detector.selection)
+        index = confident[survivors]
+
         # From the canvas, where the photograph lies between two corners, to its pixels.
         first_pixel, last_pixel, first, last = frames[0].view(4, 2).repeat(1, 2).unbind()
-        placed = (boxes[chosen] - first) * (last_pixel - first_pixel) / (last - first) + first_pixel
+        placed = (boxes[survivors] - first) * (last_pixel - first_pixel) / (last - first) + first_pixel
         placed = placed.clamp(first_pixel, last_pixel)
-        return cls(placed, confidence[confident][chosen], labels[confident][chosen] + 1, proposals)
+        return cls(placed, confidence[index], labels[index] + 1, proposals)
 
 
 def try_detector(agent: ActivePerception, photo: Path) -> None:
@@ -93,20 +97,31 @@ def _settings(detector: Detector) -> str:
 
 
 def _rows(bare: Trial, objects: Objects, classes: tuple[str, ...]) -> list[list[str]]:
-    """Class, both scores and box of what the bare detector shows, and then of what semfov lists beyond it."""
-    overlap = box_iou(bare.boxes, objects.boxes.to(bare.boxes)) * (bare.labels[:, None] == objects.labels)
-    rows = list[list[str]]()
+    """List class, both scores and box of what the bare detector shows, and then of what semfov lists beyond it.
+
+    Args:
+        bare: what the detector shows, most confident first.
+        objects: what semfov lists; each stands beside one box of the detector at most.
+        classes: names of the classes, background first.
+
+    Returns:
+        The cells of each row; `-` where one of them does not have the object.
+    """
+    is_same_class = bare.labels[:, None] == objects.labels
+    overlap = box_iou(bare.boxes, objects.boxes.to(bare.boxes)) * is_same_class
+    rows: list[list[str]] = []
     unmatched = set(range(len(objects)))
     for number, (box, score, label) in enumerate(zip(bare.boxes, bare.scores, bare.labels, strict=True)):
         best = int(overlap[number].argmax()) if len(objects) else 0
-        listed = "-"
+        listed_score = "-"
         if best in unmatched and float(overlap[number, best]) >= _SAME:
             unmatched.remove(best)
-            listed = f"{objects.scores[best]:.2f}"
-        rows.append([classes[label], f"{score:.2f}", listed, box_text(box.tolist())])
+            listed_score = f"{objects.scores[best]:.2f}"
+        rows.append([classes[label], f"{score:.2f}", listed_score, box_text(box.tolist())])
     for number in sorted(unmatched):
         name = classes[int(objects.labels[number])]
-        rows.append([name, "-", f"{objects.scores[number]:.2f}", box_text(objects.boxes[number].tolist())])
+        place = box_text(objects.boxes[number].tolist())
+        rows.append([name, "-", f"{objects.scores[number]:.2f}", place])
     return rows
 
 

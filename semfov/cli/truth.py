@@ -5,7 +5,6 @@ from collections import defaultdict
 from collections.abc import Collection, Sequence
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import Any
 from unicodedata import normalize
 from urllib.parse import unquote
 
@@ -13,8 +12,9 @@ import torch
 
 from semfov.data.annotations import Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name
-from semfov.errors import DataError, check
+from semfov.errors import DataError, check, check_data
 from semfov.metrics.average_precision import average_precision
+from semfov.paths.conversion import Values
 
 
 class Truth:
@@ -36,15 +36,16 @@ class Truth:
     def _warn_of_boxes(self) -> None:
         """Warn of boxes that are written in another form, and of those without area, which are not judged."""
         boxes = []
-        sizes = []
+        limits = []
         empty = 0
         for image, entries in self.annotations.objects.items():
             size = self.annotations.size(image)
             empty += sum(min(entry["bbox"][2:]) == 0 for entry in entries)
             if size is not None:
                 boxes += [entry["bbox"] for entry in entries]
-                sizes += [size * 2] * len(entries)
-        warn_of_form(torch.tensor(boxes).view(-1, 4).double(), torch.tensor(sizes).view(-1, 4).double(), self.path)
+                limits += [size * 2] * len(entries)
+        corners = torch.tensor(boxes).view(-1, 4).double()
+        warn_of_form(corners, torch.tensor(limits).view(-1, 4).double(), self.path)
         if empty:
             warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
 
@@ -67,23 +68,24 @@ class Truth:
 
         def agreement(image: Id) -> tuple[int, int]:
             """Count the last parts of both paths that agree, and those that are equal."""
-            pairs = [*zip(reversed(parts), reversed(_parts(self.annotations.images[image]["file_name"])), strict=False)]
+            image_parts = _parts(self.annotations.images[image]["file_name"])
+            pairs = [*zip(reversed(parts), reversed(image_parts), strict=False)]
             agreeing = takewhile(lambda pair: _plain(pair[0]) == _plain(pair[1]), pairs)
             equal = takewhile(lambda pair: pair[0] == pair[1], pairs)
             return len([*agreeing]), len([*equal])
 
-        found = sorted(self._images.get(_plain(parts[-1]), ()), key=agreement)
-        if not found or (len(found) > 1 and agreement(found[-1]) == agreement(found[-2])):
+        images = sorted(self._images.get(_plain(parts[-1]), ()), key=agreement)
+        is_ambiguous = len(images) > 1 and agreement(images[-1]) == agreement(images[-2])
+        expected = f"one image with the file_name of {name}"
+        check_data(bool(images) and not is_ambiguous, f"annotations {self.path}", expected, len(images))
+        best = images[-1]
+        stated = self.annotations.size(best)
+        if size is not None and stated is not None and stated != size:
             raise DataError(
-                f"annotations {self.path}: expected one image with the file_name of {name}, got {len(found)}"
-            )
-        wanted = self.annotations.size(found[-1])
-        if size is not None and wanted not in (None, size):
-            raise DataError(
-                f"annotations {self.path}: expected {name} to have {wanted[0]} × {wanted[1]} px, got {size[0]} × "
+                f"annotations {self.path}: expected {name} to have {stated[0]} × {stated[1]} px, got {size[0]} × "
                 f"{size[1]}; its boxes are in another frame"
             )
-        return found[-1]
+        return best
 
     def categories(self, classes: Collection[str]) -> dict[str, Id]:
         """Find the categories of the file that are among some classes.
@@ -105,7 +107,7 @@ class Truth:
         check(bool(found), "annotations", f"some of the classes {', '.join([*classes][:5])} as categories", examples)
         return found
 
-    def judge(self, results: Sequence[dict[str, Any]], images: Sequence[Id], classes: Collection[str]) -> str:
+    def judge(self, results: Sequence[Values], images: Sequence[Id], classes: Collection[str]) -> str:
         """AP and AP50 of results over some images and classes, in words."""
         precision = average_precision(self.annotations, results, images=images, classes=classes)
         counts = f"({len(images)} pictures, {len(results)} boxes)"

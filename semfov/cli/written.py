@@ -1,14 +1,17 @@
 """The files that a command writes about its pictures: results, figures, crops, labels and a page."""
 
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from semfov.cli.jobs import PictureJob
+from semfov.cli.options import PictureOptions
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import STDOUT, ResultsFile, kind_of, results_format, tell_written, unfinished
 from semfov.errors import SemfovError
 from semfov.io.files import check_apart, plain_name, write_bytes
+from semfov.paths.conversion import Values
 from semfov.report import write_page
+from semfov.report.episode import Data
 from semfov.runs.results import SceneResults
 
 _KEPT = ("ended", "text", "row", "episode", "names")
@@ -23,12 +26,12 @@ class PictureFiles:
         finished: the outcomes that the same command takes up after an interruption; None for one picture.
     """
 
-    def __init__(self, job: PictureJob[Any], stream: TextIO) -> None:
+    def __init__(self, job: PictureJob[PictureOptions], stream: TextIO) -> None:
         self.job = job
-        self.rows: dict[int, dict[str, Any]] = {}
+        self.rows: dict[int, Values] = {}
         self.finished: SceneResults | None = None
         self._written = list[Path]()
-        self._episodes: dict[int, dict[str, Any]] = {}
+        self._episodes: dict[int, Data] = {}
         self._results: ResultsFile | None = None
         self._folder: Path | None = None
         if job.options.figure is not None:
@@ -118,7 +121,7 @@ class PictureFiles:
             if self._results.path != STDOUT:
                 written.append(self._results.path)
         written += self._written
-        if self._episodes:
+        if options.report is not None and self._episodes:
             episodes = [self._episodes[number] for number in sorted(self._episodes)]
             written.append(write_page(options.report, f"semfov: {self.job.title}", episodes))
         written += [folder for folder in (options.crops, options.labels) if folder is not None]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, ClassVar, Literal, Protocol
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Association, CellMemory
@@ -10,6 +10,7 @@ from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.yolo import Runtime
 from semfov.errors import lookup
 from semfov.gaze.acquisition.base import Task
+from semfov.io.files import JsonObject
 from semfov.io.ranges import Count, Positive, Range, Seed, Share, Shifts, Side, Whole, Workers
 from semfov.runs.settings import Settings
 from semfov.runs.workers import Where
@@ -116,7 +117,7 @@ class SensorConfig(Settings):
     def kind(self) -> type[Sensor]:
         return SENSORS[lookup(self.name, SENSORS, "sensor")].make
 
-    def whole(self) -> dict[str, Any]:
+    def whole(self) -> JsonObject:
         """List all settings of the sensor: those of its name, changed by those that are given."""
         changes = {}
         for field_ in fields(self):
@@ -150,7 +151,7 @@ class SensorConfig(Settings):
             return [edge / self.reference for edge in borders if edge < self.reference]
         return [width / 100.0 * self.fovea * n for n in range(1, levels)]
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """List the name, all settings and the reference, as a model folder keeps them."""
         return {"name": self.name, **self.whole(), "reference": self.reference}
 

@@ -39,7 +39,7 @@ class SceneRun(ABC):
         return f"{depends_on[:16]}-{self.code[:16]}"
 
     @abstractmethod
-    def depends_on(self) -> dict[str, Any]:
+    def depends_on(self) -> dict[str, object]:
         """List the fitted models and the settings that the outcomes depend on, beside scenes and code."""
 
     @property

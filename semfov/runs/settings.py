@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import yaml
 
+from semfov.io.files import JsonObject
 from semfov.io.ranges import CheckedSettings
 
 
@@ -16,7 +17,7 @@ class Settings(CheckedSettings):
 
     unused: ClassVar[tuple[str, ...]] = ()  # inherited settings that mean nothing here: no options, and not written
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> JsonObject:
         """Write the settings as JSON values, in which paths are text and tuples are lists."""
         return plain({name: value for name, value in asdict(self).items() if name not in self.unused})
 
@@ -54,6 +55,6 @@ def load_yaml(text: str) -> Any:
     return get_loader("yaml")(text)
 
 
-def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+def plain(settings: Mapping[str, object]) -> JsonObject:
     """Convert settings to JSON values: paths become text, tuples become lists."""
     return json.loads(json.dumps(settings, default=str))

@@ -1,6 +1,6 @@
 """Makes scenes, detector, eye and models from settings."""
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import Any, TypeVar
 
 from semfov.belief import TargetEvidence, Verification
@@ -37,7 +37,7 @@ def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> N
         check_detector(detector.name)
 
 
-def make_scenes(data: DataConfig, classes: tuple[str, ...], ids: Sequence[Any] | None = None) -> Scenes:
+def make_scenes(data: DataConfig, classes: tuple[str, ...], ids: Collection[int | str] | None = None) -> Scenes:
     """Make the scenes of the settings.
 
     Args:
