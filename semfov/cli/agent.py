@@ -133,25 +133,41 @@ def make_agent(options: AgentOptions) -> ActivePerception:
     return agent if device is None else agent.to(device)
 
 
-def _load_agent(options: AgentOptions, loaded: dict[str, Any]) -> ActivePerception:
-    """Load the agent that the options name, with options of `load_detector`."""
+def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePerception:
+    """Load the agent that the options name.
+
+    Args:
+        options: the options of a command.
+        loading: options of `load_detector`.
+
+    Returns:
+        The agent.
+    """
     if options.models is not None:
-        made_of_a_folder = options.agent in ("recommended", "published")
-        check(made_of_a_folder, "agent", "recommended or published with --models", options.agent)
-        moved = loaded if options.detector == AgentOptions.detector else {"detector": options.detector, **loaded}
-        load = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
-        return load(options.models, **moved)
+        return _load_from_folder(options, options.models, loading)
     if options.agent == "recommended":
         sensor = SENSORS[options.sensor or "gradual"]
         kind = sensor.make.__name__
         check(sensor.make is Foveation, "sensor", "a Foveation, since models are shipped for no other sensor", kind)
-        shape: dict[str, Any] = {name: sensor.settings[name] for name in ("sigma", "growth")}
-        return ActivePerception.recommended(options.detector, **shape, **loaded)
+        sigma = sensor.settings["sigma"]
+        growth = sensor.settings["growth"]
+        return ActivePerception.recommended(options.detector, sigma=sigma, growth=growth, **loading)
     if options.agent == "learned-chain":
         check(options.sensor in (None, "gradual"), "sensor", "gradual with --agent learned-chain", options.sensor)
-        return ActivePerception.learned_chain(options.detector, **loaded)
+        return ActivePerception.learned_chain(options.detector, **loading)
     make = ActivePerception.published if options.agent == "published" else ActivePerception.raw
-    return make(options.detector, sensor=options.sensor or "published", **loaded)
+    return make(options.detector, sensor=options.sensor or "published", **loading)
+
+
+def _load_from_folder(options: AgentOptions, folder: Path, loading: dict[str, Any]) -> ActivePerception:
+    """Load an agent from a folder of models, which says what its detector is."""
+    made_of_a_folder = options.agent in ("recommended", "published")
+    check(made_of_a_folder, "agent", "recommended or published with --models", options.agent)
+    if options.detector != AgentOptions.detector:
+        # The file of the detector is elsewhere now.
+        loading = {"detector": options.detector, **loading}
+    load = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
+    return load(folder, **loading)
 
 
 def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str] | None:

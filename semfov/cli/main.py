@@ -127,15 +127,24 @@ complete -c semfov -n __fish_use_subcommand -a "{commands}"
 
 
 def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
-    """Write the script with which a shell completes the command, from the options of each subcommand."""
+    """Write the script with which a shell completes the command.
+
+    Args:
+        shell: `bash`, `zsh` or `fish`.
+        options: names of the options of each subcommand.
+
+    Returns:
+        The script; how to ask for one, where it is no such shell.
+    """
     script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
     if script is None:
         return "usage: semfov completion bash|zsh|fish, for example: semfov completion bash >> ~/.bashrc\n"
-    cases = []
-    lines = []
+    cases = []  # of the script of bash
+    lines = []  # of that of fish
     for command, names in options.items():
         words = [dashed(name) for name in names]
-        cases.append(f'    {command}) words="{" ".join(f"--{word}" for word in words)}";;')
+        completions = " ".join(f"--{word}" for word in words)
+        cases.append(f'    {command}) words="{completions}";;')
         lines += [f'complete -c semfov -n "__fish_seen_subcommand_from {command}" -l {word}' for word in words]
     start = "autoload -Uz compinit bashcompinit && compinit && bashcompinit\n" if shell == "zsh" else ""
     return start + script.format(cases="\n".join(cases), commands=" ".join(options), lines="\n".join(lines))
