@@ -63,19 +63,35 @@ def agreement(
     Returns:
         How well they agree where both show the scene.
     """
-    height, width = second.shape
-    blocks = _Blocks.of(height, width)
-    moved = first
-    is_shown = blocks.pixels > 0
-    if similarity is not None:
-        moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
-        is_shown &= blocks.shown_by(cv2, similarity)
-    textured, correlation = _correlations(cv2, moved, second, blocks)
-    is_compared = textured & is_shown
+    is_compared, correlation = _compared(cv2, first, second, similarity)
     compared = correlation[is_compared]
     median = float(np.median(compared)) if len(compared) else -1.0
-    elsewhere = blocks.spread(is_compared & (correlation < _ALIKE))
+    elsewhere = _Blocks.of(*second.shape).spread(is_compared & (correlation < _ALIKE))
     return Agreement(len(compared), int((compared >= _ALIKE).sum()), median, elsewhere)
+
+
+def blocks_of_rival(
+    cv2: Any,
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    similarity: NDArray[np.float64],
+    rival: NDArray[np.float64],
+) -> int:
+    """Count the blocks that look alike after another motion, and not after the one of a frame.
+
+    Args:
+        cv2: OpenCV.
+        first: contrast of the frame that is moved, `(h, w)` bytes.
+        second: likewise of the other one.
+        similarity: `(2, 3)`, maps pixels of the first frame to those of the second.
+        rival: likewise, the other motion.
+
+    Returns:
+        Their number.
+    """
+    is_compared, correlation = _compared(cv2, first, second, similarity)
+    is_compared_too, otherwise = _compared(cv2, first, second, rival)
+    return int((is_compared & (correlation < _ALIKE) & is_compared_too & (otherwise >= _ALIKE)).sum())
 
 
 def largest_change(cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
@@ -139,6 +155,21 @@ class _Blocks:
         x, y = np.rint(back @ self.corners)
         is_inside = (x >= 0) & (x < self.across[-1]) & (y >= 0) & (y < self.down[-1])
         return np.asarray(is_inside.reshape(4, *self.pixels.shape).all(0))
+
+
+def _compared(
+    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], similarity: NDArray[np.float64] | None
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Tell which blocks of a frame, moved, can be compared with another one, and their correlations."""
+    height, width = second.shape
+    blocks = _Blocks.of(height, width)
+    moved = first
+    is_shown = blocks.pixels > 0
+    if similarity is not None:
+        moved = cv2.warpAffine(first, similarity, (width, height), flags=cv2.INTER_LINEAR)
+        is_shown &= blocks.shown_by(cv2, similarity)
+    textured, correlation = _correlations(cv2, moved, second, blocks)
+    return textured & is_shown, correlation
 
 
 def _correlations(

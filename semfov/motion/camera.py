@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semfov.errors import needing
-from semfov.motion.agreement import agreement, largest_change
-from semfov.motion.coarse import coarse_shift
+from semfov.motion.agreement import agreement, blocks_of_rival, largest_change
 from semfov.motion.flow import LEAST_CORNERS, corners_stay, flow_between, rival_between
 from semfov.motion.frames import GreyFrame
 from semfov.motion.motion import Motion
+from semfov.motion.residual import coarse_shift, share_off
 
 _STILL = np.eye(3)
 _STILL_SHIFT = 0.3  # pixels of the frame: a camera that moves less stands still
@@ -33,6 +33,9 @@ _COARSE_SHIFT = 0.4  # reduced pixels by which what is coarse may move otherwise
 _AS_GOOD = 0.02  # by so much they correlate less, at most, where the camera may have stood still as well
 _AHEAD = 0.1  # by so much the blocks correlate better than after a shift by which the frame repeats itself
 _STEADY = 4.0  # reduced pixels by which a motion differs from the last one at most, where it has a rival
+_GOES_ON = 1.0  # the same of a motion that goes on, however much moves otherwise
+_MOST_OFF = 1 / 8  # share of the blocks, a row of them, that are off where a motion is one of two
+_GOING_ON = 2  # number of blocks that move as before from which on another motion is not that of the camera
 
 
 class CameraStep(NamedTuple):
@@ -137,7 +140,8 @@ class CameraMotion:
 
     - if the key frame correlates nearly as well a period away, as bricks and rows of windows do, unless nothing moved;
     - if a part of the frame moves otherwise, until the motion goes on as before: that may be a lorry before the camera,
-      or all that is left of the scene behind one;
+      or all that is left of the scene behind one. A part is a motion that corners have in common, blocks that move as
+      the frames before did, or a row of blocks that are off;
     - if what is coarse moves otherwise than its edges, as in a film that was compressed too much;
     - if the picture of the key frame has gone little by little, as in a dissolve;
     - if there is nothing to follow, unless the frame is the same: in the dark, before a clear sky, or before blinds.
@@ -205,6 +209,7 @@ class CameraMotion:
         lost.waited += 1
         fit = self._between(lost.key, present, lost.key_to_last)
         found = fit is not None and not fit.is_repeated and self._is_certain(fit, None)
+        found = found and fit is not None and share_off(self._cv2, lost.key, present, fit.similarity[:2]) < _MOST_OFF
         if found or lost.waited >= self.patience:
             self._lost = None
             if not found:
@@ -231,7 +236,9 @@ class CameraMotion:
         last_to_present = fit.similarity @ np.linalg.inv(self._key_to_last)
         rival = None if fit.rival is None else fit.rival @ np.linalg.inv(self._key_to_last)
         shift = _largest_shift(last_to_present, present.grey.shape) * max(present.ratio)
-        is_certain = self._is_certain(_Fit(last_to_present, rival, fit.median), self._course)
+        is_certain = self._is_certain(_Fit(last_to_present, rival, fit.median), self._course) and (
+            self._goes_on(last_to_present) or not self._is_divided(key, present, fit.similarity)
+        )
         is_still = shift < _STILL_SHIFT
         # Edges of the blocks of a broken film stay, too, but the blocks change.
         if not is_certain or (
@@ -288,6 +295,22 @@ class CameraMotion:
             return False
         shape = self._key.grey.shape
         return _difference(fit.similarity, course, shape) < min(_STEADY, _difference(fit.rival, course, shape))
+
+    def _goes_on(self, last_to_present: NDArray[np.float64]) -> bool:
+        """Tell whether the camera moves as it did between the frames before."""
+        if self._course is None or self._last is None:
+            return False
+        return _difference(last_to_present, self._course, self._last.grey.shape) < _GOES_ON
+
+    def _is_divided(self, key: GreyFrame, present: GreyFrame, similarity: NDArray[np.float64]) -> bool:
+        """Tell whether the motion from the key frame is one of two: blocks are off, or some move as before."""
+        if share_off(self._cv2, key, present, similarity[:2]) >= _MOST_OFF:
+            return True
+        if self._course is None:
+            return False
+        as_before = self._course @ self._key_to_last
+        count = blocks_of_rival(self._cv2, key.contrast, present.contrast, similarity[:2], as_before[:2])
+        return count >= _GOING_ON
 
     def _is_same(self, last: GreyFrame, present: GreyFrame) -> bool:
         """Tell whether nothing has changed between two frames, of which too few corners can be followed."""

@@ -40,6 +40,11 @@ def test_a_wrong_motion_is_not_believed(kind):
     assert judge(KINDS[kind](Stage(PICTURES, 1))) != "wrong"
 
 
+@pytest.mark.parametrize("number", [0, 1, 3])
+def test_a_lorry_that_passes_is_not_taken_for_a_camera_that_moves(number):
+    assert judge(KINDS["lorry that comes"](Stage(PICTURES, number))) == "right"
+
+
 def test_an_easy_pair_is_believed_and_a_false_pose_is_found_out():
     film = KINDS["cut to another photograph"](Stage(PICTURES, 0))[:2]
     assert judge(film) == "right"
