@@ -228,6 +228,31 @@ def test_noise_of_a_camera_that_stands_does_not_add_up():
         assert camera.step(view(picture, 800.2, 800.15, 0.0, 1.06**number)[0]).motion is not None
 
 
+@pytest.mark.parametrize("move", [(0.1, 0), (0.05, -0.08), (45, 20)], ids=["drift", "slow drift", "leap"])
+def test_a_camera_that_has_stood_is_seen_to_move(move):
+    """It stands for six frames, moves for twelve, and stands again; noise of the sensor is on all of them."""
+    picture, camera, random = scene(), CameraMotion(), np.random.default_rng(3)
+    steps = np.concatenate([np.zeros(6), np.arange(13), np.full(4, 12)])
+    places = np.array([700, 800]) + steps[:, None] * move
+    views = [view(picture, *place) for place in places]
+    total = Motion.still()
+    for frame, _ in views:
+        noisy = np.clip(frame + random.normal(0, 3, frame.shape), 0, 255).astype(np.uint8)
+        motion = camera.step(noisy).motion
+        total = total if motion is None else total.then(motion)
+    assert error(total, views[0][1], views[-1][1]) < 1.0
+
+
+def test_what_passes_before_a_camera_that_stands_is_no_motion_of_the_camera():
+    background, patch = view(scene(), 800, 800)[0], scene(seed=5)[:80, :80]
+    camera = CameraMotion()
+    for number in range(20):
+        frame = background.copy()
+        frame[140:220, 10 + 20 * number : 90 + 20 * number] = patch
+        step = camera.step(frame)
+        assert number == 0 or step.is_still
+
+
 @pytest.mark.parametrize("size", [(480, 7), (7, 480), (2, 2), (1, 1)])
 def test_frames_of_some_pixels_across_have_no_slopes_that_tell(size):
     frame = GreyFrame(cv2, np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8))
