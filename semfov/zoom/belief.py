@@ -20,6 +20,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -189,20 +190,14 @@ class ZoomBelief:
         x1, y1, x2, y2 = self._box(gist)
         rate = self._rate[:, y1:y2, x1:x2]
         rated_level = self._rated_level[y1:y2, x1:x2]
-        before = None
-        if gist.level > 0:
-            # Rates of looks that are coarser by more than three octaves are those for three.
-            level = rated_level + 1 + (gist.level - rated_level).clip(0, STEPS - 1)
-            before = before_of(np.choose(level, rate), gist)[None]
+        before = _rates_before(rate, rated_level, gist) if gist.level > 0 else None
         predicted = self._rates.rates(gist, self._targets, before)[0].exp().numpy()
-        if gist.scale > 1:
-            # The objects of a square of cells are spread evenly over its cells.
-            by_cell = predicted.repeat(gist.scale, -1).repeat(gist.scale, -2)
-            predicted = by_cell[:, : y2 - y1, : x2 - x1] / gist.scale**2
+        by_cell = _by_cell(predicted, gist.scale, rated_level.shape)
         is_closer = rated_level < gist.level
-        for level, values in enumerate(rate):
+        for level, rate_of_level in enumerate(rate):
+            # A look predicts the octaves above its own level; in the others it is expected to find nothing.
             octave = level - gist.level - 1
-            np.copyto(values, predicted[octave] if 0 <= octave < STEPS else 0, where=is_closer)
+            np.copyto(rate_of_level, by_cell[octave] if 0 <= octave < STEPS else 0, where=is_closer)
         rated_level[is_closer] = gist.level
 
     def remaining(self) -> tuple[float, float]:
@@ -266,7 +261,40 @@ class ZoomBelief:
 
 
 def _equal_weight(span: int) -> Cells:
+    """Weight the cells along a side of a window alike, `(span,)`."""
     return np.ones(span, np.float32)
+
+
+def _rates_before(rate: Cells, rated_level: NDArray[np.int8], gist: Gist) -> Tensor:
+    """Read what looks so far predict for the cells of a new look, as its own prediction takes it.
+
+    Args:
+        rate: `(levels, rows, columns)`, rates of the cells for looks of each level.
+        rated_level: `(rows, columns)`, level of the look that the rates of a cell are from.
+        gist: the look.
+
+    Returns:
+        `(1, rows, columns)` of the gist (`before_of`).
+    """
+    # Rates of looks that are coarser by more than three octaves are those for three.
+    octaves = (gist.level - rated_level).clip(0, STEPS - 1)
+    rate_before = np.choose(rated_level + 1 + octaves, rate)
+    return before_of(rate_before, gist)[None]
+
+
+def _by_cell(predicted: Cells, scale: int, shape: tuple[int, ...]) -> Cells:
+    """Spread the objects of each square of `scale` cells evenly over its cells, `(octaves, rows, columns)`.
+
+    Args:
+        predicted: `(octaves, down, across)`, objects of the squares, which may reach beyond the picture.
+        scale: cells along a side of a square.
+        shape: rows and columns of the cells in the picture.
+    """
+    if scale == 1:
+        return predicted
+    rows, columns = shape
+    repeated = predicted.repeat(scale, -1).repeat(scale, -2)
+    return repeated[:, :rows, :columns] / np.float32(scale**2)
 
 
 def before_of(rate: Cells, gist: Gist) -> Tensor:

@@ -29,10 +29,12 @@ def blank_cells(picture: LargePicture, lattice: Lattice) -> Tensor | None:
     if not colours and picture.nothing is None:
         return None
     width, height = lattice.size
-    pixels = picture.read((0, 0, width, height), picture.reduction(1 / lattice.magnifications[0])).numpy()
+    coarse = picture.reduction(1 / lattice.magnifications[0])  # as coarse as the overview
+    pixels = picture.read((0, 0, width, height), coarse).numpy()
     pixel_rows, pixel_columns = pixels.shape[1:]
-    down = _cell_pixels(lattice.rows, lattice.pitch[1] * (pixel_rows / height), pixel_rows)
-    across = _cell_pixels(lattice.columns, lattice.pitch[0] * (pixel_columns / width), pixel_columns)
+    cell_width, cell_height = lattice.pitch
+    down = _cell_pixels(lattice.rows, cell_height * (pixel_rows / height), pixel_rows)
+    across = _cell_pixels(lattice.columns, cell_width * (pixel_columns / width), pixel_columns)
     blank = np.zeros((lattice.rows, lattice.columns), bool)
     for colour in colours:
         blank |= _border_of_colour(pixels, colour, down, across)
@@ -61,27 +63,43 @@ def _border_of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, 
     first_rows = [first for first, _ in down]
     first_columns = [first for first, _ in across]
     sample = pixels[:, first_rows][:, :, first_columns]
-    single_rows = [(row, row + 1) for row in range(len(down))]
-    single_columns = [(column, column + 1) for column in range(len(across))]
-    candidates = _reaching_border(_of_colour(sample, colour, single_rows, single_columns))
+    has_colour = _of_colour(sample, colour, _single_pixels(len(down)), _single_pixels(len(across)))
+    candidates = _reaching_border(has_colour)
     for x1, x2 in _runs(candidates.any(0)):
         for y1, y2 in _runs(candidates[:, x1:x2].any(1)):
             candidates[y1:y2, x1:x2] &= _of_colour(pixels, colour, down[y1:y2], across[x1:x2])
     return _reaching_border(candidates)
 
 
+def _single_pixels(count: int) -> _Spans:
+    """List first and end of parts of a line of one pixel each."""
+    return [(pixel, pixel + 1) for pixel in range(count)]
+
+
 def _of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across: _Spans) -> NDArray[np.bool_]:
-    """Find cells all of whose pixels have a colour, up to rounding; pixels `(3, h, w)` → `(rows, columns)`."""
-    lowest = np.array([max(value, 1) - 1 for value in colour], np.uint8)
-    highest = np.array([min(value, 254) + 1 for value in colour], np.uint8)
+    """Find cells all of whose pixels have a colour, up to rounding.
+
+    Args:
+        pixels: `(3, h, w)`.
+        colour: red, green and blue.
+        down: first and end of the rows of pixels of each row of cells.
+        across: the same of columns.
+
+    Returns:
+        `(rows, columns)` of the cells.
+    """
     top = down[0][0]
     bottom = down[-1][1]
     left = across[0][0]
     right = across[-1][1]
     width = right - left
-    part = pixels[:, top:bottom, left:right].transpose(1, 2, 0).reshape(bottom - top, -1)
+    channels_last = pixels[:, top:bottom, left:right].transpose(1, 2, 0)
+    values = channels_last.reshape(bottom - top, -1)  # three in a row for each pixel
+    lowest = np.array([max(value, 1) - 1 for value in colour], np.uint8)
+    highest = np.array([min(value, 254) + 1 for value in colour], np.uint8)
     # One comparison for both limits: bytes below the lowest wrap round to large ones.
-    differs = part - np.tile(lowest, width) > np.tile(highest - lowest, width)
+    differs = values - np.tile(lowest, width) > np.tile(highest - lowest, width)
+    # Over the rows of a cell first: they are adjacent in memory, and leave little for the other steps.
     rows_differ = np.stack([differs[first - top : end - top].any(0) for first, end in down])
     pixels_differ = np.logical_or.reduce(rows_differ.reshape(len(down), width, -1), -1)
     cells_differ = np.stack([pixels_differ[:, first - left : end - left].any(1) for first, end in across], 1)
@@ -89,9 +107,16 @@ def _of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across:
 
 
 def _cell_pixels(cells: int, pitch: float, length: int) -> _Spans:
-    """List first and end of the pixels of each cell; those at the border of two cells count for both."""
+    """List first and end of the pixels of each cell; those at the border of two cells count for both.
+
+    Args:
+        cells: number of cells.
+        pitch: pixels of a cell.
+        length: number of pixels.
+    """
     spans = []
     for cell in range(cells):
+        # At least one pixel, also where cells are smaller than pixels.
         first = min(int(cell * pitch), length - 1)
         end = max(int(np.ceil((cell + 1) * pitch)), first + 1)
         spans.append((first, min(end, length)))

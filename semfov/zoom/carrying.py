@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.motion import Motion, moved_boxes
@@ -41,10 +42,11 @@ def carried(looks: Sequence[WindowLook], motions: Sequence[Motion], lattice: Lat
     boxes = torch.cat([look.detections.boxes[0] for look in looks])
     moved, _ = moved_boxes(matrices.repeat_interleave(counts, 0), boxes)
     places = zip(moved_regions.tolist(), scales.tolist(), moved.split(counts.tolist()), strict=True)
-    return [
-        _carried_look(look, motion, lattice, _window_at(look.window, region, scale, lattice), boxes)
-        for look, motion, (region, scale, boxes) in zip(looks, motions, places, strict=True)
-    ]
+    carried_looks = []
+    for look, motion, (region, scale, boxes_of_look) in zip(looks, motions, places, strict=True):
+        window = _window_at(look.window, region, scale, lattice)
+        carried_looks.append(_carried_look(look, motion, lattice, window, boxes_of_look))
+    return carried_looks
 
 
 def _carried_look(look: WindowLook, motion: Motion, lattice: Lattice, window: Window, boxes: Tensor) -> WindowLook:
@@ -101,24 +103,16 @@ def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
     rows, columns = gist.scores.shape[:2]
     first = np.array(gist.first)
     pitch = np.array(lattice.pitch)
-    if gist.level == 0:
-        low = first
-        counts = np.array([columns, rows])
-    elif not motion.is_ahead(torch.from_numpy(first * pitch)):
+    is_overview = gist.level == 0
+    squares = (first, np.array([columns, rows])) if is_overview else _moved_squares(gist, motion, lattice)
+    if squares is None:
         return None
-    else:
-        corner = motion.points(torch.from_numpy(first * pitch)[None])[0].numpy()
-        moved = np.rint(corner / pitch).astype(int)
-        low = moved.clip(0)
-        high = np.minimum(moved + gist.scale * np.array([columns, rows]), (lattice.columns, lattice.rows))
-        counts = (high - low) // gist.scale
-        if counts.min() <= 0:
-            return None
-    cells = np.stack(np.meshgrid(*(np.arange(count) for count in counts)), -1)
-    centres = (low + (cells + 0.5) * gist.scale) * pitch
-    # Where the centres of the new cells were in the frame of the look.
+    new_first, counts = squares
+    square = np.stack(np.meshgrid(*(np.arange(count) for count in counts)), -1)
+    centres = torch.from_numpy((new_first + (square + 0.5) * gist.scale) * pitch)
+    # Where the centres of the new squares were in the frame of the look.
     back = motion.inverse()
-    origins = back.points(torch.from_numpy(centres)).numpy()
+    origins = back.points(centres).numpy()
     place = np.floor((origins / pitch - first) / gist.scale).astype(np.intp)
     nearest = place.clip(0, (columns - 1, rows - 1))
     column = nearest[..., 0]
@@ -126,9 +120,35 @@ def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
     scores = gist.scores[row, column]
     size = gist.size[row, column]
     found = gist.found[row, column]
-    if gist.level > 0:
-        shown = torch.from_numpy((place == nearest).all(-1)) & back.is_ahead(torch.from_numpy(centres))
-        scores = scores * shown[..., None]
-        size = size * shown
-        found = found & shown[..., None]
-    return Gist(gist.level, (int(low[0]), int(low[1])), gist.scale, scores, size, found)
+    if not is_overview:
+        # Beyond what the look showed it says nothing.
+        is_inside = torch.from_numpy((place == nearest).all(-1))
+        is_shown = is_inside & back.is_ahead(centres)
+        scores = scores * is_shown[..., None]
+        size = size * is_shown
+        found = found & is_shown[..., None]
+    return Gist(gist.level, (int(new_first[0]), int(new_first[1])), gist.scale, scores, size, found)
+
+
+def _moved_squares(gist: Gist, motion: Motion, lattice: Lattice) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
+    """Find the squares of cells of the lattice to which the hints of a look at a part of the frame are moved.
+
+    Args:
+        gist: the hints, by squares of `scale` cells.
+        motion: from the frame of the look to the present one.
+        lattice: lattice of the frames.
+
+    Returns:
+        First cell `(column, row)`, and number of squares across and down; None if none is in the frame.
+    """
+    pitch = np.array(lattice.pitch)
+    corner = torch.from_numpy(np.array(gist.first) * pitch)
+    if not motion.is_ahead(corner):
+        return None
+    rows, columns = gist.scores.shape[:2]
+    moved_first = np.rint(motion.points(corner[None])[0].numpy() / pitch).astype(int)
+    moved_end = moved_first + gist.scale * np.array([columns, rows])
+    first = moved_first.clip(0)
+    end = np.minimum(moved_end, (lattice.columns, lattice.rows))
+    counts = (end - first) // gist.scale
+    return (first, counts) if counts.min() > 0 else None

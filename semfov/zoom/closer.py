@@ -32,7 +32,7 @@ MOST_IN_PHOTOGRAPH = 3
 
 _WHOLE = 0.9  # share of a photograph from which on a window shows no more than the look at the whole
 
-_SMALLEST = 1e-4
+_SMALLEST = 1e-4  # probability below which, and below 1 less it, one counts as this in log odds
 
 
 def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = USUAL_WINDOW) -> Window:
@@ -142,11 +142,11 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         boxes, scores = self._boxes()
         if self._examined:
             scores = scores.masked_fill(self._are_examined(boxes), 0)
-        if not len(scores) or float(scores.max()) <= 0:
+        if not len(scores):
             return None
-        number = int(scores.argmax())
-        score = float(scores[number])
-        return CandidatePlace(boxes[number], score, self._chance(score))
+        best = int(scores.argmax())
+        score = float(scores[best])
+        return CandidatePlace(boxes[best], score, self._chance(score)) if score > 0 else None
 
     def _change(self) -> None:
         """Drop what was computed of the looks and the examined places, as these change."""
@@ -169,17 +169,21 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         super().wait(passed)
 
     def follow(self, motion: Motion | None) -> None:
-        """Carry the boxes of the target along, too."""
+        """Carry the boxes of the target along, too; those that come to lie behind the camera are dropped."""
         self._change()
         super().follow(motion)
         if motion is None or not self._looks:
             return
-        counts = [len(boxes) for _, (boxes, _) in self._looks]
-        together = torch.cat([boxes for _, (boxes, _) in self._looks])
-        moved = motion.boxes(together).split(counts)
-        shown = motion.shows(together).split(counts)
-        looks = zip(self._looks, moved, shown, strict=True)
-        self._looks = [(time, (boxes[ahead], scores[ahead])) for (time, (_, scores)), boxes, ahead in looks]
+        # The boxes of all looks are moved together.
+        parts = [boxes for _, (boxes, _) in self._looks]
+        counts = [len(boxes) for boxes in parts]
+        together = torch.cat(parts)
+        moved_boxes = motion.boxes(together).split(counts)
+        is_ahead = motion.shows(together).split(counts)
+        moved_looks = []
+        for (time, (_, scores)), boxes, ahead in zip(self._looks, moved_boxes, is_ahead, strict=True):
+            moved_looks.append((time, (boxes[ahead], scores[ahead])))
+        self._looks = moved_looks
 
     def probability(self, look: CloseUp) -> float:
         """Compute the present probability that the target is at the place of a closer look.
@@ -201,13 +205,17 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         if not self._looks:
             return torch.zeros(0, 4), torch.zeros(0)
         keep = self.forgetting.keep
-        faded = [scores * keep ** (self._now - time) for time, (_, scores) in self._looks]
-        return torch.cat([boxes for _, (boxes, _) in self._looks]), torch.cat(faded)
+        boxes_of_looks = [boxes for _, (boxes, _) in self._looks]
+        faded_scores = [scores * keep ** (self._now - time) for time, (_, scores) in self._looks]
+        return torch.cat(boxes_of_looks), torch.cat(faded_scores)
 
     def _chance(self, score: float) -> float:
-        """Probability that the target is where the highest score is this one."""
-        picture, place, top = torch.tensor([self._look.presence, score, self._look.best]).logit(_SMALLEST)
-        return self.prior.place(float((picture + place - top).sigmoid()), self._look.presence)
+        """Probability that the target is where the highest score is this one (the formula of the class)."""
+        presence = self._look.presence
+        logits = torch.tensor([presence, score, self._look.best]).logit(_SMALLEST)
+        of_picture, of_score, of_best_score = logits
+        chance = float((of_picture + of_score - of_best_score).sigmoid())
+        return self.prior.place(chance, presence)
 
 
 class PhotographPlaces(CandidateBoxes):
@@ -276,4 +284,5 @@ class PhotographPlaces(CandidateBoxes):
 
     def _hit_chance_at(self, place: CandidatePlace) -> float:
         """Chance that a look at a place shows the target, if no closer look so far has."""
-        return place.probability * (1 - max((known for _, known in self._places), default=0.0))
+        surest = max((probability for _, probability in self._places), default=0.0)
+        return place.probability * (1 - surest)

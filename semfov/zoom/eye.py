@@ -28,9 +28,8 @@ _Frame = tuple[int, int, int, int, int, int, int, int]
 Resampled = tuple[Tensor, list[_Frame]]
 
 BORDER = 2.0  # a box this near to the border of its window, in canvas pixels, counts as cut by it
-_PHOTOGRAPH_BORDER = (
-    16.0  # the same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md)
-)
+# The same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md).
+_PHOTOGRAPH_BORDER = 16.0
 
 
 @dataclass(frozen=True)
@@ -151,8 +150,7 @@ class WindowEye(nn.Module):
         canvas, frames = self.resample(view, fixations, within) if resampled is None else resampled
         device = canvas.device
         candidates = self._propose(canvas, meanwhile)
-        policy = self.detector.background
-        selected = select(candidates, None, self.detector.selection, policy)
+        selected = select(candidates, None, self.detector.selection, self.detector.background)
         border = _PHOTOGRAPH_BORDER if view.lattice.levels == 1 else BORDER
         place = _Placement(frames, view.picture.size, selected.boxes, border)
         boxes = place.to_picture(selected.boxes)
@@ -160,14 +158,19 @@ class WindowEye(nn.Module):
             boxes = boxes * selected.mask[..., None]
         detections = replace(selected, boxes=boxes).to(device)
         detections, cut = self._treat(detections, place.cut(selected).to(device))
-        if not hints:
-            return WindowDetections(detections, cut, None)
-        by_look = []
-        for number in range(len(frames)):
-            canvas_hints = _hints_of(candidates, number, policy, self.detector.faint)
-            hint_boxes = place.to_picture(canvas_hints.boxes, number)
-            by_look.append(Hints(hint_boxes.to(device), canvas_hints.scores.to(device)))
-        return WindowDetections(detections, cut, tuple(by_look))
+        hints_of_looks = self._hints(candidates, place, len(frames), device) if hints else None
+        return WindowDetections(detections, cut, hints_of_looks)
+
+    def _hints(
+        self, candidates: Candidates, place: "_Placement", looks: int, device: torch.device
+    ) -> tuple[Hints, ...]:
+        """Take the hints of each look from all boxes of the detector's head, with boxes in picture pixels."""
+        hints = []
+        for look in range(looks):
+            on_canvas = _hints_of(candidates, look, self.detector.background, self.detector.faint)
+            boxes = place.to_picture(on_canvas.boxes, look)
+            hints.append(Hints(boxes.to(device), on_canvas.scores.to(device)))
+        return tuple(hints)
 
     def _propose(self, canvas: Tensor, meanwhile: Callable[[], object] | None) -> Candidates:
         """Pass canvases `(F, 3, h, w)` through the detector, on its device, while a second thread works."""
@@ -212,14 +215,7 @@ class WindowEye(nn.Module):
         Returns:
             Canvases `(F, 3, h, w)`, RGB from 0 to 255, as bytes if the padding is a byte; and frames as of `glimpse`.
         """
-        if fixations.shape[-1] == 2:
-            closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
-            fixations = torch.cat([fixations, closest], -1)
-        check_shape(fixations, "fixations", None, 3)
-        rows = fixations.tolist()
-        check(bool(fixations.isfinite().all()), "fixations", "finite numbers", rows)
-        magnifications = [row[2] for row in rows]
-        check(min(magnifications, default=1) > 0, "fixations", "positive magnifications", magnifications)
+        rows = _checked_fixations(fixations, view.lattice.magnifications[-1])
         limits = [None] * len(rows) if within is None else within
         padding = self._padding()
         canvases = []
@@ -239,16 +235,28 @@ class WindowEye(nn.Module):
     def _show(
         self, padding: Tensor, picture: LargePicture, fixation: list[float], limit: _Limit | None
     ) -> tuple[Tensor, _Frame]:
-        """Show one window on a canvas `(1, 3, h, w)` of the dtype of `padding`, a pixel of it; also give its frame."""
+        """Show one window on a canvas.
+
+        Args:
+            padding: a pixel of the canvas where the window has none, `()`; gives the dtype.
+            picture: the picture.
+            fixation: x, y and magnification.
+            limit: `(x1, y1, x2, y2)` of the picture that is shown; None shows all that fits the canvas.
+
+        Returns:
+            The canvas `(1, 3, h, w)`, and the frame of the window.
+        """
         width, height = self.detector.input_size
+        picture_width, picture_height = picture.size
         left, top, right, bottom = (0.0, 0.0, math.inf, math.inf) if limit is None else limit
         x, y, magnification = fixation
         reduction = picture.reduction(1 / magnification)
-        x1, x2, u1, u2 = _window_pixels(x, magnification, width, picture.size[0], left, right, reduction)
-        y1, y2, v1, v2 = _window_pixels(y, magnification, height, picture.size[1], top, bottom, reduction)
-        frame = x1, y1, x2, y2, u1, v1, u2, v2
+        # First and end in the picture, and on the canvas.
+        x1, x2, u1, u2 = _window_pixels(x, magnification, width, picture_width, left, right, reduction)
+        y1, y2, v1, v2 = _window_pixels(y, magnification, height, picture_height, top, bottom, reduction)
         window = picture.read((x1, y1, x2, y2), reduction)
         pixels = resized(window, (v2 - v1, u2 - u1)).to(padding.dtype)
+        frame = x1, y1, x2, y2, u1, v1, u2, v2
         if (u1, v1, u2, v2) == (0, 0, width, height):
             return pixels, frame
         canvas = padding.expand(1, 3, height, width).contiguous(memory_format=torch.channels_last)
@@ -256,16 +264,25 @@ class WindowEye(nn.Module):
         return canvas, frame
 
     def _treat(self, detections: Detections, cut: Tensor) -> tuple[Detections, Tensor]:
-        """Treat cut boxes as the eye's setting says; also return which of the resulting boxes are cut."""
+        """Treat cut boxes as the eye's setting says.
+
+        Args:
+            detections: a batch of F.
+            cut: `(F, L)`, which boxes are cut.
+
+        Returns:
+            The detections, and which of the resulting boxes are cut.
+        """
         if self.cut == "keep" or not bool(cut.any()):
             return detections, cut
         if self.cut == "drop":
             uncut = detections.mask & ~cut
-            remaining = Detections.stack([detections[n : n + 1].take(rows) for n, rows in enumerate(uncut)])
+            looks = [detections[look : look + 1].take(rows) for look, rows in enumerate(uncut)]
+            remaining = Detections.stack(looks)
             return remaining, torch.zeros_like(remaining.mask)
-        nothing = torch.zeros_like(detections.scores[..., :1, :])
-        nothing[..., 0] = 1
-        scores = torch.where(cut[..., None], nothing, detections.scores)
+        background = torch.zeros_like(detections.scores[..., :1, :])
+        background[..., 0] = 1
+        scores = torch.where(cut[..., None], background, detections.scores)
         return replace(detections, scores=scores, confidence=detections.confidence * ~cut), cut
 
     def forward(self, picture: Tensor, fixations: Tensor) -> Detections:
@@ -288,6 +305,19 @@ class WindowEye(nn.Module):
         """
         sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
         return {"sensor": sensor, "detector": self.detector.settings()}
+
+
+def _checked_fixations(fixations: Tensor, closest: float) -> list[list[float]]:
+    """Check fixations; returns x, y and magnification of each, the closest one for points `(F, 2)` alone."""
+    if fixations.shape[-1] == 2:
+        magnification = fixations.new_full((*fixations.shape[:-1], 1), closest)
+        fixations = torch.cat([fixations, magnification], -1)
+    check_shape(fixations, "fixations", None, 3)
+    rows: list[list[float]] = fixations.tolist()
+    check(bool(fixations.isfinite().all()), "fixations", "finite numbers", rows)
+    magnifications = [magnification for _, _, magnification in rows]
+    check(min(magnifications, default=1) > 0, "fixations", "positive magnifications", magnifications)
+    return rows
 
 
 def _hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, faint: float) -> Hints:
@@ -319,15 +349,32 @@ def _window_pixels(
         First and end in the picture, and first and end on the canvas; at least one pixel each.
     """
     edge, last_edge = edges_at(point, magnification, float(count))
-    start = step * round(edge / step)
-    stop = step * round(last_edge / step)
+    window_start = step * round(edge / step)
+    window_end = step * round(last_edge / step)
     least = round(max(low, 0.0))
     most = round(min(high, length))
-    first = min(max(start, least), most - 1)
-    end = min(max(stop, first + 1), most)
-    canvas_first = min(max(round((first - start) * magnification), 0), count - 1)
+    first = min(max(window_start, least), most - 1)
+    end = min(max(window_end, first + 1), most)
+    # What the window shows beyond the picture is padding on the canvas.
+    padding = round((first - window_start) * magnification)
+    canvas_first = min(max(padding, 0), count - 1)
     canvas_end = canvas_first + round((end - first) * magnification)
     return first, end, canvas_first, min(max(canvas_end, canvas_first + 1), count)
+
+
+def _placement_rows(frame: _Frame, size: tuple[int, int], border: float) -> list[list[float]]:
+    """List the six rows of numbers of a look (`_Placement`)."""
+    width, height = size
+    x1, y1, x2, y2, u1, v1, u2, v2 = frame
+    scale = [(x2 - x1) / (u2 - u1), (y2 - y1) / (v2 - v1)]
+    # The border of the picture cuts no object.
+    borders = [
+        u1 + border if x1 > 0 else -math.inf,
+        v1 + border if y1 > 0 else -math.inf,
+        border - u2 if x2 < width else -math.inf,
+        border - v2 if y2 < height else -math.inf,
+    ]
+    return [[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, scale * 2, borders, [1, 1, -1, -1]]
 
 
 class _Placement:
@@ -347,27 +394,16 @@ class _Placement:
             like: gives dtype and device.
             border: canvas pixels from the border of a window at which it cuts a box.
         """
-        width, height = size
-        rows = []
         # Python's numbers: tensors this small spend their time in calls.
-        for x1, y1, x2, y2, u1, v1, u2, v2 in frames:
-            scale = [(x2 - x1) / (u2 - u1), (y2 - y1) / (v2 - v1)]
-            # The border of the picture cuts no object.
-            borders = [
-                u1 + border if x1 > 0 else -math.inf,
-                v1 + border if y1 > 0 else -math.inf,
-                border - u2 if x2 < width else -math.inf,
-                border - v2 if y2 < height else -math.inf,
-            ]
-            rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, scale * 2, borders, [1, 1, -1, -1]])
+        rows = [_placement_rows(frame, size, border) for frame in frames]
         numbers = torch.tensor(rows, dtype=like.dtype, device=like.device).view(-1, 6, 1, 4)
-        self._by_look = [numbers[number].unbind() for number in range(len(frames))]
+        self._by_look = [numbers[look].unbind() for look in range(len(frames))]
         self._all = numbers.unbind(1)
 
     def to_picture(self, boxes: Tensor, look: int | None = None) -> Tensor:
         """Map canvas boxes of all looks `(F, L, 4)`, or of one `(L, 4)`, to the picture, cut to the window."""
-        low, high, first, scale, _, _ = self._all if look is None else self._by_look[look]
-        return ((boxes - first) * scale + low).clamp(low, high)
+        low, high, canvas_low, scale, _, _ = self._all if look is None else self._by_look[look]
+        return ((boxes - canvas_low) * scale + low).clamp(low, high)
 
     def cut(self, detections: Detections) -> Tensor:
         """Tell which boxes touch a border of their window that lies inside the picture, `(F, L)`."""

@@ -224,7 +224,7 @@ def _better_neighbours(
 ) -> tuple[_Floats, _Floats, _Floats, _Floats]:
     """Measure how much better objects overlap each object, weighted by their probability.
 
-    The better one of a pair is the one with the higher best score, `best` `(M,)` as log odds.
+    The better one of a pair is the one with the higher best score, `best` `(M,)` as log odds, of equals the first.
 
     Args:
         overlaps: pairs of boxes.
@@ -237,15 +237,19 @@ def _better_neighbours(
         Four measures `(M,)`: of objects of the same class the overlap, the share of this object inside the other, and
         the share of the other inside this one; and the overlap with objects of other classes.
     """
-    are_objects = (object_of[overlaps.first] >= 0) & (object_of[overlaps.second] >= 0)
+    object_of_first = object_of[overlaps.first]
+    object_of_second = object_of[overlaps.second]
+    are_objects = (object_of_first >= 0) & (object_of_second >= 0)
+    # Of each pair of objects, which stands in both orders, the one in which the first is the worse.
     pair = np.flatnonzero(are_objects)
-    one = object_of[overlaps.first[pair]]
-    other = object_of[overlaps.second[pair]]
-    is_tie = best[other] == best[one]
-    is_worse = (best[other] > best[one]) | (is_tie & (other < one))
-    pair = pair[is_worse]
-    worse = one[is_worse]
-    weight = 1 / (1 + np.exp(-best[other[is_worse]]))
+    worse = object_of_first[pair]
+    better = object_of_second[pair]
+    is_tie = best[better] == best[worse]
+    is_in_order = (best[better] > best[worse]) | (is_tie & (better < worse))
+    pair = pair[is_in_order]
+    worse = worse[is_in_order]
+    better = better[is_in_order]
+    weight = 1 / (1 + np.exp(-best[better]))
     alike = same_class[pair]
     overlap = iou[pair] * weight
     inside = overlaps.share_of(overlaps.first)[pair] * weight
@@ -280,18 +284,27 @@ def _should_show(
     Returns:
         `(M, N)`, and the logarithms (base 2) of the sides of the boxes, `(M,)`.
     """
-    side = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).mean(1)
+    sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)
+    log_side = np.log2(sides).mean(1)
+    log_side_on_canvas = log_side[:, None] + np.log2(scale)
+    is_large_enough = log_side_on_canvas >= math.log2(_SMALLEST)
+    should_show = _are_inside(boxes, windows, scale, size) & is_large_enough
+    if latest:
+        for number in range(len(scale) - 1):
+            later = slice(number + 1, None)
+            is_as_close = scale[later] >= scale[number]
+            is_replaced = (should_show[:, later] & is_as_close).any(1)
+            should_show[:, number] &= ~is_replaced
+    return should_show, log_side
+
+
+def _are_inside(boxes: _Floats, windows: _Floats, scale: _Floats, size: tuple[int, int]) -> _Flags:
+    """Tell which windows show boxes whole, `(M, N)`: no border cuts them but that of the picture, which cuts none."""
     first_edges = windows[:, :2]
     last_edges = windows[:, 2:]
     margin = _EDGE / scale[:, None]
-    # The border of the picture cuts no object.
     low = np.where(first_edges > 0, first_edges + margin, -np.inf)
     high = np.where(last_edges < np.array(size) - 0.5, last_edges - margin, np.inf)
-    is_inside = (boxes[:, None, :2] >= low).all(-1) & (boxes[:, None, 2:] <= high).all(-1)
-    is_large_enough = side[:, None] + np.log2(scale) >= math.log2(_SMALLEST)
-    visible = is_inside & is_large_enough
-    if latest:
-        for number in range(len(scale) - 1):
-            later = visible[:, number + 1 :] & (scale[number + 1 :] >= scale[number])
-            visible[:, number] &= ~later.any(1)
-    return visible, side
+    begins_inside = (boxes[:, None, :2] >= low).all(-1)
+    ends_inside = (boxes[:, None, 2:] <= high).all(-1)
+    return np.logical_and(begins_inside, ends_inside)
