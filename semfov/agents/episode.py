@@ -6,10 +6,10 @@ and `run` looks until the decision or a limit. A `StreamEpisode` looks once at e
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Generic, Literal, Self, TypeVar
 
 import torch
 from numpy.typing import ArrayLike
@@ -24,8 +24,8 @@ from semfov.paths import Ending, Moment, Record, RecordedLook
 from semfov.settings import MOST_PASSES, LookSettings, OnLook
 
 _Module = TypeVar("_Module", bound=nn.Module)
-_Record = TypeVar("_Record", bound=Record)
-_Moment = TypeVar("_Moment", bound=Moment)
+_Record_co = TypeVar("_Record_co", bound=Record, covariant=True)
+_Moment_co = TypeVar("_Moment_co", bound=Moment, covariant=True)
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,13 @@ class EpisodeLimits:
         passes = usual if settings.passes is None else settings.passes
         return cls(passes, settings.seconds, settings.on_look)
 
-    def reached(self, passes: int, record: Callable[[], Any]) -> Literal["stopped", "passes", "seconds"] | None:
-        """Find the limit that is reached after a look. Call it once after each look."""
+    def reached(self, passes: int, record: Callable[[], Record]) -> Literal["stopped", "passes", "seconds"] | None:
+        """Find the limit that is reached after a look. Call it once after each look.
+
+        Args:
+            passes: number of passes of the detector so far.
+            record: makes the record so far, for the caller's function.
+        """
         if self.on_look is not None and self.on_look(record()) is False:
             return "stopped"
         if self.passes is not None and passes >= self.passes:
@@ -96,8 +101,11 @@ class Goal:
     @classmethod
     def of(cls, classes: Sequence[str], target: int | None = None, targets: Sequence[int] = ()) -> "Goal":
         """Make the goal of a search for a target, or of finding all objects of some classes, or of all."""
-        one = targets[0] if len(targets) == 1 else target
-        return cls(tuple(classes), one, tuple(targets) if len(targets) > 1 else (), searches=target is not None)
+        searches = target is not None
+        if len(targets) > 1:
+            return cls(tuple(classes), target, tuple(targets), searches)
+        # Looks for all objects of one class are chosen for it, as those of a search are.
+        return cls(tuple(classes), targets[0] if targets else target, searches=searches)
 
     @property
     def sought(self) -> tuple[int, ...]:
@@ -112,7 +120,7 @@ class Goal:
         return f"searching for {names}" if self.searches else f"finding all {names}"
 
 
-class Episode(ABC, Generic[_Record]):
+class Episode(ABC, Generic[_Record_co]):
     """Base of what is under way: a search, finding all objects, or an exploration.
 
     Looks, decision, record and criterion hold at any time: before the first look, after any, and after the end.
@@ -144,7 +152,7 @@ class Episode(ABC, Generic[_Record]):
         """What a search needs for the decision `found`, in words; None where nothing is decided."""
 
     @abstractmethod
-    def record(self) -> _Record:
+    def record(self) -> _Record_co:
         """Make the record of the looks so far."""
 
     def moment(self) -> Moment:
@@ -156,7 +164,7 @@ class Episode(ABC, Generic[_Record]):
         return self.goal.describe()
 
 
-class PictureEpisode(Episode[_Record]):
+class PictureEpisode(Episode[_Record_co]):
     """Base of the episodes of a picture, or of a scene that stands still.
 
     Attributes:
@@ -182,7 +190,7 @@ class PictureEpisode(Episode[_Record]):
     def _end(self, limit: Ending | None) -> None:
         """Decide at the end, which a limit makes, or the last look, and give its reason."""
 
-    def run(self) -> _Record:
+    def run(self) -> _Record_co:
         """Look until the decision, a limit, or the last look, and make the record."""
         limit = None
         while limit is None and self.ending is None and self.look() is not None:
@@ -191,7 +199,7 @@ class PictureEpisode(Episode[_Record]):
         return self.record()
 
 
-class StreamEpisode(Episode[_Moment]):
+class StreamEpisode(Episode[_Moment_co]):
     """Base of the episodes of a stream, each frame of which is given to `step`. They have no end.
 
     Attributes:
@@ -210,7 +218,7 @@ class StreamEpisode(Episode[_Moment]):
         return self._passes
 
     @torch.inference_mode()
-    def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> _Moment:
+    def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> _Moment_co:
         """Look at the next frame, and make its record.
 
         Args:
@@ -227,10 +235,10 @@ class StreamEpisode(Episode[_Moment]):
         """Spend a frame on a look."""
 
     @abstractmethod
-    def moment(self) -> _Moment:
+    def moment(self) -> _Moment_co:
         """Make the record of the present frame, after the first one."""
 
-    def record(self) -> _Moment:
+    def record(self) -> _Moment_co:
         """Make the record of what counts at the present frame: its moment."""
         return self.moment()
 
@@ -258,18 +266,20 @@ def on_cpu(module: _Module) -> _Module:
     Returns:
         The copy; the module itself if all its tensors are on the CPU.
     """
-    tensors = {id(tensor): tensor for tensor in (*module.parameters(), *module.buffers())}
-    elsewhere = {key: tensor for key, tensor in tensors.items() if tensor.device.type != "cpu"}
+    elsewhere: dict[torch.dtype, list[Tensor]] = {}
+    # A tensor that two layers share is copied once.
+    for tensor in dict.fromkeys((*module.parameters(), *module.buffers())):
+        if tensor.device.type != "cpu":
+            elsewhere.setdefault(tensor.dtype, []).append(tensor)
     if not elsewhere:
         return module
-    copies: dict[int, Any] = {}
-    for dtype in {tensor.dtype for tensor in elsewhere.values()}:
-        group = {key: tensor for key, tensor in elsewhere.items() if tensor.dtype == dtype}
-        joined = torch.cat([tensor.detach().flatten() for tensor in group.values()]).cpu()
-        parts = joined.split([tensor.numel() for tensor in group.values()])
-        for (key, tensor), part in zip(group.items(), parts, strict=True):
-            copies[key] = _shaped_as(tensor, part)
-    return _with_tensors(module, copies)
+    copies: dict[int, Tensor] = {}
+    for tensors in elsewhere.values():
+        joined = torch.cat([tensor.detach().flatten() for tensor in tensors]).cpu()
+        parts = joined.split([tensor.numel() for tensor in tensors])
+        for tensor, part in zip(tensors, parts, strict=True):
+            copies[id(tensor)] = _shaped_as(tensor, part)
+    return _with_tensors(module, copies, {})
 
 
 def _shaped_as(tensor: Tensor, values: Tensor) -> Tensor:
@@ -278,21 +288,27 @@ def _shaped_as(tensor: Tensor, values: Tensor) -> Tensor:
     return nn.Parameter(shaped, tensor.requires_grad) if isinstance(tensor, nn.Parameter) else shaped
 
 
-def _with_tensors(module: _Module, copies: dict[int, Any]) -> _Module:
+def _with_tensors(module: _Module, tensors: Mapping[int, Tensor], copies: dict[int, nn.Module]) -> _Module:
     """Copy a module with other tensors.
 
     Args:
         module: the module.
-        copies: by `id`, what takes the place of its tensors; modules that were copied are added.
+        tensors: by `id`, what takes the place of its tensors.
+        copies: by `id`, the modules that were copied, to which this one is added: parts that are shared stay shared.
     """
     copy = object.__new__(type(module))
     copies[id(module)] = copy
     copy.__dict__.update(module.__dict__)
     for kind in ("_parameters", "_buffers"):
-        tensors = getattr(module, kind)
-        copy.__dict__[kind] = {name: copies.get(id(tensor), tensor) for name, tensor in tensors.items()}
+        own_tensors = getattr(module, kind)
+        copy.__dict__[kind] = {name: tensors.get(id(tensor), tensor) for name, tensor in own_tensors.items()}
     parts: dict[str, nn.Module | None] = {}
     for name, part in module._modules.items():
-        parts[name] = part if part is None else copies.get(id(part)) or _with_tensors(part, copies)
+        if part is None:
+            parts[name] = None
+        elif id(part) in copies:
+            parts[name] = copies[id(part)]
+        else:
+            parts[name] = _with_tensors(part, tensors, copies)
     copy.__dict__["_modules"] = parts
     return copy

@@ -328,23 +328,27 @@ class HeadEpisode(PictureEpisode[HeadPath]):
             return None
         self._last = step
         target = self.goal.target
-        self._maps.append(_scene_map(step, target))
+        map_after = _scene_map(step, target)
+        self._maps.append(map_after)
         if self.thresholds is not None and target is not None:
             self._decision = _decide_look(self.views, step, target, self.thresholds)
             self.ending = "decision" if self._decision.outcome != "undecided" else None
-        look = head_look(
-            self.views, step.action, step.detections, self._maps[-1], len(self._looks), step.seconds, step.gain
-        )
+        number = len(self._looks)
+        look = head_look(self.views, step.action, step.detections, map_after, number, step.seconds, step.gain)
         self._looks.append(look)
         return look
 
     def _end(self, limit: Ending | None) -> None:
         step = self._last
         assert step is not None
-        usual: Ending = "duration" if step.seconds + step.ahead > self.duration else "min_gain"
+        if self.ending is None:
+            self.ending = limit or self._usual_ending(step)
+
+    def _usual_ending(self, step: HeadStep) -> Ending:
+        """Find why no look is left after a step, which neither a decision nor a limit ended."""
         if len(self._looks) == len(self.views.grid):
-            usual = "cells"
-        self.ending = self.ending or limit or usual
+            return "cells"
+        return "duration" if step.seconds + step.ahead > self.duration else "min_gain"
 
     def record(self) -> HeadPath:
         decision = self.decision
@@ -388,16 +392,18 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
         The decision; its cell and its box are those of the scene.
     """
     belief = step.belief
+    pose, cell_of_view = divmod(step.action, views.cells)
     cell = views.gaze_cell[step.action]
-    cells = belief.probability(target).double()
-    located = place_known(cells[:, cell, None], torch.ones(1, 1, dtype=torch.bool), thresholds.place)
+    probability = belief.probability(target)
+    at_gaze = probability.double()[:, cell, None]
+    is_detected = torch.ones(1, 1, dtype=torch.bool)
+    located = place_known(at_gaze, is_detected, thresholds.place)
     # The chance of a view assumes that the target is in it, which is one of many. It keeps the precision of the belief,
     # in which a cell that was never seen has exactly the threshold.
-    best = belief.probability(target).masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
-    outcome = int(settle(belief.presence(target).double(), located, best, thresholds))
-    decision = conclude(outcome, belief, [step.detections], views.view_grid, target, step.action % views.cells)
+    best_unseen = probability.masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
+    outcome = int(settle(belief.presence(target).double(), located, best_unseen, thresholds))
+    decision = conclude(outcome, belief, [step.detections], views.view_grid, target, cell_of_view)
     if decision.outcome != "found":
         return decision
-    pose = views.poses[step.action // views.cells]
-    box = None if decision.box is None else views.world.boxes(decision.box[None], pose)[0]
-    return replace(decision, cell=int(cell), box=box, place=float(cells[0, cell]))
+    box = None if decision.box is None else views.world.boxes(decision.box[None], views.poses[pose])[0]
+    return replace(decision, cell=int(cell), box=box, place=float(at_gaze[0, 0]))

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 from semfov.agents.episode import StreamEpisode
 from semfov.agents.fovea import FoveaAgent
@@ -12,7 +12,7 @@ from semfov.agents.windows import ZoomAgent
 from semfov.belief.observers.any_of import TargetLike
 from semfov.errors import InputError, check
 from semfov.kinds import FOVEA, HEAD, WINDOWS, LookKind
-from semfov.paths import Record
+from semfov.paths import Moment, Record
 from semfov.settings import (
     ExploreSettings,
     FindSettings,
@@ -65,7 +65,7 @@ class KindOfLook(ABC):
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
         """Explore a picture (`ActivePerception.explore`)."""
 
-    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Moment]:
         """Make the episode that looks at the frames of a stream (`ActivePerception.live`).
 
         Args:
@@ -108,7 +108,7 @@ class FoveaKind(KindOfLook):
         record = fovea.explore(picture.image(fovea.eye.sensor.like), settings)
         return _counted_from(picture.named(record), settings.score_threshold)
 
-    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Moment]:
         remedy = "for all objects of several classes use how='windows', and for one of them a class without a list"
         check(not targets, "target", f"one class, or None; {remedy}", targets)
         return self.parts.fovea.stream(target, settings)
@@ -128,7 +128,7 @@ class WindowKind(KindOfLook):
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
         return self.parts.zoom.explore(picture.large, settings)
 
-    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Any]:
+    def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Moment]:
         return self.parts.zoom.stream(target, targets, settings)
 
 

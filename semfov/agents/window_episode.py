@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from math import isfinite
-from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -29,6 +28,7 @@ from semfov.episode import Forgetting
 from semfov.errors import InputError, check
 from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
 from semfov.paths import Ending, WindowMoment, ZoomPath
+from semfov.paths.conversion import Values
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import LookAtWindow, look_at_window
 from semfov.settings import DecisionSettings
@@ -44,7 +44,8 @@ from semfov.zoom.episode import KeptLook, WindowStep, carry_along, find_everythi
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
-from semfov.zoom.looks import LiveWindowLooks, Window, WindowLooks
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
+from semfov.zoom.policy import WindowChoice
 from semfov.zoom.slices import ranked, usual_slices
 from semfov.zoom.window_sums import Cells
 
@@ -112,7 +113,7 @@ class WindowSession:
         source: WindowLooks,
         limits: EpisodeLimits,
         forgetting: Forgetting | None = None,
-        steps: Iterator[WindowStep[Any]] | None = None,
+        steps: Iterator[WindowStep[ZoomBelief | None]] | None = None,
     ) -> None:
         evidence = task.evidence
         self.task = task
@@ -122,7 +123,7 @@ class WindowSession:
         self.decisions = WindowDecisions()
         self.passes = 0
         self.newest: KeptLook | None = None
-        self.step: WindowStep[Any] | None = None
+        self.step: WindowStep[ZoomBelief | None] | None = None
         self.follows = False
         photograph = None if evidence is None else evidence.photograph
         self._close_window = USUAL_WINDOW if photograph is None else photograph.window
@@ -136,37 +137,41 @@ class WindowSession:
         """Whether nothing is forgotten, as in a picture."""
         return self.forgetting is None or self.forgetting.rate == 0
 
-    def _chosen_steps(self) -> Iterator[WindowStep[Any]]:
+    def _chosen_steps(self) -> Iterator[WindowStep[ZoomBelief | None]]:
         """Choose by the task how windows are chosen, and what decides; returns the looks as they are made."""
-        task, source = self.task, self.source
-        goal, evidence = task.goal, task.evidence
+        task = self.task
+        source = self.source
+        evidence = task.evidence
+        target = task.goal.target if task.goal.searches else None
         if isinstance(source, LiveWindowLooks) and self._stands_still and source.lattice.levels > 1:
             source.blank = cache(partial(blank_cells, source.view.picture, source.lattice))
-        if goal.searches and goal.target is not None and evidence is None:
-            self.decisions = DecisionsByScore(goal.target, task.decisions.confirm)
+        if target is not None and evidence is None:
+            self.decisions = DecisionsByScore(target, task.decisions.confirm)
         if evidence is None or task.takes_slices(source.lattice):
-            order = ranked(usual_slices(source.lattice, source.blank()), goal.sought)
-            return look_by_look(
-                source,
-                order,
-                None,
-                forgetting=self.forgetting,
-                guess=lambda looks, done, _: next(iter(order(looks, done)), None),
-            )
-        if goal.searches and goal.target is not None:
-            belief = ZoomBelief(source.lattice, evidence, goal.target, source.blank)
+            return self._slices()
+        if target is not None:
+            belief = ZoomBelief(source.lattice, evidence, target, source.blank)
             self.decisions = decisions_of(belief, self._close_up, task.decisions, self.forgetting)
             return search_windows(source, belief, forgetting=self.forgetting)
-        min_gain = NEW_OBJECTS if task.min_gain is None else task.min_gain
         return find_everything(
             source,
             evidence,
-            goal.target,
+            task.goal.target,
             batch=task.batch,
-            min_gain=min_gain,
+            min_gain=NEW_OBJECTS if task.min_gain is None else task.min_gain,
             forgetting=self.forgetting,
             known=None if self.tracker is None else self._value_of_known,
         )
+
+    def _slices(self) -> Iterator[WindowStep[None]]:
+        """Look at slices in the order of the overview's scores in them."""
+        order = ranked(usual_slices(self.source.lattice, self.source.blank()), self.task.goal.sought)
+
+        def next_slice(looks: Sequence[WindowLook], windows: set[Window], _: Window | None) -> WindowChoice | None:
+            choices = order(looks, windows)
+            return choices[0] if choices else None
+
+        return look_by_look(self.source, order, None, forgetting=self.forgetting, guess=next_slice)
 
     def _value_of_known(self, level: int) -> Cells:
         """Value windows of a level by the objects that are known, and may have moved."""
@@ -235,7 +240,7 @@ class WindowSession:
         chosen = () if self.step is None else self.step.kept_looks
         return sorted([*chosen, *self._closer_looks], key=lambda look: look.number)
 
-    def record_fields(self, looks: Sequence[LookAtWindow]) -> dict[str, Any]:
+    def record_fields(self, looks: Sequence[LookAtWindow]) -> Values:
         """Collect what the record of a picture and that of a frame have alike.
 
         Args:
@@ -342,20 +347,23 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
         look = self.session.look()
         if look is None:
             return None
-        made = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
-        self._looks.append(made)
+        recorded = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
+        self._looks.append(recorded)
         decisions = self.session.decisions
         if decisions.outcome and decisions.candidate is None:
             self.ending = decisions.ending
-        return made
+        return recorded
 
     def _end(self, limit: Ending | None) -> None:
         decisions = self.session.decisions
         self._concluded = decisions.conclude()
-        is_sliced = self.session.task.takes_slices(self.source.lattice)
-        usual: Ending = "windows" if self.goal.searches or is_sliced else "min_gain"
         is_found = self._concluded is not None and self._concluded.outcome == "found"
-        self.ending = decisions.ending if is_found or decisions.outcome else limit or usual
+        if is_found or decisions.outcome:
+            self.ending = decisions.ending
+        else:
+            # A search and an order of slices end where no window is left, an exploration where none is worth it.
+            is_sliced = self.session.task.takes_slices(self.source.lattice)
+            self.ending = limit or ("windows" if self.goal.searches or is_sliced else "min_gain")
 
     def record(self) -> ZoomPath:
         picture = self.source.view.picture if isinstance(self.source, LiveWindowLooks) else None
@@ -388,7 +396,7 @@ class GivenWindows(PictureEpisode[ZoomPath]):
         super().__init__(replace(goal, searches=False))
         self.source = source
         self._next = Window.overview(source.lattice)
-        belief: Any = None if evidence is None else ZoomBelief(source.lattice, evidence, goal.target or 0)
+        belief = None if evidence is None else ZoomBelief(source.lattice, evidence, goal.target or 0)
         steps = look_by_look(source, lambda looks, windows: [(self._next, 0.0)], belief)
         self.session = WindowSession(WindowTask(self.goal, evidence), source, self.limits, steps=steps)
         self._looks: list[LookAtWindow] = []
@@ -411,9 +419,9 @@ class GivenWindows(PictureEpisode[ZoomPath]):
         self._next = window or self._next
         look = self.session.look()
         assert look is not None
-        made = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
-        self._looks.append(made)
-        return made
+        recorded = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
+        self._looks.append(recorded)
+        return recorded
 
     def _end(self, limit: Ending | None) -> None:
         self.ending = limit
@@ -549,8 +557,8 @@ class _Camera:
 
     def step(self, view: WindowView, pose: Motion | ArrayLike | None) -> CameraStep | None:
         """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
-        has_poses = self._poses is not None
-        check(self._is_first or (pose is not None) == has_poses, "pose", "a pose of each frame, or of none", pose)
+        is_pose_expected = self._is_first or (self._poses is None) == (pose is None)
+        check(is_pose_expected, "pose", "a pose of each frame, or of none", pose)
         # Without OpenCV a warning is given, which does not concern a camera whose poses are known.
         if self._is_first and pose is None and self._follows:
             self._estimate = _camera_motion()
@@ -582,5 +590,8 @@ def _objects_in_frame(tracks: Tracks, places: Mapping[int, int], size: tuple[int
 
 def _renumbered(closer: Sequence[CloseUp], places: Mapping[int, int]) -> tuple[CloseUp, ...]:
     """Give the closer looks that count the places of their looks in the record as numbers."""
-    counting = [look for look in closer if look.number is not None and look.number in places]
-    return tuple(replace(look, number=places[look.number]) for look in counting if look.number is not None)
+    return tuple(
+        replace(look, number=places[look.number])
+        for look in closer
+        if look.number is not None and look.number in places
+    )

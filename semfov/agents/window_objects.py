@@ -95,18 +95,20 @@ def seen_by(look: KeptLook, lattice: Lattice, sought: Sequence[int]) -> Seen:
     detected = detected_boxes([look.original], sought, shares=False)
     detected = detected.of((detected.scores >= FAINTEST) & detected.boxes.isfinite().all(-1))
     window = look.original.window
+    magnification = window.fixation[2]
     boxes = detected.boxes.double()
-    margin = BORDER / window.fixation[2]
-    entering = (boxes[:, :2] <= margin) | (boxes[:, 2:] >= boxes.new_tensor(lattice.size) - margin)
+    margin = BORDER / magnification
+    at_left_or_top = boxes[:, :2] <= margin
+    at_right_or_bottom = boxes[:, 2:] >= boxes.new_tensor(lattice.size) - margin
     return Seen(
         boxes=boxes.numpy(),
         scores=detected.scores.double().numpy(),
         labels=detected.labels.numpy(),
         cut=detected.cut.numpy(),
         region=window.region(lattice),
-        magnification=window.fixation[2],
+        magnification=magnification,
         number=look.number,
-        entering=entering.any(-1).numpy(),
+        entering=(at_left_or_top | at_right_or_bottom).any(-1).numpy(),
     )
 
 
@@ -125,17 +127,25 @@ def without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[Wind
     # All boxes are in one table, so that each look is compared with those of all before it at once.
     counts = [look.detections.boxes.shape[1] for look in looks]
     ends = np.cumsum(counts)
-    low, high = _surroundings(torch.cat([look.detections.boxes[0] for look in looks]), lattice.size)
+    boxes = torch.cat([look.detections.boxes[0] for look in looks])
+    low, high = _surroundings(boxes, lattice.size)
     remain = torch.cat([look.detections.mask[0] for look in looks]).numpy()
     magnifications = np.array([look.window.fixation[2] for look in looks])
     magnification_of_box = np.repeat(magnifications, counts)
     for number in range(1, len(looks)):
         earlier = slice(ends[number - 1])
-        x1, y1, x2, y2 = np.array(looks[number].window.region(lattice), dtype=low.dtype)
-        inside = (low[0, earlier] >= x1) & (low[1, earlier] >= y1) & (high[0, earlier] <= x2) & (high[1, earlier] <= y2)
-        remain[earlier] &= ~(inside & (magnifications[number] >= magnification_of_box[earlier]))
-    parts = torch.from_numpy(remain).split(counts)
-    return [_taken(look, part) for look, part in zip(looks, parts, strict=True)]
+        region = np.array(looks[number].window.region(lattice), dtype=low.dtype)
+        is_shown = _lie_inside(low[:, earlier], high[:, earlier], region)
+        is_as_close = magnifications[number] >= magnification_of_box[earlier]
+        remain[earlier] &= ~(is_shown & is_as_close)
+    remain_of_look = torch.from_numpy(remain).split(counts)
+    return [_taken(look, remain) for look, remain in zip(looks, remain_of_look, strict=True)]
+
+
+def _lie_inside(low: np.ndarray, high: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Tell which boxes, with low and high corners `(2, M)`, lie inside a region `(x1, y1, x2, y2)`, `(M,)`."""
+    x1, y1, x2, y2 = region
+    return (low[0] >= x1) & (low[1] >= y1) & (high[0] <= x2) & (high[1] <= y2)
 
 
 def _surroundings(boxes: Tensor, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

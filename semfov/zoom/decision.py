@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,16 +78,18 @@ class SearchFacts:
         self.detected = surest.found >= DETECTION_SCORE
 
     def _facts_of(self, look: WindowLook) -> _LookFacts:
+        """Read from a look what it shows of the target."""
         target = self.belief.target
         score = float(look.show[target - 1])
         is_closest = look.window.level == self.belief.lattice.levels - 1
         closest = score if is_closest else 0.0
         scores = look.detections.scores[0, :, target].detach().float().numpy()
         if not len(scores):
-            return _LookFacts(score, closest, 0.0, 0.0, None)
-        named = scores[look.detections.labels[0].numpy() == target]
-        box = look.detections.boxes[0, int(scores.argmax())]
-        return _LookFacts(score, closest, float(named.max(initial=0)), float(scores.max()), box)
+            return _LookFacts(score, closest, named=0.0, found=0.0, box=None)
+        is_named = look.detections.labels[0].numpy() == target
+        named = float(scores[is_named].max(initial=0))
+        best = int(scores.argmax())
+        return _LookFacts(score, closest, named, float(scores[best]), look.detections.boxes[0, best])
 
     def case(self, hit_chance: float) -> Tensor:
         """Facts `(10,)` for `GlimpseEvidence.anywhere`: scores, what remains to be seen, and numbers of looks.
@@ -95,17 +97,24 @@ class SearchFacts:
         Args:
             hit_chance: chance that the best remaining window shows the target.
         """
-        looks = self.looks
+        scores_of_looks = [look.score for look in self.looks]
         # With a single look, there is no second score.
-        best, second, *_ = sorted([*(look.score for look in looks), 0.0], reverse=True)
-        closest = max(look.closest for look in looks)
-        named = max(look.named for look in looks)
-        scores = torch.tensor([best, second, closest, looks[0].score, named, hit_chance], dtype=torch.float32)
-        unexplored = float(self.belief.unexplored.sum() / self.belief.visible.sum().clamp(1))
-        remaining = [math.log(self._expected_finds() + 1e-3) / 4, unexplored]
-        detected = sum(look.score >= DETECTION_SCORE for look in looks)
-        counts = [math.log1p(detected) / 2, math.log(len(looks)) / 2]
-        return torch.cat([features(scores), torch.tensor([*remaining, *counts])])
+        best, second, *_ = sorted([*scores_of_looks, 0.0], reverse=True)
+        closest = max(look.closest for look in self.looks)
+        named = max(look.named for look in self.looks)
+        overview = scores_of_looks[0]
+        scores = torch.tensor([best, second, closest, overview, named, hit_chance], dtype=torch.float32)
+        visible = self.belief.visible.sum().clamp(1)
+        unexplored = float(self.belief.unexplored.sum() / visible)
+        detected = sum(score >= DETECTION_SCORE for score in scores_of_looks)
+        # Logarithms and their divisors bring numbers of objects and of looks to the range of the others.
+        others = [
+            math.log(self._expected_finds() + 1e-3) / 4,
+            unexplored,
+            math.log1p(detected) / 2,
+            math.log(len(scores_of_looks)) / 2,
+        ]
+        return torch.cat([features(scores), torch.tensor(others)])
 
     def _expected_finds(self) -> float:
         """Estimate how many new objects of the target looks of the last level, side by side, would find."""
@@ -145,7 +154,7 @@ class WindowDecisions(DecisionState):
     ending: Literal["decision", "detection"] = "decision"
     prior = Prior(known=False)
 
-    def see(self, step: WindowStep[Any], number: int, room: float) -> None:
+    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
         """Take in a step, and choose the place that is to be looked at closely.
 
         Args:
@@ -179,7 +188,7 @@ class DecisionsByScore(WindowDecisions):
         self._decision: Decision | None = None
         self.criterion = f"a detection scores {self._confirm:g}"
 
-    def see(self, step: WindowStep[Any], number: int, room: float) -> None:
+    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
         score, box = self._best(step.looks)
         if score >= self._confirm:
             self.outcome = FOUND
@@ -220,7 +229,7 @@ class DecisionsByPresence(WindowDecisions):
         self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
         self._presence: float | None = None  # that after the last look, once it was asked for
 
-    def see(self, step: WindowStep[Any], number: int, room: float) -> None:
+    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
         self._facts.see(step.looks)
         self._fitted_chance = step.next_value
         self._presence = None
@@ -234,7 +243,7 @@ class DecisionsByPresence(WindowDecisions):
             return False
         return self._hit_chance() >= self.thresholds.stop_below
 
-    def _judge(self, step: WindowStep[Any], number: int, *, last: bool) -> None:
+    def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Decide after a step."""
         presence = torch.tensor([self.prior(self._fitted_presence())])
         located = torch.tensor([self._facts.detected])
@@ -273,7 +282,7 @@ class DecisionsByCloserLooks(DecisionsByPresence):
         self.verifier = verifier
         self.criterion = verifier.criterion
 
-    def _judge(self, step: WindowStep[Any], number: int, *, last: bool) -> None:
+    def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""
         candidates = step.look.candidates
         look = SearchLook(candidates, number, self._fitted_presence(), self._facts.best, self._fitted_chance)

@@ -15,7 +15,8 @@ from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.policy import WindowChoice, best_find, jointly
 from semfov.zoom.window_sums import Cells
 
-_Belief = TypeVar("_Belief", ZoomBelief, None)
+_Belief = TypeVar("_Belief", bound=ZoomBelief | None)
+_StepBelief_co = TypeVar("_StepBelief_co", bound=ZoomBelief | None, covariant=True)
 
 Order = Callable[[Sequence[WindowLook], set[Window]], Sequence[WindowChoice]]
 """Maps the looks that count, the overview first, and their windows, to the windows to look at next with their values;
@@ -69,7 +70,7 @@ def carry_along(looks: Sequence[KeptLook], motion: Motion, lattice: Lattice) -> 
         look.current = current
 
 
-class WindowStep(Generic[_Belief]):
+class WindowStep(Generic[_StepBelief_co]):
     """One step of an episode: a look, the looks that count with it, and the belief after it.
 
     Attributes:
@@ -81,13 +82,13 @@ class WindowStep(Generic[_Belief]):
     def __init__(
         self,
         newest: KeptLook,
-        belief: _Belief,
+        belief: _StepBelief_co,
         kept_looks: Sequence[KeptLook],
         choose: Callable[[], Sequence[WindowChoice]],
     ) -> None:
         self.newest = newest
         self.kept_looks = kept_looks
-        self.belief: _Belief = belief
+        self.belief = belief
         self._choose = choose
 
     @property
