@@ -254,21 +254,23 @@ class CandidateCells(CandidatePlaces[Step]):
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Find the most evident place, if a fixated cell is nearly as probable as any, or no other look follows."""
-        cells = self._step.belief.probability(self._target)[0]
+        probability = self._step.belief.probability(self._target)[0]
         for place in self._examined:
-            cells = cells.masked_fill(place.cells, 0)
-        if not (last or bool(place_known(cells, self._step.visited[0], thresholds.place))):
+            probability = probability.masked_fill(place.cells, 0)
+        is_located = bool(place_known(probability, self._step.visited[0], thresholds.place))
+        if not last and not is_located:
             return None
         boxes = torch.cat([look.detections.boxes[0] for _, look in self._looks])
         if not len(boxes):
             return None
         evidence = self._evidence(boxes)
-        value = cells * evidence.amax(0)
+        value = probability * evidence.amax(0)
         cell = int(value.argmax())
-        if float(value[cell]) <= 0 or float(cells[cell]) < thresholds.place:
+        chance = float(probability[cell])
+        if float(value[cell]) <= 0 or chance < thresholds.place:
             return None
         best = int(evidence[:, cell].argmax())
-        return CandidatePlace(boxes[best], float(evidence[best, cell]), float(cells[cell]), cell)
+        return CandidatePlace(boxes[best], float(evidence[best, cell]), chance, cell)
 
     def _evidence(self, boxes: Tensor) -> Tensor:
         """Evidence of each detection of all looks in each cell: its faded score times its footprint.
@@ -280,14 +282,15 @@ class CandidateCells(CandidatePlaces[Step]):
             `(N, X·Y)`, 0 for objects that were examined.
         """
         keep = self.forgetting.keep
-        faded = [
-            look.detections.mask[0] * (look.detections.scores[0, :, self.target] * keep ** (self._now - time))
-            for time, look in self._looks
-        ]
-        scores = torch.cat(faded)
+        faded_scores = []
+        for time, look in self._looks:
+            scores_of_look = look.detections.scores[0, :, self.target]
+            faded_scores.append(look.detections.mask[0] * (scores_of_look * keep ** (self._now - time)))
+        scores = torch.cat(faded_scores)
         if self._examined:
             scores = scores * ~self._are_examined(boxes)
-        return scores[:, None] * torch.cat([look.footprint()[0] for _, look in self._looks])
+        footprints = torch.cat([look.footprint()[0] for _, look in self._looks])
+        return scores[:, None] * footprints
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the search."""

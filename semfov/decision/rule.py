@@ -162,12 +162,26 @@ def conclude(
     presence = float(belief.presence(target))
     if OUTCOMES[outcome] != "found":
         return Decision(OUTCOMES[outcome], presence)
-    cells = belief.probability(target)[0]
+    probability = belief.probability(target)[0]
     evidence = [_evidence_of_cells(look, grid, target) for look in looks]
     if cell is None:
-        strongest = torch.cat([cells.new_zeros(1, len(grid)), *evidence]).amax(0)
-        cell = int((cells * strongest if bool(strongest.any()) else cells).argmax())
-    return Decision("found", presence, cell, _most_evident_box(looks, evidence, cell), float(cells[cell]))
+        cell = _strongest_cell(probability, evidence)
+    box = _most_evident_box(looks, evidence, cell)
+    return Decision("found", presence, cell, box, float(probability[cell]))
+
+
+def _strongest_cell(probability: Tensor, evidence: Sequence[Tensor]) -> int:
+    """Find the cell with the strongest evidence of belief and detections (`conclude`).
+
+    Args:
+        probability: `(X·Y,)`, of the target in each cell.
+        evidence: `(L, X·Y)` of each look.
+    """
+    no_evidence = torch.zeros_like(probability)[None]
+    strongest = torch.cat([no_evidence, *evidence]).amax(0)
+    # Where no detection shows the target, the belief alone tells where it is.
+    value = probability * strongest if bool(strongest.any()) else probability
+    return int(value.argmax())
 
 
 def _evidence_of_cells(look: Detections, grid: Grid, target: int) -> Tensor:
@@ -180,10 +194,11 @@ def _most_evident_box(looks: Sequence[Detections], evidence: Sequence[Tensor], c
     """Box `(4,)` of the detection with the strongest evidence in a cell; None if no detection has any there."""
     highest = 0.0
     box = None
-    for look, values in zip(looks, evidence, strict=True):
-        if len(values) and float(values[:, cell].max()) > highest:
-            highest = float(values[:, cell].max())
-            box = look.boxes[0, int(values[:, cell].argmax())]
+    for look, evidence_of_look in zip(looks, evidence, strict=True):
+        in_cell = evidence_of_look[:, cell]
+        if len(in_cell) and float(in_cell.max()) > highest:
+            highest = float(in_cell.max())
+            box = look.boxes[0, int(in_cell.argmax())]
     return box
 
 
@@ -218,15 +233,23 @@ def final_outcome(places: Sequence[float], presence: float, confirm: float) -> i
 
 def check_thresholds(confirm: float | None, stop_below: float | None, closer: int | None = None) -> None:
     """Raise `InputError` unless each threshold is None or a probability, and closer looks are None or 0 to 100."""
-    for name, value in (("confirm", confirm), ("stop_below", stop_below)):
-        check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
-    check_whole(0 if closer is None else closer, "closer", 0, 100)
+    _check_chance("confirm", confirm)
+    _check_chance("stop_below", stop_below)
+    if closer is not None:
+        check_whole(closer, "closer", 0, 100)
+
+
+def _check_chance(name: str, value: float | None) -> None:
+    """Raise `InputError` unless a threshold is None or a probability."""
+    is_chance = value is None or (is_number(value) and 0 <= value <= 1)
+    check(is_chance, name, "a probability from 0 to 1", value)
 
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
     """Whether a detection over each cell `(B,)` gives `target` at least this score, `(B,)`."""
     has_score = detections.mask & (detections.class_scores[..., target - 1] >= score)
-    is_over_cell = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
+    footprints = grid.footprint(detections.boxes)
+    is_over_cell = footprints.take_along_dim(cell[:, None, None], -1)[..., 0]
     return (is_over_cell & has_score).any(-1)
 
 
@@ -235,15 +258,22 @@ def detects(step: Step, *, grid: Grid, weights: Mapping[int, float], score: floa
 
     The product of its score and of the weight of its class, the probability that it is meant, is `score` at least.
     """
-    meant = ((number, weight) for number, weight in weights.items() if weight > 0)
-    hits = [confirms(step.detections, grid, step.cell, number, score / weight) for number, weight in meant]
+    hits = []
+    for target, weight in weights.items():
+        if weight > 0:
+            hits.append(confirms(step.detections, grid, step.cell, target, score / weight))
     return torch.stack(hits).any(0).long()
 
 
 def gains_less(step: Step, *, gain: Callable[[Belief, Tensor], Tensor], least: float) -> Tensor:
-    """Decide which explorations end: where a look at every cell that is left gains less than `least`, `(A,)`."""
-    best = gain(step.belief, step.visited).masked_fill(step.visited, -torch.inf).amax(-1)
-    return ((best < least) & (least > 0) & ~step.visited.all(-1)).long()
+    """Decide which explorations end: where a look at every cell that is left gains less than `least`, `(A,)`.
+
+    Exploration without a least gain, or with no cell left, does not end so.
+    """
+    gains = gain(step.belief, step.visited)
+    best = gains.masked_fill(step.visited, -torch.inf).amax(-1)
+    has_cells_left = ~step.visited.all(-1)
+    return ((best < least) & (least > 0) & has_cells_left).long()
 
 
 def cell_of(box: Tensor, grid: Grid) -> int:
