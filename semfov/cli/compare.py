@@ -134,7 +134,8 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
     share = last.seconds / slices.seconds
     if not is_truth:
         found = f"{last.right} of the {last.reference} objects that all slices list"
-        others = f"{last.listed - last.right} others"
+        number = last.listed - last.right
+        others = f"{number} other{'s' if number != 1 else ''}"
         return [
             f"After {_passes(last)} semfov lists {found} and {others}, in {share:.2f} of their time.",
             "All slices miss and invent objects, too: AP50 says how well semfov agrees with them. To judge both by "

@@ -47,7 +47,7 @@ class Cautions(NamedTuple):
         """Say how the shape of the picture differs from those of the shipped fits."""
         width, height = self.size
         if width <= height:
-            yield "the model learned from pictures that are wider than high"
+            yield "the model learned only from pictures that are wider than high, and this one is not"
         if width >= _WIDE * height:
             yield f"the model learned from pictures of 4 : 3, and this one is {width / height:.1f} : 1"
         if width == _PANORAMA * height:

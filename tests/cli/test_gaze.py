@@ -190,7 +190,8 @@ def test_areas_are_told_drawn_and_in_the_table(run, photos, tmp_path):
     assert [(row["picture"], row["width"], row["unlike"]) for row in rows] == [
         ("0.png", "120", "False"), ("1.png", "80", "False")
     ]  # fmt: skip
-    assert [row["caution"] for row in rows] == ["", "the model learned from pictures that are wider than high"]
+    caution = "the model learned only from pictures that are wider than high, and this one is not"
+    assert [row["caution"] for row in rows] == ["", caution]
     assert run(photos / "0.png", "--people", 2, "--out", tmp_path / "density.npy")[0] == 0
     density = np.load(tmp_path / "density.npy")
     assert float(rows[0]["share of top"]) == pytest.approx(float(density[:45, :80].sum()), abs=1e-4)
