@@ -61,6 +61,13 @@ def test_a_folder_leaves_out_no_photograph_that_is_read_alone(tmp_path):
     assert picture_files(tmp_path / "d.jpg") == [tmp_path / "d.jpg"]
 
 
+def test_a_folder_with_the_name_of_a_picture_is_none(tmp_path):
+    (tmp_path / "holidays.jpg").mkdir()
+    Image.new("RGB", (8, 6)).save(tmp_path / "holidays.jpg" / "a.jpg")
+    unusable("expected photographs", picture_files, tmp_path)
+    assert picture_files(tmp_path, recursive=True) == [tmp_path / "holidays.jpg" / "a.jpg"]
+
+
 def test_pictures_that_semfov_has_written_are_left_out_of_folders_in_a_folder(tmp_path):
     """A figure, a film, a crop and heat maps, told by what is in them; by their own folder they are looked at."""
     Image.new("RGB", (8, 6), "red").save(tmp_path / "photo.jpg")
