@@ -3,6 +3,7 @@
 import ast
 import doctest
 import inspect
+import json
 import re
 import textwrap
 import xml.etree.ElementTree as etree
@@ -17,6 +18,7 @@ from docs.api import entries
 from docs.site.docstrings import markdown as docstring
 from docs.site.formulas import mathml
 from docs.site.names import Names
+from docs.site.search_index import put_members_into_classes
 from docs.site.stage import Stage, place_of
 from docs.site.tutorials import execute, page
 
@@ -258,3 +260,24 @@ def test_docstrings_of_classes_are_complete(thing):
             assert arguments(init) <= {n for each in told for part in PARTS for n in explained(each.get(part, ""))}
     for function in methods(thing):
         check_function(function, inspect.getdoc(function))
+
+
+def test_members_are_found_in_the_entry_of_their_class(tmp_path):
+    entries = [
+        ("tasks/find.html#threshold", "Threshold", "when"),
+        ("api/semfov.paths.html", "semfov.paths", ""),
+        ("api/semfov.paths.html#semfov.paths.Words", "semfov.paths.Words", "words"),
+        (
+            "api/semfov.paths.html#semfov.paths.Words.threshold",
+            "threshold <small><code>property</code></small>",
+            "from",
+        ),
+        ("api/semfov.paths.html#semfov.paths.open", "semfov.paths.open", "opens"),
+    ]
+    index = tmp_path / "search.json"
+    items = [{"location": place, "title": title, "text": text} for place, title, text in entries]
+    index.write_text(json.dumps({"config": {"lang": ["en"]}, "items": items}))
+    put_members_into_classes(index)
+    written = json.loads(index.read_text(encoding="utf-8"))
+    assert written["config"] == {"lang": ["en"]}
+    assert written["items"] == [*items[:2], {**items[2], "text": "words<p>threshold</p>from"}, items[4]]

@@ -161,6 +161,18 @@ ASKED = {
     "jupyter": "tasks/running",
     "docker": "install",
     "webcam": "tasks/video",
+    "threshold": "tasks/find",
+    "confidence": "tasks/find",
+    "windows": "install",
+    "budget": "tasks/running",
+    "camera": "tasks/camera",
+    "video": "tasks/video",
+    "heat map": "tasks/poster",
+    "gpu": "tasks/running",
+    "label": "tasks/count",
+    "count": "tasks/count",
+    "onnx": "detectors.html#an-onnx-model-of-your-own",
+    "offline": "install",
 }
 """Words that a reader may ask for, and a page that is among the first three answers."""
 ANSWERS = """() => {
