@@ -32,7 +32,7 @@ print(policies.policy_names("exploration"))
 # %% [markdown]
 # ## Put it into an agent
 #
-# An agent is an eye with a strategy for search and one for exploration. We take the eye and the learned map of the
+# An agent is an eye with a strategy for search and one for exploration. We take the eye and the map of the
 # recommended agent for the published fovea, and combine them with the new policy.
 
 # %% alt="The scanpath over a photograph of a market by the new policy, with the foveated views and the classes of the map"

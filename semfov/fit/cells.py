@@ -21,6 +21,7 @@ MOST_PHOTOGRAPHS = 200
 _COUNTS = 4  # numbers of looks, each twice the one before
 _ITERATIONS = 60
 _LEAST = 1e-9  # of a probability whose logarithm is taken
+_PULL = 1e-4  # weight that keeps the numbers finite where cells hold nothing, or all the same
 
 
 @dataclass(frozen=True)
@@ -127,13 +128,15 @@ def fit_cells(model: FovealObservationModel, photographs: Sequence[MappedLooks],
     with torch.no_grad():
         ratio = torch.cat([_closest_looks(observer, mapped, generator) for mapped in photographs])
     answers = torch.cat([mapped.answers.expand(_COUNTS, -1, -1) for mapped in photographs])
+    start = model.log_cell.detach().clone()
     optimiser = torch.optim.LBFGS([model.log_cell], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
 
     def loss_of() -> Tensor:
         optimiser.zero_grad()
         likelihood = observer.likelihood(ratio)
         right = (likelihood * answers).sum(-1) / likelihood.sum(-1)
-        loss = -right.clamp(min=_LEAST).log().mean()
+        pull = (model.log_cell - start).square().sum()
+        loss = _PULL * pull - right.clamp(min=_LEAST).log().mean()
         loss.backward()
         return loss
 

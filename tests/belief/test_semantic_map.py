@@ -8,7 +8,7 @@ import torch
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief.observers import SemanticMap
 from semfov.errors import DataError
-from semfov.fit.cells import MappedLooks, fit_cells, map_loss
+from semfov.fit.cells import MappedLooks, fit_cells, map_loss, mean_map_loss
 
 GRID = Grid(5, 4, (100, 80))
 FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
@@ -119,23 +119,21 @@ class _Loss(torch.nn.Module):
         return map_loss(self.observer, self.mapped, torch.arange(3))
 
 
-def test_the_fit_finds_how_certain_the_map_may_be(looks):
-    """Cells that never hold an object, against cells that always do."""
-    losses = {}
-    for name, held in (("empty", 0), ("full", 1)):
-        answers = torch.zeros(20, 4, dtype=torch.bool)
-        answers[:, held] = True
-        mapped = MappedLooks(looks, FIXATIONS.double(), GRID, answers)
-        fom = model()
-        others = {key: value.clone() for key, value in fom.state_dict().items() if key != "log_cell"}
-        before = float(map_loss(SemanticMap(fom), mapped, torch.arange(3)).detach())
-        fit_cells(fom, [mapped])
-        after = float(map_loss(SemanticMap(fom), mapped, torch.arange(3)).detach())
-        assert after < before
-        assert all(torch.equal(fom.state_dict()[key], value) for key, value in others.items())
-        assert all(parameter.requires_grad for parameter in fom.parameters())
-        losses[name] = float(fom.log_cell[2].detach())
-    assert losses["full"] < math.log(BACKGROUND) < losses["empty"]
+def test_the_fit_finds_how_often_cells_hold_nothing(looks):
+    """Where nothing is detected, the probability of background becomes the share of cells that hold nothing."""
+    nothing = Detections(looks.boxes, looks.scores, torch.zeros_like(looks.mask))
+    answers = torch.zeros(20, 4, dtype=torch.bool)
+    answers[:15, 0] = answers[15:, 2] = True
+    mapped = MappedLooks(nothing, FIXATIONS.double(), GRID, answers)
+    fom = model()
+    others = {key: value.clone() for key, value in fom.state_dict().items() if key != "log_cell"}
+    before = mean_map_loss(fom, [mapped])
+    fit_cells(fom, [mapped])
+    assert mean_map_loss(fom, [mapped]) < before
+    share = SemanticMap(fom).unseen(torch.zeros(1).double())[0]
+    assert float(share.detach()) == pytest.approx(0.75, abs=1e-3)
+    assert all(torch.equal(fom.state_dict()[key], value) for key, value in others.items())
+    assert all(parameter.grad is None for parameter in fom.parameters())
 
 
 def test_a_fit_needs_a_photograph():
