@@ -94,7 +94,7 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
 
 
 def _visible_files(folder: Path, *, recursive: bool) -> list[Path]:
-    """List the files of a folder, without names that begin with a dot: notes of the system, such as ._a.jpg of Apple."""
+    """List the files of a folder but those whose names begin with a dot, such as ._a.jpg, which Apple writes."""
     paths = folder.rglob("*") if recursive else folder.iterdir()
     return [path for path in paths if not _is_hidden(path.relative_to(folder)) and not path.is_dir()]
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from semfov.motion import CameraMotion, CameraStep, Motion
-from semfov.motion.coarse import coarse_shift
+from semfov.motion.agreement import blocks_of_rival
 from semfov.motion.frames import GreyFrame
+from semfov.motion.residual import coarse_shift, share_off
 
 WIDTH, HEIGHT = 640, 360
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
@@ -256,3 +257,21 @@ def test_what_passes_before_a_camera_that_stands_is_no_motion_of_the_camera():
 def test_frames_of_some_pixels_across_have_no_slopes_that_tell(size):
     frame = GreyFrame(cv2, np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8))
     assert coarse_shift(cv2, frame, frame, np.eye(3)[:2]) == np.inf
+    assert share_off(cv2, frame, frame, np.eye(3)[:2]) == 0
+
+
+def test_blocks_that_move_otherwise_are_counted():
+    """The lower three quarters of a view of 480 × 360 px moved by 4 px, and the two upper rows of blocks by none."""
+    picture = scene()
+    first, second = picture[200:560, 300:780].copy(), picture[200:560, 296:776].copy()
+    second[:90] = first[:90]
+    before, after = GreyFrame(cv2, first), GreyFrame(cv2, second)
+    shifted = np.array([[1.0, 0, 4], [0, 1, 0]])
+    still = np.eye(3)[:2]
+    assert share_off(cv2, before, after, shifted) == pytest.approx(2 / 8, abs=0.06)
+    assert share_off(cv2, before, after, still) == pytest.approx(6 / 8, abs=0.06)
+    assert share_off(cv2, before, before, still) == 0
+    far = np.array([[1.0, 0, 60], [0, 1, 0]])
+    count = blocks_of_rival(cv2, before.contrast, after.contrast, far, still)
+    assert 0 < count <= 20 + 1
+    assert blocks_of_rival(cv2, before.contrast, after.contrast, still, still) == 0
