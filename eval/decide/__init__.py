@@ -3,12 +3,13 @@
     python -m eval.decide --data.root DIR --data.annotations instances.json --out runs/decide
 
 Without photographs it uses the embedded scenes. In every photograph the agent searches for a class that is present and
-for a class that is absent, until it decides: by windows, as it does by default, and with a fovea. The tables give the
-area under the ROC curve of the final probability, hit rates at several false alarm rates, and the decisions. For
-comparison they have plain rules (one unfoveated pass, with one or two closer looks, with four quarters), the same
-belief with random gaze, and the belief by Kaplan's rule with the same thresholds and with the rule of the published
-agent. Detections from every cell are stored and shared with `python -m eval.search`. `--references false` leaves out
-what needs them, which takes a tenth of the looks.
+for a class that is absent, until it decides: by windows, as it does by default, and with a fovea. Classes are drawn as
+in the fit, so that the probabilities assume its share (`prior="fit"`). The tables give the area under the ROC curve of
+the final probability, hit rates at several false alarm rates, and the decisions. For comparison they have plain rules
+(one unfoveated pass, with one or two closer looks, with four quarters), the same belief with random gaze, and the
+belief by Kaplan's rule with the same thresholds and with the rule of the published agent. Detections from every cell
+are stored and shared with `python -m eval.search`. `--references false` leaves out what needs them, which takes a tenth
+of the looks.
 """
 
 from eval.comparison.model_folder import with_models
