@@ -204,9 +204,9 @@ class CellGazes(Gazes[CellEpisode]):
 
     def action(self, action: object) -> Tensor:
         cell = action.item() if isinstance(action, Tensor) and action.ndim == 0 else action
-        expected = f"a whole number from 0 to {int(self.action_space.n) - 1}"
+        # A boolean is a whole number in Python, and no cell.
         is_cell = not isinstance(cell, bool | np.bool_) and self.action_space.contains(cell)
-        check(is_cell, "action", expected, repr(action))
+        check(is_cell, "action", f"a whole number from 0 to {int(self.action_space.n) - 1}", repr(action))
         return torch.from_numpy(np.asarray(cell, dtype=np.int64).reshape(1))
 
     @torch.inference_mode()
@@ -274,15 +274,13 @@ class CellGazes(Gazes[CellEpisode]):
     def _enter(self, rows: Tensor, episodes: Sequence[CellEpisode]) -> None:
         """Take the scenes, the targets and the goals of episodes."""
         scenes = [episode.scene for episode in episodes]
-        targets = None
         if self.searching:
             trials = [episode for episode in episodes if isinstance(episode, Trial)]
             self.targets[rows] = torch.tensor([trial.cue for trial in trials])
             self._right[rows] = _goals(trials, self._right.shape[1])
-            targets = self.targets[rows]
         else:
             self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])
-        self.looks.enter(rows, scenes, targets)
+        self.looks.enter(rows, scenes, self.targets[rows] if self.searching else None)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
 
     def check_saved(self, saved: SavedGazes) -> None:
@@ -349,11 +347,11 @@ class CellGazes(Gazes[CellEpisode]):
 
     def _view(self, row: int) -> Tensor:
         view = self.scenery.view(self.episodes[row].scene)
-        left, top = view.placement.offset
+        placement = view.placement
+        left, top = placement.offset
         # The part of the detector's canvas that the scene fills.
-        width, height = (
-            round(size * scale) for size, scale in zip(view.placement.size, view.placement.scale, strict=True)
-        )
+        width = round(placement.size[0] * placement.scale[0])
+        height = round(placement.size[1] * placement.scale[1])
         canvas = self.scenery.eye.pictures(view, self.points(torch.tensor([row])))
         return canvas[..., top : top + height, left : left + width]
 

@@ -250,10 +250,14 @@ class Gazes(ABC, Generic[_Episode]):
     @torch.inference_mode()
     def _glimpses(self, rows: Tensor, side: int) -> NDArray[np.uint8]:
         """Show what the eye sees in the rows `(n,)`, `(n, side, side, 3)`."""
-        # Scenes have sizes of their own, so that each view is resized alone.
-        views = [interpolate(self._view(row), (side, side), mode="bilinear", antialias=True) for row in rows.tolist()]
-        pixels = torch.cat(views).clamp(0, 1).mul(255).round().byte()
-        return np.ascontiguousarray(pixels.permute(0, 2, 3, 1).numpy())
+        glimpses = []
+        for row in rows.tolist():
+            # Scenes have sizes of their own, so that each view is resized alone.
+            glimpse = interpolate(self._view(row), (side, side), mode="bilinear", antialias=True)
+            glimpses.append(glimpse)
+        pixels = torch.cat(glimpses).clamp(0, 1).mul(255).round().byte()
+        channels_last = pixels.permute(0, 2, 3, 1)
+        return np.ascontiguousarray(channels_last.numpy())
 
     def infos(self, rows: Tensor, *, detections: bool = True) -> Arrays:
         """Tell what a learner may use beside the observations of some rows.

@@ -78,27 +78,22 @@ class WindowGaze(Gazes[_WindowEpisode]):
         self.done: set[Window] = set()
 
     def choose(self, random: np.random.Generator, options: Mapping[str, object]) -> _WindowEpisode:
-        unknown = [name for name in options if name not in ("scene", "target")]
-        check(not unknown, "options", "scene or target", ", ".join(unknown))
-        scene = options.get("scene")
+        unknown = options.keys() - {"scene", "target"}
+        check(not unknown, "options", "scene or target", ", ".join(sorted(unknown)))
         target = options.get("target")
-        if scene is None:
+        if options.get("scene") is None:
             check(target is None, "target", "a scene to search for it in (scene=)", target)
             return _WindowEpisode(*self.scenery.draw(random, self.task))
-        number = scene_number(scene, self.scenery)
+        scene = scene_number(options["scene"], self.scenery)
         if target is None:
-            return _WindowEpisode(*self.scenery.draw(random, self.task, number))
-        allowed = self.scenery.episodes(number) if self.searching else [0]
+            return _WindowEpisode(*self.scenery.draw(random, self.task, scene))
+        allowed = self.scenery.episodes(scene) if self.searching else [0]
         if isinstance(target, SupportsInt) and int(target) in allowed:
-            return _WindowEpisode(number, int(target))
+            return _WindowEpisode(scene, int(target))
         raise InputError(f"target: expected one of {allowed}, got {target}")
 
     def action(self, action: object) -> Tensor:
-        try:
-            given = np.asarray(action.detach().cpu() if isinstance(action, Tensor) else action)
-        except (ValueError, TypeError):  # it has no numbers in a row
-            given = np.empty(0)
-        place = given.astype(np.float64) if given.dtype.kind in "iuf" else np.empty(0)
+        place = _numbers_of(action)
         # The space warns of lists. An array is checked with its own type of numbers, but one of booleans is none.
         is_array = isinstance(action, np.ndarray) and place.size > 0
         is_action = self.action_space.contains(action if is_array else place)
@@ -123,14 +118,14 @@ class WindowGaze(Gazes[_WindowEpisode]):
         lattice = self.source.lattice
         belief = self.looking.session.belief
         assert belief is not None
+        expected = torch.zeros(lattice.rows, lattice.columns)
         if lattice.levels > 1:
             by_level = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
             expected = torch.stack(by_level).amax(0)
-        else:
-            expected = torch.zeros(lattice.rows, lattice.columns)
         # Objects of each place: the mean of its cells times their number.
         rows, columns = self.shape
-        return adaptive_avg_pool2d(expected[None], self.shape) * expected.numel() / (rows * columns)
+        mean = adaptive_avg_pool2d(expected[None], self.shape)
+        return mean * expected.numel() / (rows * columns)
 
     def _closeness(self) -> Tensor:
         """Compute how closely each lattice cell was looked at, `(1, rows, columns)`, 1 at the closest level."""
@@ -214,6 +209,15 @@ class WindowGaze(Gazes[_WindowEpisode]):
         eye = self.scenery.eye
         view = eye.open(self.scenery.image(self.episodes[row].scene))
         return eye.glimpse(view, torch.tensor([self.window.fixation], dtype=torch.float64))[0]
+
+
+def _numbers_of(action: object) -> NDArray[np.float64]:
+    """Convert an action to numbers; empty if it has none."""
+    try:
+        values = np.asarray(action.detach().cpu() if isinstance(action, Tensor) else action)
+    except (ValueError, TypeError):  # it has no numbers in a row
+        return np.empty(0)
+    return values.astype(np.float64) if values.dtype.kind in "iuf" else np.empty(0)
 
 
 def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
