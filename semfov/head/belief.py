@@ -177,16 +177,28 @@ class SceneObserver(Observer):
         if isinstance(self.inner, SemanticMap):
             return self.inner.unseen(like).expand_as(like).clone()
         look = own(look, EvidenceLook, "look")
+        # A look as far from all cells as can be, which shows nothing, tells what the belief is without one.
         evidence = torch.zeros_like(look.evidence) + self.inner.model.unseen(look.evidence)
         blank = replace(look, evidence=evidence, distance=torch.ones_like(look.distance), score=0 * look.score)
-        probabilities = self._probabilities(self.inner.update(self.inner.start(1, self.views.view_grid, like), blank))
+        start = self.inner.start(1, self.views.view_grid, like)
+        probabilities = self._probabilities(self.inner.update(start, blank))
         # The median leaves out the one cell that counts as fixated.
         return probabilities.median(-1).values.expand_as(like).clone()
 
 
 def _faded(values: Tensor, unseen: Tensor, keep: float, *, about_all: bool) -> Tensor:
-    """Move log odds, or the logarithms of the probabilities of all classes, towards those of an unseen cell."""
-    if not about_all:
-        return (unseen.logit(_CERTAIN) + keep * (values.logit(_CERTAIN) - unseen.logit(_CERTAIN))).sigmoid()
-    logarithms = unseen.clamp(min=_CERTAIN).log()
-    return (logarithms + keep * (values.clamp(min=_CERTAIN).log() - logarithms)).softmax(-1)
+    """Move log odds, or the logarithms of the probabilities of all classes, towards those of an unseen cell.
+
+    Args:
+        values: `(..., C)`, probabilities.
+        unseen: the same of a cell that was never seen.
+        keep: share of the difference that is left.
+        about_all: whether they are of all classes, and sum to 1.
+    """
+    if about_all:
+        start = unseen.clamp(min=_CERTAIN).log()
+        present = values.clamp(min=_CERTAIN).log()
+        return (start + keep * (present - start)).softmax(-1)
+    start = unseen.logit(_CERTAIN)
+    present = values.logit(_CERTAIN)
+    return (start + keep * (present - start)).sigmoid()

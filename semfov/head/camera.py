@@ -140,7 +140,8 @@ class _CameraScene(Sphere):
         pan = (one[..., 0] - other[..., 0]).abs()
         if self.around:
             pan = torch.minimum(pan, 360 - pan)
-        return torch.maximum(pan, (one[..., 1] - other[..., 1]).abs())
+        tilt = (one[..., 1] - other[..., 1]).abs()
+        return torch.maximum(pan, tilt)
 
     def image(self) -> Tensor | None:
         """Draw a panorama of the last frames from all poses, grey where none was; None before the first."""
@@ -149,13 +150,15 @@ class _CameraScene(Sphere):
         columns = min(_DRAWN, self.picture[0])
         rows = columns // 2
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-        directions = panorama_directions(torch.stack([x, y], -1).flatten(0, 1).float(), (columns, rows))
+        pixels = torch.stack([x, y], -1).flatten(0, 1).float()
+        directions = panorama_directions(pixels, (columns, rows))
         canvas = torch.full((3, columns * rows), 0.5)
         for frame, pose in self._frames.values():
             height, width = frame.shape[-2:]
             points, inside = Camera(pose, (width, height)).points(directions)
-            x, y = points[inside].round().long().unbind(-1)
-            canvas[:, inside] = frame[:, y.clamp(0, height - 1), x.clamp(0, width - 1)].float() / 255
+            column, row = points[inside].round().long().unbind(-1)
+            nearest = frame[:, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+            canvas[:, inside] = nearest.float() / 255
         return canvas.unflatten(-1, (rows, columns))
 
 

@@ -53,24 +53,39 @@ class CloserLooks:
             detections: a batch of one, boxes in pixels of the view.
         """
         views = self.views
-        pose = views.poses[action // views.cells]
+        number = action // views.cells
+        pose = views.poses[number]
         field = views.field_of(pose)
-        self._taken.add(action // views.cells)
+        self._taken.add(number)
         if action in self._cells:
             self._shown[self._cells[action]] = field
-        scores = detections.scores[0, :, 1:].amax(-1) if self.target is None else detections.scores[0, :, self.target]
-        boxes = detections.boxes[0, detections.mask[0] & (scores >= _FAINTEST)]
-        size = boxes.new_tensor(views.world.size)
-        middles = (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5
-        inside = ((middles >= -0.5) & (middles <= size - 0.5)).all(-1)
-        points = views.world.to_scene(middles[inside], pose)
+        boxes, middles = self._boxes_in_view(detections)
+        points = views.world.to_scene(middles, pose)
         cells = views.world.scene.cell_of(views.world.pixels_of(points)).tolist()
         # The sides of boxes as shares of those of the view.
-        shares = (boxes[inside, 2:] - boxes[inside, :2]) / size
+        shares = (boxes[:, 2:] - boxes[:, :2]) / boxes.new_tensor(views.world.size)
         extents = (shares.amax(-1) * field).tolist()
         for cell, point, extent in zip(cells, points, extents, strict=True):
-            fitting = [each for each in views.fields if each >= _CONTEXT * extent]
-            self._places[cell] = _Place(point, min(fitting, default=views.fields[-1]))
+            self._places[cell] = _Place(point, self._field_around(extent))
+
+    def _boxes_in_view(self, detections: Detections) -> tuple[Tensor, Tensor]:
+        """Select the boxes that may show what is looked for, and whose middle is in the view.
+
+        Returns:
+            Boxes `(M, 4)` and their middles `(M, 2)`, in pixels of the view.
+        """
+        class_scores = detections.scores[0]
+        scores = class_scores[:, 1:].amax(-1) if self.target is None else class_scores[:, self.target]
+        boxes = detections.boxes[0, detections.mask[0] & (scores >= _FAINTEST)]
+        size = boxes.new_tensor(self.views.world.size)
+        middles = (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5
+        inside = ((middles >= -0.5) & (middles <= size - 0.5)).all(-1)
+        return boxes[inside], middles[inside]
+
+    def _field_around(self, extent: float) -> float:
+        """Choose the narrowest field of view that shows an object of an extent in degrees with its surroundings."""
+        wide_enough = [field for field in self.views.fields if field >= _CONTEXT * extent]
+        return min(wide_enough, default=self.views.fields[-1])
 
     def values(self, belief: SceneBelief, here: int) -> Tensor:
         """Value the closer looks that are offered after a look; their poses are added to the views.
@@ -85,20 +100,37 @@ class CloserLooks:
         views = self.views
         cells = self._best(belief)
         # Poses that were offered, and are not looked from, serve the next ones.
-        free = sorted({action // views.cells for action in self._cells} - self._taken, reverse=True)
-        offered = [views.aim(self._places[cell].point, self._places[cell].field, free) for cell in cells]
-        self._cells = dict(zip(offered, cells, strict=True))
+        offered_before = {action // views.cells for action in self._cells}
+        free = sorted(offered_before - self._taken, reverse=True)
+        actions = []
+        for cell in cells:
+            place = self._places[cell]
+            actions.append(views.aim(place.point, place.field, free))
+        self._cells = dict(zip(actions, cells, strict=True))
         values = torch.full((len(views.grid),), OUT)
-        if not offered:
-            return values
-        actions = torch.tensor(offered)
-        gains = self.gain.closer(belief, torch.tensor(cells))
-        if self.speeds is not None:
-            gains = gains / views.durations(here, self.speeds)[actions]
-            turns = views.world.turn(views.poses[here // views.cells], views.poses[actions // views.cells])
-            gains = torch.where(self.speeds.makes(turns), gains, OUT)
-        values[actions] = gains
+        if actions:
+            values[torch.tensor(actions)] = self._gains(belief, here, torch.tensor(actions), torch.tensor(cells))
         return values
+
+    def _gains(self, belief: SceneBelief, here: int, actions: Tensor, cells: Tensor) -> Tensor:
+        """Compute the expected gains of closer looks, of a head with speeds per second.
+
+        Args:
+            belief: the belief over the scene.
+            here: the present action.
+            actions: `(n,)`, the looks.
+            cells: `(n,)`, the cells of their places.
+
+        Returns:
+            `(n,)`; `OUT` for turns that the head does not make.
+        """
+        views = self.views
+        gains = self.gain.closer(belief, cells)
+        if self.speeds is None:
+            return gains
+        gains = gains / views.durations(here, self.speeds)[actions]
+        turns = views.world.turn(views.poses[here // views.cells], views.poses[actions // views.cells])
+        return torch.where(self.speeds.makes(turns), gains, OUT)
 
     def _best(self, belief: SceneBelief) -> list[int]:
         """Choose the places that promise most, of those that no look has shown as closely; → their cells."""

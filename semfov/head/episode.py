@@ -87,8 +87,11 @@ def live(eye: Eye, views: Views) -> Detect:
 
 def _moved_boxes(boxes: Tensor, world: World, from_pose: Tensor, to_pose: Tensor) -> Tensor:
     """Move boxes `(..., 4)` of the view from one pose to that from another: the smallest around their corners there."""
-    corners = boxes[..., [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2) - 0.5
-    moved = world.to_view(world.to_scene(corners, from_pose), to_pose)[0].view(*boxes.shape[:-1], 4, 2) + 0.5
+    x1, y1, x2, y2 = boxes.unbind(-1)
+    corners = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], -1).unflatten(-1, (4, 2))
+    in_scene = world.to_scene(corners.reshape(-1, 2) - 0.5, from_pose)
+    in_view, _ = world.to_view(in_scene, to_pose)
+    moved = in_view.view(corners.shape) + 0.5
     return torch.cat([moved.amin(-2), moved.amax(-2)], -1)
 
 
@@ -145,16 +148,14 @@ def look_around(
         The looks.
     """
     speeds = views.world.speeds
-    numbers = [seed] if isinstance(seed, int) else [*seed]
-    digest = hashlib.sha256(repr(numbers).encode()).digest()
-    generator = torch.Generator().manual_seed(int.from_bytes(digest[:8], "big") >> 1)
+    generator = _generator(seed)
     looks = _HeadLooks(views, detect, target)
+    forgetting = Forgetting(views.world.rate) if views.world.rate else None
+    memory = Memory.empty(looks, observer, 1)
+    action = start
     spent = speeds.look  # seconds at the end of the present look
     ahead = 0.0  # seconds that the next one takes
     gain = math.inf  # value that it is chosen for
-    memory = Memory.empty(looks, observer, 1)
-    forgetting = Forgetting(views.world.rate) if views.world.rate else None
-    action = start
     for number in range(passes):
         looks.passed = ahead
         cell = torch.tensor([action])
@@ -164,17 +165,27 @@ def look_around(
         if closer is not None:
             closer.see(action, look.detections())
             values, memory = _with_closer(values, closer.values(belief, action), memory)
+        # Closer looks may have added actions to the grid, so that the choice is made anew.
         choice = Greedy(drawn_by(generator, len(views.grid), looks.like))
-        following = int(choice(number, _ONE, values, memory.visited, views.grid.centres)[1])
-        spent += ahead
+        _, chosen = choice(number, _ONE, values, memory.visited, views.grid.centres)
+        following = int(chosen)
         chosen_for = gain
+        spent += ahead
         ahead = float(views.durations(action, speeds)[following])
         gain = float(values[0, following])
         yield HeadStep(action, spent, belief, look.detections(), chosen_for, ahead)
-        is_over = spent + ahead > duration or gain <= OUT or (min_gain > 0 and gain * ahead < min_gain)
-        if is_over or bool(memory.visited.all()):
+        is_too_late = spent + ahead > duration
+        is_worthless = gain <= OUT or (min_gain > 0 and gain * ahead < min_gain)
+        if is_too_late or is_worthless or bool(memory.visited.all()):
             return
         action = following
+
+
+def _generator(seed: int | Sequence[int]) -> torch.Generator:
+    """Make a generator whose seed depends on all of some numbers."""
+    numbers = [seed] if isinstance(seed, int) else [*seed]
+    digest = hashlib.sha256(repr(numbers).encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "big") >> 1)  # 63 bits, which it takes
 
 
 def _with_closer(values: Tensor, closer: Tensor, memory: Memory) -> tuple[Tensor, Memory]:

@@ -153,10 +153,7 @@ class OnvifClient:
             moment = answer.find(f".//{{{_TYPES}}}UTCDateTime")
             if moment is None:
                 return timedelta()
-            names = ("Date/Year", "Date/Month", "Date/Day", "Time/Hour", "Time/Minute", "Time/Second")
-            paths = ["/".join(f"{{{_TYPES}}}{part}" for part in name.split("/")) for name in names]
-            year, month, day, hour, minute, second = (int(moment.findtext(path, "")) for path in paths)
-            ahead = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC) - datetime.now(UTC)
+            ahead = _time_of(moment) - datetime.now(UTC)
         except (DataError, ValueError, OverflowError):
             return timedelta()
         return ahead if abs(ahead) < _OTHER_CENTURY else timedelta()
@@ -306,7 +303,8 @@ class OnvifCamera(PanTiltCamera):
         down, up = self.tilt
         pan = 2 * (direction[0] - left) / (right - left) - 1
         tilt = 2 * (direction[1] - down) / (up - down) - 1
-        wide, narrow = _focal(self.fields[-1]), _focal(self.fields[0])
+        wide = _focal(self.fields[-1])
+        narrow = _focal(self.fields[0])
         zoom = (_focal(field) - wide) / (narrow - wide) if narrow > wide else 0.0
         return Position(pan, tilt, zoom)
 
@@ -323,8 +321,10 @@ class OnvifCamera(PanTiltCamera):
         down, up = self.tilt
         pan = left + (position.pan + 1) / 2 * (right - left)
         tilt = down + (position.tilt + 1) / 2 * (up - down)
-        wide, narrow = _focal(self.fields[-1]), _focal(self.fields[0])
-        return (pan, tilt), 2 * math.degrees(math.atan(1 / (wide + position.zoom * (narrow - wide))))
+        wide = _focal(self.fields[-1])
+        narrow = _focal(self.fields[0])
+        focal = wide + position.zoom * (narrow - wide)
+        return (pan, tilt), 2 * math.degrees(math.atan(1 / focal))
 
     def where(self) -> Position:
         """Ask for the present position.
@@ -341,33 +341,32 @@ class OnvifCamera(PanTiltCamera):
         """Ask for the position, and whether the camera moves; None where it does not say."""
         answer = self._command("GetStatus")
         turned = answer.find(f".//{{{_TYPES}}}PanTilt[@x]")
-        zoomed = answer.find(f".//{{{_TYPES}}}Zoom[@x]")
         if turned is None:
             raise DataError("camera: expected its position, got a status without pan and tilt")
         pan = _number(turned, "x")
         tilt = _number(turned, "y")
         units = turned.get("space", "")
-        if max(abs(pan), abs(tilt)) > _BEYOND or (units and not units.endswith("/PositionGenericSpace")):
+        is_generic = not units or units.endswith("/PositionGenericSpace")
+        if not is_generic or max(abs(pan), abs(tilt)) > _BEYOND:
             expected = "its position from -1 to 1 (the generic space of ONVIF)"
             raise DataError(f"camera: expected {expected}, got {pan:g}, {tilt:g} in {units or 'no named space'}")
+        zoomed = answer.find(f".//{{{_TYPES}}}Zoom[@x]")
         zoom = 0.0 if zoomed is None else _number(zoomed, "x")
-        states = [element.text for element in answer.findall(f".//{{{_TYPES}}}MoveStatus/*")]
-        known = [state for state in states if state in ("IDLE", "MOVING")]
-        moves = "MOVING" in known if known else None
-        return Position(pan, tilt, zoom), moves
+        return Position(pan, tilt, zoom), _is_moving(answer)
 
     def _approach(self, goal: Position) -> None:
         """Turn by relative moves, the short way round; one is at most as long as ONVIF allows, so there may be two."""
-        here = self.where()
+        position = self.where()
         while True:
-            way = Position(self._turn(here.pan, goal.pan), goal.tilt - here.tilt, goal.zoom - here.zoom)
-            part = Position(*(max(-_FARTHEST, min(_FARTHEST, length)) for length in way))
-            stop = Position(*(start + length for start, length in zip(here, part, strict=True)))
-            self._move("RelativeMove", "Translation", part)
+            pan = self._turn(position.pan, goal.pan)
+            distance = Position(pan, goal.tilt - position.tilt, goal.zoom - position.zoom)
+            step = Position(*(max(-_FARTHEST, min(_FARTHEST, length)) for length in distance))
+            stop = Position(position.pan + step.pan, position.tilt + step.tilt, position.zoom + step.zoom)
+            self._move("RelativeMove", "Translation", step)
             self._wait(stop)
-            if part == way:
+            if step == distance:
                 return
-            here = stop
+            position = stop
 
     def _turn(self, start: float, end: float) -> float:
         """Compute the turn between two pans in the units of ONVIF; of a camera without borders the shorter one."""
@@ -409,6 +408,31 @@ class OnvifCamera(PanTiltCamera):
             if profile.find(f"{{{_TYPES}}}PTZConfiguration") is not None:
                 return profile.get("token", "")
         raise DataError("camera: expected a media profile with pan and tilt, got none; set it up in the camera")
+
+
+def _time_of(moment: XML.Element) -> datetime:
+    """Read a date and a time; raise `ValueError` where a part of them is no number."""
+
+    def number(group: str, name: str) -> int:
+        return int(moment.findtext(f"{{{_TYPES}}}{group}/{{{_TYPES}}}{name}", ""))
+
+    return datetime(
+        number("Date", "Year"),
+        number("Date", "Month"),
+        number("Date", "Day"),
+        number("Time", "Hour"),
+        number("Time", "Minute"),
+        min(number("Time", "Second"), 59),  # a leap second is 60
+        tzinfo=UTC,
+    )
+
+
+def _is_moving(status: XML.Element) -> bool | None:
+    """Read from a status whether any motor moves; None where it says nothing of them."""
+    states = [element.text for element in status.findall(f".//{{{_TYPES}}}MoveStatus/*")]
+    if "MOVING" in states:
+        return True
+    return False if "IDLE" in states else None
 
 
 def _focal(field: float) -> float:

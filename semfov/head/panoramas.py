@@ -95,21 +95,24 @@ class Panoramas(ComposedScenes):
         generator = self._generator(index)
         slots = sum(number for _, number in self.rings)
         count = len(self.scenes)
-        rounds = -(-slots // count)
+        rounds = math.ceil(slots / count)  # every photograph is used once before one is used again
         order = np.concatenate([generator.permutation(count) for _ in range(rounds)])[:slots].tolist()
-        places = []
+        directions = []
         for latitude, number in self.rings:
             turn = float(generator.uniform(0, 360))
-            places += [((turn + 360 * n / number) % 360 - 180, latitude) for n in range(number)]
-        patches = []
-        for scene, (yaw, pitch) in zip(order, places, strict=True):
-            width, height = self.scenes.annotation(scene).size
-            slot_width, slot_height = _SLOT
-            scale = min(slot_width / width, slot_height / height)
-            x = (slot_width - width * scale) / 2
-            y = (slot_height - height * scale) / 2
-            patches.append(_Patch(scene, (yaw, pitch, self.slot), (x, y, slot_width - x, slot_height - y)))
-        return patches
+            for slot in range(number):
+                pan = (turn + 360 * slot / number) % 360 - 180
+                directions.append((pan, latitude))
+        return [self._patch(scene, pan, tilt) for scene, (pan, tilt) in zip(order, directions, strict=True)]
+
+    def _patch(self, scene: int, pan: float, tilt: float) -> _Patch:
+        """Lay a photograph into the middle of a slot in a direction, as large as the slot allows."""
+        width, height = self.scenes.annotation(scene).size
+        slot_width, slot_height = _SLOT
+        scale = min(slot_width / width, slot_height / height)
+        x = (slot_width - width * scale) / 2
+        y = (slot_height - height * scale) / 2
+        return _Patch(scene, (pan, tilt, self.slot), (x, y, slot_width - x, slot_height - y))
 
     def __getitem__(self, index: int) -> Scene:
         """Compose a panorama."""
@@ -121,26 +124,39 @@ class Panoramas(ComposedScenes):
     def _paint(self, canvas: Tensor, patch: _Patch) -> None:
         """Paint a photograph into a panorama `(3, H, W)`."""
         camera = Camera(torch.tensor(patch.pose), _SLOT)
-        x1, y1, x2, y2 = patch.box
-        # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.
-        scale = self.size[0] / (2 * math.pi) / float(camera.focal)
-        image = self.scenes[patch.scene].image[None]
-        shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
-        image = F.interpolate(image, shape, mode="bilinear", antialias=True)
-        # The pixels of the panorama that it may cover; a seam does not cut them.
-        region = Regions(torch.tensor([patch.box]), Camera(camera.pose[None], _SLOT))
-        left, top, right, bottom = region.panorama_boxes(self.size)[0].tolist()
-        columns = torch.arange(math.floor(left), math.ceil(right)) % self.size[0]
-        rows = torch.arange(math.floor(top), min(math.ceil(bottom), self.size[1]))
+        image = self._resized(patch, camera)
+        columns, rows = self._pixels_around(patch, camera)
         pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()
-        points, _ = camera.points(panorama_directions(pixels.flatten(0, 1), self.size))
+        directions = panorama_directions(pixels.flatten(0, 1), self.size)
+        points, _ = camera.points(directions)
+        x1, y1, x2, y2 = patch.box
         low = points.new_tensor([x1, y1]) - 0.5
         high = points.new_tensor([x2, y2]) - 0.5
         inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
+        # Places in the photograph as `grid_sample` takes them, from -1 to 1; far ones, behind the camera, are unused.
         place = (2 * (points - low) / (high - low) - 1).nan_to_num().clamp(-2, 2).view(1, *inside.shape, 2)
         projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
         row, column = inside.nonzero().unbind(-1)
         canvas[:, rows[row], columns[column]] = projection[:, row, column]
+
+    def _resized(self, patch: _Patch, camera: Camera) -> Tensor:
+        """Resize a photograph, with antialiasing, to the resolution of the panorama at the horizon, `(1, 3, h, w)`."""
+        x1, y1, x2, y2 = patch.box
+        pixels_per_radian = self.size[0] / (2 * math.pi)
+        scale = pixels_per_radian / float(camera.focal)
+        height = max(1, round((y2 - y1) * scale))
+        width = max(1, round((x2 - x1) * scale))
+        image = self.scenes[patch.scene].image[None]
+        return F.interpolate(image, (height, width), mode="bilinear", antialias=True)
+
+    def _pixels_around(self, patch: _Patch, camera: Camera) -> tuple[Tensor, Tensor]:
+        """List the columns and the rows of the panorama that a photograph may cover; a seam does not cut them."""
+        region = Regions(torch.tensor([patch.box]), Camera(camera.pose[None], _SLOT))
+        left, top, right, bottom = region.panorama_boxes(self.size)[0].tolist()
+        width, height = self.size
+        columns = torch.arange(math.floor(left), math.ceil(right)) % width
+        rows = torch.arange(math.floor(top), min(math.ceil(bottom), height))
+        return columns, rows
 
     def regions(self, index: int) -> Regions:
         """Find the exact regions of the objects of a panorama: boxes in the planes of their photographs.

@@ -260,23 +260,31 @@ class Sphere(_Scene):
         Returns:
             Rings of poses `(3,)`, of which every second pose of every second ring tiles the scene.
         """
-        height = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
-        middle = (self.tilt[0] + self.tilt[1]) / 2
-        reach = (self.tilt[1] - self.tilt[0]) / 2
-        number = math.floor(reach / (height / 2))  # rings above the middle, and below it
-        start = self.pan[0]
-        width = min(self.pan[1] - self.pan[0], 360)
+        width, height = self.size
+        field_up = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * height / width))
+        down, up = self.tilt
+        middle = (down + up) / 2
+        reach = (up - down) / 2
+        number = math.floor(reach / (field_up / 2))  # rings above the middle, and below it
         rings = []
-        for row in range(-number, number + 1):
-            pitch = middle + row * height / 2
+        for ring in range(-number, number + 1):
+            tilt = middle + ring * field_up / 2
             # In a ring that tiles, the sides of neighbouring windows meet even at the corners nearest to the horizon.
-            tiles = (row + number) % 2 == 0
-            lowest = max(abs(pitch) - height / 2, 0) if tiles else abs(pitch)
-            count = 2 * math.ceil(width * math.cos(math.radians(lowest)) / field - 1e-9)
-            # The ends of an arc are both poses; those of a ring are the same one.
-            steps = range(count if self.around else count + 1)
-            rings.append([torch.tensor([width * n / max(count, 1) + start, pitch, field]) for n in steps])
+            tiles = (ring + number) % 2 == 0
+            nearest_to_horizon = max(abs(tilt) - field_up / 2, 0) if tiles else abs(tilt)
+            pans = self._pans(field, nearest_to_horizon)
+            rings.append([torch.tensor([pan, tilt, field]) for pan in pans])
         return rings
+
+    def _pans(self, field: float, tilt: float) -> list[float]:
+        """List pans half a window apart, at a tilt, where a degree of pan is shorter than at the horizon."""
+        left, right = self.pan
+        width = min(right - left, 360)
+        # Two for each window that fits, rounded up, but for the error of the division.
+        count = 2 * math.ceil(width * math.cos(math.radians(tilt)) / field - 1e-9)
+        # The ends of an arc are both poses; those of a ring are the same one.
+        steps = range(count if self.around else count + 1)
+        return [width * step / max(count, 1) + left for step in steps]
 
     def aim(self, point: Tensor, field: float) -> Tensor:
         """Find the pose that has a direction in the middle of its view, or as near to it as the limits allow.
@@ -398,30 +406,35 @@ class _Plane(_Scene):
     def _box(self, pose: Tensor) -> tuple[int, int, int, int]:
         """Find the window `(x1, y1, x2, y2)` of a pose in whole pixels."""
         pan, tilt, field = pose.tolist()
+        picture_width, picture_height = self.picture
         width = field * self.degree
         height = width * self.size[1] / self.size[0]
         columns = max(1, round(width))
         rows = max(1, round(height))
-        x = round(self.picture[0] / 2 + pan * self.degree - width / 2)
-        y = round(self.picture[1] / 2 - tilt * self.degree - height / 2)
+        x = round(picture_width / 2 + pan * self.degree - width / 2)
+        y = round(picture_height / 2 - tilt * self.degree - height / 2)
         # Windows at the border of the picture may be rounded to a place one pixel beyond it.
-        x1 = min(max(x, 0), self.picture[0] - columns)
-        y1 = min(max(y, 0), self.picture[1] - rows)
+        x1 = min(max(x, 0), picture_width - columns)
+        y1 = min(max(y, 0), picture_height - rows)
         is_inside = abs(x1 - x) <= 1 and abs(y1 - y) <= 1 and min(x1, y1) >= 0
-        expected = f"a window inside {self.picture[0]} × {self.picture[1]} pixels"
+        expected = f"a window inside {picture_width} × {picture_height} pixels"
         check(is_inside, "pose", expected, (x, y, x + columns, y + rows))
         return x1, y1, x1 + columns, y1 + rows
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         x1, y1, x2, y2 = self._box(pose)
         size = points.new_tensor(self.size)
-        pixels = (points + 0.5 - points.new_tensor([x1, y1])) * size / points.new_tensor([x2 - x1, y2 - y1]) - 0.5
-        return pixels, ((pixels >= -0.5) & (pixels <= size - 0.5)).all(-1)
+        extent = points.new_tensor([x2 - x1, y2 - y1])
+        # Points count from the centres of pixels, and windows from their edges, half a pixel before.
+        pixels = (points + 0.5 - points.new_tensor([x1, y1])) * size / extent - 0.5
+        is_inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(-1)
+        return pixels, is_inside
 
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
         x1, y1, x2, y2 = self._box(pose)
+        size = points.new_tensor(self.size)
         extent = points.new_tensor([x2 - x1, y2 - y1])
-        return (points + 0.5) * extent / points.new_tensor(self.size) + points.new_tensor([x1, y1]) - 0.5
+        return (points + 0.5) * extent / size + points.new_tensor([x1, y1]) - 0.5
 
     def pixels_of(self, points: Tensor) -> Tensor:
         return points
@@ -441,33 +454,42 @@ class _Plane(_Scene):
 
     def poses(self, field: float) -> list[list[Tensor]]:
         """List the windows of a field of view that lie inside the picture, half a window apart, in rows."""
+        picture_width, picture_height = self.picture
         width = field * self.degree
         height = width * self.size[1] / self.size[0]
-        is_inside = round(width) <= self.picture[0] and round(height) <= self.picture[1]
+        is_inside = round(width) <= picture_width and round(height) <= picture_height
         got = f"{field} degrees, {width:.0f} × {height:.0f} pixels; give narrower `fields`, or a smaller `degree`"
-        expected = f"a window inside the picture of {self.picture[0]} × {self.picture[1]} pixels"
+        expected = f"a window inside the picture of {picture_width} × {picture_height} pixels"
         check(is_inside, "field", expected, got)
-        across = self._middles(self.picture[0], width)
-        down = self._middles(self.picture[1], height)
-        return [[torch.tensor([x, -y, field]) for x in across] for y in down]
+        pans = self._middles(picture_width, width)
+        # Pixels count down, and tilts up.
+        tilts = [-down for down in self._middles(picture_height, height)]
+        return [[torch.tensor([pan, tilt, field]) for pan in pans] for tilt in tilts]
 
     def _middles(self, length: int, side: float) -> list[float]:
         """Spread windows of a side over a length, half a window apart at most; middles in degrees from its middle."""
         steps = 2 * math.ceil(length / side - 1 - 1e-9)
-        return [(length - side) * (n / max(steps, 1) - 0.5) / self.degree for n in range(steps + 1)]
+        room = length - side
+        return [room * (step / max(steps, 1) - 0.5) / self.degree for step in range(steps + 1)]
 
     def aim(self, point: Tensor, field: float) -> Tensor:
         """Find the pose of the window whose middle is nearest to a point."""
         pan, tilt = self.angles_of(point[None])[0].tolist()
-        across = max(self.pan[1] - field / 2, 0.0)
-        up = max(self.tilt[1] - field / 2 * self.size[1] / self.size[0], 0.0)
-        return torch.tensor([min(max(pan, -across), across), min(max(tilt, -up), up), field])
+        field_up = field / 2 * self.size[1] / self.size[0]
+        most_pan = max(self.pan[1] - field / 2, 0.0)
+        most_tilt = max(self.tilt[1] - field_up, 0.0)
+        return torch.tensor([_limited(pan, most_pan), _limited(tilt, most_tilt), field])
 
     def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
         return Boxes(self.boxes(boxes, pose))
 
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
         return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
+
+
+def _limited(angle: float, most: float) -> float:
+    """Bring an angle into limits that lie as far on both sides of 0."""
+    return min(max(angle, -most), most)
 
 
 class Flat(_Plane):

@@ -49,31 +49,30 @@ class Views:
         self.world = world
         self.fields = fields
         self.fovea = fovea
-        poses: list[Tensor] = []
-        numbers = []
-        for row in world.poses(fields[-1]):
-            numbers.append([*range(len(poses), len(poses) + len(row))])
-            poses += row
-        self.tiling = [row[::2] for row in numbers[::2]]
-        self.lattice = len(poses)
-        self.poses = torch.stack(poses)
+        rows = world.poses(fields[-1])
+        self.poses = torch.stack([pose for row in rows for pose in row])
+        self.lattice = len(self.poses)
+        # Every second pose of every second row tiles the scene.
+        numbers = torch.arange(self.lattice).split([len(row) for row in rows])
+        self.tiling = [numbers_of_row[::2].tolist() for numbers_of_row in numbers[::2]]
         width, height = world.size
         self.view_grid = Grid(_POINTS, _POINTS, (width, height))
         self.cells = _POINTS**2
         self.grid = self._strip()
-        self.gaze = torch.cat([world.to_scene(self.view_grid.centres, pose) for pose in self.poses])
-        self.gaze_cell = world.scene.cell_of(world.pixels_of(self.gaze))
         centres = self.view_grid.centres
+        self.gaze = torch.cat([world.to_scene(centres, pose) for pose in self.poses])
+        self.gaze_cell = world.scene.cell_of(world.pixels_of(self.gaze))
         # For each field of view, angles between the cells of a view, `(cells, cells)`.
         self._shifts = torch.stack([world.shift(centres[:, None], centres[None], field) for field in fields])
-        self._field_numbers = [len(fields) - 1] * len(poses)
+        self._field_numbers = [len(fields) - 1] * self.lattice
         self.visible: list[Tensor] = []
         self.points: list[Tensor] = []
+        self.distances: list[Tensor] = []
         for pose in self.poses:
             points, inside = world.to_view(world.centres, pose)
             self.visible.append(inside.nonzero()[:, 0])
             self.points.append(points[inside])
-        self.distances = [self._distances(pose, points) for pose, points in zip(self.poses, self.points, strict=True)]
+            self.distances.append(self._distances(pose, points[inside]))
 
     def _strip(self) -> Grid:
         """Make the grid of the cells of all views."""
@@ -93,9 +92,9 @@ class Views:
         """
         free = [] if free is None else free
         pose = self.world.aim(point, field)
-        known = (self.poses == pose).all(-1).nonzero()
-        if len(known):
-            number = int(known[0, 0])
+        same_poses = (self.poses == pose).all(-1).nonzero()
+        if len(same_poses):
+            number = int(same_poses[0, 0])
             if number in free:
                 free.remove(number)
         else:
@@ -147,7 +146,7 @@ class Views:
         self._field_numbers[number] = self.fields.index(self.field_of(pose))
         points, inside = world.to_view(world.centres, pose)
         # A narrow view may lie between the centres of cells. It shows the cell in its middle all the same.
-        middle = int(self.gaze_cell[number * self.cells + self.cells // 2 + _POINTS // 2])
+        middle = int(self.gaze_cell[number * self.cells + self._middle_cell])
         if not bool(inside[middle]):
             inside[middle] = True
             points[middle] = self.view_grid.extent / 2 - 0.5
@@ -167,10 +166,16 @@ class Views:
     @cached_property
     def ahead(self) -> int:
         """Action in the middle of the view nearest to straight ahead, of those that tile the scene."""
-        poses = [pose for row in self.tiling for pose in row]
-        middle = torch.tensor([0.0, 0.0, self.fields[-1]]).expand(len(poses), 3)
-        nearest = poses[int(self.world.turn(self.poses[poses], middle).argmin())]
-        return nearest * self.cells + self.cells // 2 + _POINTS // 2
+        numbers = [number for row in self.tiling for number in row]
+        straight_ahead = torch.tensor([0.0, 0.0, self.fields[-1]]).expand(len(numbers), 3)
+        turns = self.world.turn(self.poses[numbers], straight_ahead)
+        nearest = numbers[int(turns.argmin())]
+        return nearest * self.cells + self._middle_cell
+
+    @property
+    def _middle_cell(self) -> int:
+        """Number of the cell right below and beside the middle of a view, whose cells are even in number."""
+        return self.cells // 2 + _POINTS // 2
 
     @cached_property
     def reachable(self) -> Tensor:
@@ -190,7 +195,8 @@ class Views:
             `(C, V)`.
         """
         image = values.unflatten(-1, (_POINTS, _POINTS))[None]
-        place = (2 * (self.points[pose] + 0.5) / self.view_grid.extent - 1)[None, None].to(values)
+        shares = (self.points[pose] + 0.5) / self.view_grid.extent
+        place = (2 * shares - 1)[None, None].to(values)  # from -1 to 1, as `grid_sample` takes them
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 
     def _distances(self, pose: Tensor, points: Tensor) -> Tensor:
