@@ -68,12 +68,17 @@ class LivePerception(OtherWords):
         self._canvas = windows.eye.detector.input_size
         knows_photographs = windows.evidence is not None and windows.evidence.photograph is not None
         self._photographs = knows_photographs and settings.start is None
-        possible: tuple[str, ...] = (self.how,)
-        if self.how == "auto":
-            possible = ("windows",) if self._photographs else ("fovea", "windows")
         # A kind of look that no frame can ask for is not made: it may refuse settings that suit the other.
-        self._episodes = {name: KINDS_OF_LOOK[name](parts).stream(target, targets, settings) for name in possible}
+        self._episodes = {}
+        for name in self._possible_kinds():
+            self._episodes[name] = KINDS_OF_LOOK[name](parts).stream(target, targets, settings)
         self._check_start()
+
+    def _possible_kinds(self) -> tuple[str, ...]:
+        """List the kinds of look that the first frame may ask for."""
+        if self.how != "auto":
+            return (self.how,)
+        return ("windows",) if self._photographs else ("fovea", "windows")
 
     def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> Moment:
         """Look at the next frame.

@@ -120,8 +120,8 @@ class FoveaAgent(GazeParts):
             The record, with its objects.
         """
         limits = EpisodeLimits.of(settings)
-        one = targets[0] if len(targets) == 1 else None
-        plan = GazePlan(self, one, shifts=_shifts(settings.shifts, 20, limits))
+        target = targets[0] if len(targets) == 1 else None
+        plan = GazePlan(self, target, shifts=_shifts(settings.shifts, 20, limits))
         episode = FoveaEpisode(plan, image, limits, lambda grid: StoppingCriterion())
         return replace(episode.run(), target=None, targets=targets)
 

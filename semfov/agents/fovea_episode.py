@@ -111,16 +111,17 @@ class GazePlan:
         self.beside = None if mapper is chosen.observer else on_cpu(mapper)
         self.forgetting = None if rate is None else Forgetting(rate)
         self.most_closer = MOST_CLOSER if decisions.closer is None else decisions.closer
+        # The thresholds are those of the verification where there is one.
         self.verification = self._fitted_verification()
         self.thresholds = self._thresholds(decisions)
         self._viewed = viewed
-        self._cells: Tensor | None = None
+        self._cells = None if cells is None else _checked_cells(cells, agent.cells)
         if cells is not None:
-            self._cells = _checked_cells(cells, agent.cells)
             start = cells[0]
             shifts = len(cells) - 1
         self.most = sys.maxsize if shifts is None else shifts + 1
         check_whole(seed, "seed", 0, 2**63 - 1)
+        # The draw of the start comes first; later ones break ties.
         self._generator = torch.Generator().manual_seed(int(seed))
         self.start = _first_cell(start, agent.cells, self._generator)
 
@@ -442,12 +443,22 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         seconds: dict[str, float],
         closer: tuple[CloseUp, ...] = (),
     ) -> FoveaMoment:
-        """Make the record of the present frame, after its look."""
+        """Make the record of the present frame, after its look.
+
+        Args:
+            gaze: the gaze, whose belief is that after its last fixation.
+            cell: the cell that the look was at.
+            detections: what it shows, a batch of one.
+            seconds: its time by stage.
+            closer: the closer look that it was; empty for a fixation.
+        """
         step = gaze.step
         assert step is not None
         belief = step.belief
         target = self.goal.target
+        number = self.passes - 1
         probability = _probability(belief, target)
+        look = moment_look(gaze.grid, number, cell, detections, probability, seconds)
         decision = gaze.criterion.decision
         candidate = gaze.criterion.candidate
         next_cell = None if candidate is None else candidate.cell
@@ -455,13 +466,14 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
             classes=self.goal.classes,
             target=target,
             decision=decision,
-            number=self.passes - 1,
+            number=number,
             grid=gaze.grid,
-            looks=(moment_look(gaze.grid, self.passes - 1, cell, detections, probability, seconds),),
+            looks=(look,),
             probability=probability,
             belief=belief,
             visited=step.visited[0],
             next_cell=int(step.next_cell) if next_cell is None else next_cell,
+            # Of one look, which is that of the frame.
             closer=tuple(replace(close_up, fixation=0, number=0) for close_up in closer),
             found=decision is not None and decision.outcome == "found",
             prior=self.plan.given_share,

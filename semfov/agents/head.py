@@ -143,12 +143,13 @@ class HeadAgent(nn.Module):
         limits = EpisodeLimits.of(settings, _PASSES)
         views = self.views(scene, color)
         evidence = on_cpu(self.target_evidence)  # where the geometry of the scene is
-        known = Prior.of(settings.prior, evidence.shares, index)
-        never_seen = known(chance)
+        prior = Prior.of(settings.prior, evidence.shares, index)
+        never_seen = prior(chance)
         gain = SearchGain(views, foresight)
-        observer = SceneObserver(Target(evidence, prior=known), views, prior=never_seen)
-        sure = _CONFIRM if settings.confirm is None else settings.confirm
-        thresholds = Thresholds(sure, never_seen if settings.stop_below is None else settings.stop_below, sure)
+        observer = SceneObserver(Target(evidence, prior=prior), views, prior=never_seen)
+        confirm = _CONFIRM if settings.confirm is None else settings.confirm
+        stop_below = never_seen if settings.stop_below is None else settings.stop_below
+        thresholds = Thresholds(confirm, stop_below, place=confirm)
         return HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=_first_action(settings), duration=_duration(settings),

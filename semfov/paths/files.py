@@ -271,16 +271,20 @@ def _check_shared(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> N
     targets = record["targets"]
     check(all(_is_class(label, classes) for label in targets), "targets", "indices of classes", targets)
     if "photograph" in tensors:
-        height, width = tensors["photograph"].shape[1:]
-        has_size = min(height, width) >= 1 and max(height, width) <= LONGEST
-        check(has_size, "photograph", f"1 to {LONGEST} px", max(height, width))
-    closer = record["closer"]
-    boxes = len(tensors.get("closer_boxes", ()))
+        sides = tensors["photograph"].shape[1:]
+        has_size = min(sides) >= 1 and max(sides) <= LONGEST
+        check(has_size, "photograph", f"1 to {LONGEST} px", max(sides))
+    closer_boxes = len(tensors.get("closer_boxes", ()))
+    _check_closer(record["closer"], closer_boxes, len(lengths), classes)
+
+
+def _check_closer(closer: Sequence[Mapping[str, Any]], boxes: int, looks: int, classes: int) -> None:
+    """Raise `InputError` unless each closer look has a box, and is of a look and of a class of the record."""
     check(boxes == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", boxes)
-    expected = f"a look below {len(lengths)} and the index of a class"
+    expected = f"a look below {looks} and the index of a class"
     for values in closer:
         look = max(values["fixation"] or 0, values["number"] or 0)
-        check(look < len(lengths) and _is_class(values["target"], classes), "closer", expected, values)
+        check(look < looks and _is_class(values["target"], classes), "closer", expected, values)
 
 
 def _is_class(label: int, classes: int) -> bool:

@@ -68,10 +68,10 @@ class FoveaLooks:
         """
         x, y = point
         width, height = (int(side) for side in self.grid.extent)
-        whole = (0.0, 0.0, float(width), float(height))
+        whole_picture = (0.0, 0.0, float(width), float(height))
         self._probability = probability
         self._presence = presence
-        return self._add((x, y), whole, detections, stages, value, cell, is_closer=False)
+        return self._add((x, y), whole_picture, detections, stages, value, cell, is_closer=False)
 
     def look_closely(
         self, cell: int, region: Sequence[float], detections: Detections, stages: Mapping[str, float], value: float

@@ -17,7 +17,7 @@ from semfov.data.classes import class_index
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import NO_TRACK, SCORE_THRESHOLD, Objects
-from semfov.errors import check, check_whole
+from semfov.errors import InputError, check, check_whole
 from semfov.kinds import LookKind
 from semfov.observation.matching import box_iou
 from semfov.paths.files import Ending
@@ -156,11 +156,9 @@ class Outcome(ABC):
         """
         check_share(prior)
         decision = self.decision
-        known = decision is not None and self.assumed is not None
-        expected = "a search by models with the shares of their fit"
-        check(known, "record", expected, "one whose assumed share is not known")
-        assert decision is not None
-        assert self.assumed is not None
+        if decision is None or self.assumed is None:
+            expected = "a search by models with the shares of their fit"
+            raise InputError(f"record: expected {expected}, got one whose assumed share is not known")
         return Prior(prior, self.assumed)(decision.probability)
 
     @property

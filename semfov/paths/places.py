@@ -65,10 +65,10 @@ def are_apart(place: Place, others: list[Place], size: tuple[int, int], *, aroun
     """Tell whether a place is as far from all others as two places of one density are."""
     least = 2 * REACH * max(size)
     for other in others:
-        across = abs(place["x"] - other["x"])
+        distance_x = abs(place["x"] - other["x"])
         if around:
-            across = min(across, size[0] - across)
-        down = place["y"] - other["y"]
-        if across**2 + down**2 <= least**2:
+            distance_x = min(distance_x, size[0] - distance_x)
+        distance_y = place["y"] - other["y"]
+        if distance_x**2 + distance_y**2 <= least**2:
             return False
     return True

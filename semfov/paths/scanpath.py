@@ -144,18 +144,21 @@ class ScanpathWords(Words):
     def describe(self) -> str:
         """Describe the outcome of the episode in one line."""
         record = self.record
-        looks = f"{record.shifts} gaze shift{'s' if record.shifts != 1 else ''}"
+        shifts = f"{record.shifts} gaze shift{'s' if record.shifts != 1 else ''}"
         if record.target is None:
-            return f"explored with {looks}: {self.objects}"
+            return f"explored with {shifts}: {self.objects}"
         name = f"“{record.target_name}”"
         if record.decision is None:
-            return f"{name} {'found after' if record.found else 'not found in'} {looks}"
-        closer = len(record.closer)
-        if closer:
-            looks += f" and {closer} closer look{'s' if closer != 1 else ''}"
+            return f"{name} {'found after' if record.found else 'not found in'} {shifts}"
         is_absent = record.decision.outcome == "absent"
         verdict = f"{name} {self.doubt}not there" if is_absent else self.verdict(name)
-        return f"{verdict} after {looks} ({self._certainty(record.decision)})"
+        return f"{verdict} after {shifts}{self._closer_looks} ({self._certainty(record.decision)})"
+
+    @property
+    def _closer_looks(self) -> str:
+        """The number of closer looks, to follow that of gaze shifts; empty without any."""
+        count = len(self.record.closer)
+        return f" and {count} closer look{'s' if count != 1 else ''}" if count else ""
 
     def _certainty(self, decision: Decision) -> str:
         """Say how sure the decision is."""

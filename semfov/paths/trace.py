@@ -12,6 +12,7 @@ from semfov.belief.observers.base import Observer
 from semfov.detection.detections import Detections
 from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode import Step
+from semfov.paths.conversion import Values
 from semfov.paths.fovea import FoveaLook, FoveaLooks
 from semfov.paths.scanpath import Scanpath
 
@@ -50,18 +51,19 @@ class Trace:
         self.target = target
         self.beside = beside
         self.score_threshold = score_threshold
-        self._made = FoveaLooks(grid)
+        self._fovea = FoveaLooks(grid)
         self._fixated: list[_Fixated] = []
         self._posterior: list[Tensor] = []  # of the target in each cell, after each fixation
         self._presence: list[Tensor] = []
         self._maps: list[Tensor] = []  # of all classes, made when they are read for the first time
         self._belief: Belief | None = None  # the belief of the last map, where one is kept beside the search
+        # Maps are made as if they had been made at once: with gradients and inference mode as they were then.
         self._modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     @property
     def looks(self) -> tuple[FoveaLook, ...]:
         """The looks so far."""
-        return tuple(self._made.looks)
+        return tuple(self._fovea.looks)
 
     def add(self, step: Step) -> FoveaLook:
         """Add the fixation of a step."""
@@ -98,42 +100,51 @@ class Trace:
             self._presence.append(belief.presence(self.target)[0])
             presence = float(self._presence[-1])
         self._fixated.append(_Fixated(cell, fixation, detections, belief, values))
-        return self._made.fixate(number, fixation[0].tolist(), detections, stages, value, probability, presence)
+        return self._fovea.fixate(number, fixation[0].tolist(), detections, stages, value, probability, presence)
 
     def look_closely(
         self, cell: int, region: Sequence[float], detections: Detections, stages: Mapping[str, float], value: float
     ) -> FoveaLook:
         """Add a closer look (`FoveaLooks.look_closely`)."""
-        return self._made.look_closely(cell, region, detections, stages, value)
+        return self._fovea.look_closely(cell, region, detections, stages, value)
 
     def scanpath(self, **outcome: Any) -> Scanpath:
-        """Make the scanpath of the looks so far. Its map of all classes is made when it is read."""
+        """Make the scanpath of the looks so far. Its map of all classes is made when it is read.
+
+        Args:
+            outcome: further attributes of the scanpath: decision, ending, photograph, …
+        """
         count = len(self._fixated)
-        like = torch.zeros(0, len(self.grid))
-        fields = {
+        no_cells = torch.zeros(0, len(self.grid))
+        fields: Values = {
             "grid": self.grid,
             "classes": self.classes,
             "target": self.target,
             "score_threshold": self.score_threshold,
             "looks": self.looks,
             "probabilities": partial(self._probabilities, count),
-            "values": torch.stack([kept.values[0] for kept in self._fixated]) if count else like,
+            "values": torch.stack([fixated.values[0] for fixated in self._fixated]) if count else no_cells,
             "found": False,
         }
         if self.target is not None:
-            fields["posterior"] = torch.stack(self._posterior) if count else like
+            fields["posterior"] = torch.stack(self._posterior) if count else no_cells
             fields["presence"] = torch.stack(self._presence) if count else torch.zeros(0)
         return Scanpath(**{**fields, **outcome})
 
     def _probabilities(self, count: int) -> Tensor:
         """Make the map of all classes after each of the first fixations, `(count, X·Y, K+1)`."""
-        gradients, inference = self._modes
-        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
-            for kept in self._fixated[len(self._maps) : count]:
-                if self.beside is not None:
-                    before = self._belief or self.beside.start(1, self.grid, kept.values)
-                    self._belief = self.beside(before, kept.detections, kept.fixation, self.grid)
-                self._maps.append((self._belief or kept.belief).class_probabilities()[0])
+        has_gradients, is_inference = self._modes
+        with torch.inference_mode(is_inference), torch.set_grad_enabled(has_gradients):
+            for fixated in self._fixated[len(self._maps) : count]:
+                self._maps.append(self._belief_about_all(fixated).class_probabilities()[0])
             if not count:
                 return torch.zeros(0, len(self.grid), len(self.classes))
             return torch.stack(self._maps[:count])
+
+    def _belief_about_all(self, fixated: _Fixated) -> Belief:
+        """Take the next fixation into the belief about all classes, which may be that of the episode."""
+        if self.beside is None:
+            return fixated.belief
+        before = self.beside.start(1, self.grid, fixated.values) if self._belief is None else self._belief
+        self._belief = self.beside(before, fixated.detections, fixated.fixation, self.grid)
+        return self._belief

@@ -33,41 +33,43 @@ def blank_cells(picture: LargePicture, lattice: Lattice) -> Tensor | None:
     pixels = picture.read((0, 0, width, height), coarse).numpy()
     pixel_rows, pixel_columns = pixels.shape[1:]
     cell_width, cell_height = lattice.pitch
-    down = _cell_pixels(lattice.rows, cell_height * (pixel_rows / height), pixel_rows)
-    across = _cell_pixels(lattice.columns, cell_width * (pixel_columns / width), pixel_columns)
+    cell_rows = _cell_pixels(lattice.rows, cell_height * (pixel_rows / height), pixel_rows)
+    cell_columns = _cell_pixels(lattice.columns, cell_width * (pixel_columns / width), pixel_columns)
     blank = np.zeros((lattice.rows, lattice.columns), bool)
     for colour in colours:
-        blank |= _border_of_colour(pixels, colour, down, across)
+        blank |= _border_of_colour(pixels, colour, cell_rows, cell_columns)
     if picture.nothing is not None:
-        blank |= _of_colour(pixels, picture.nothing, down, across)
+        blank |= _of_colour(pixels, picture.nothing, cell_rows, cell_columns)
     return torch.from_numpy(blank) if blank.any() else None
 
 
 def _corner_colours(picture: LargePicture, size: tuple[int, int]) -> set[_Colour]:
     """Find the colours of the corners that have one colour alone."""
     width, height = size
-    across = min(_CORNER, width)
-    down = min(_CORNER, height)
+    corner_width = min(_CORNER, width)
+    corner_height = min(_CORNER, height)
     colours = set()
-    for y in (0, height - down):
-        for x in (0, width - across):
-            corner = picture.pixels((x, y, x + across, y + down))
+    for y in (0, height - corner_height):
+        for x in (0, width - corner_width):
+            corner = picture.pixels((x, y, x + corner_width, y + corner_height))
             if (corner == corner[0, 0]).all():
                 colours.add(tuple(corner[0, 0].tolist()))
     return colours
 
 
-def _border_of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across: _Spans) -> NDArray[np.bool_]:
-    """Find cells of a colour that reach the border over cells of it; `down` and `across` are the pixels of cells."""
+def _border_of_colour(
+    pixels: NDArray[np.uint8], colour: _Colour, cell_rows: _Spans, cell_columns: _Spans
+) -> NDArray[np.bool_]:
+    """Find cells of a colour that reach the border over cells of it; arguments and result as for `_of_colour`."""
     # A pixel of each cell first: most cells have another colour, and the others are few strips.
-    first_rows = [first for first, _ in down]
-    first_columns = [first for first, _ in across]
+    first_rows = [first for first, _ in cell_rows]
+    first_columns = [first for first, _ in cell_columns]
     sample = pixels[:, first_rows][:, :, first_columns]
-    has_colour = _of_colour(sample, colour, _single_pixels(len(down)), _single_pixels(len(across)))
+    has_colour = _of_colour(sample, colour, _single_pixels(len(cell_rows)), _single_pixels(len(cell_columns)))
     candidates = _reaching_border(has_colour)
     for x1, x2 in _runs(candidates.any(0)):
         for y1, y2 in _runs(candidates[:, x1:x2].any(1)):
-            candidates[y1:y2, x1:x2] &= _of_colour(pixels, colour, down[y1:y2], across[x1:x2])
+            candidates[y1:y2, x1:x2] &= _of_colour(pixels, colour, cell_rows[y1:y2], cell_columns[x1:x2])
     return _reaching_border(candidates)
 
 
@@ -76,22 +78,24 @@ def _single_pixels(count: int) -> _Spans:
     return [(pixel, pixel + 1) for pixel in range(count)]
 
 
-def _of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across: _Spans) -> NDArray[np.bool_]:
+def _of_colour(
+    pixels: NDArray[np.uint8], colour: _Colour, cell_rows: _Spans, cell_columns: _Spans
+) -> NDArray[np.bool_]:
     """Find cells all of whose pixels have a colour, up to rounding.
 
     Args:
         pixels: `(3, h, w)`.
         colour: red, green and blue.
-        down: first and end of the rows of pixels of each row of cells.
-        across: the same of columns.
+        cell_rows: first and end of the rows of pixels of each row of cells.
+        cell_columns: the same of columns.
 
     Returns:
         `(rows, columns)` of the cells.
     """
-    top = down[0][0]
-    bottom = down[-1][1]
-    left = across[0][0]
-    right = across[-1][1]
+    top = cell_rows[0][0]
+    bottom = cell_rows[-1][1]
+    left = cell_columns[0][0]
+    right = cell_columns[-1][1]
     width = right - left
     channels_last = pixels[:, top:bottom, left:right].transpose(1, 2, 0)
     values = channels_last.reshape(bottom - top, -1)  # three in a row for each pixel
@@ -100,9 +104,9 @@ def _of_colour(pixels: NDArray[np.uint8], colour: _Colour, down: _Spans, across:
     # One comparison for both limits: bytes below the lowest wrap round to large ones.
     differs = values - np.tile(lowest, width) > np.tile(highest - lowest, width)
     # Over the rows of a cell first: they are adjacent in memory, and leave little for the other steps.
-    rows_differ = np.stack([differs[first - top : end - top].any(0) for first, end in down])
-    pixels_differ = np.logical_or.reduce(rows_differ.reshape(len(down), width, -1), -1)
-    cells_differ = np.stack([pixels_differ[:, first - left : end - left].any(1) for first, end in across], 1)
+    rows_differ = np.stack([differs[first - top : end - top].any(0) for first, end in cell_rows])
+    pixels_differ = np.logical_or.reduce(rows_differ.reshape(len(cell_rows), width, -1), -1)
+    cells_differ = np.stack([pixels_differ[:, first - left : end - left].any(1) for first, end in cell_columns], 1)
     return ~cells_differ
 
 

@@ -82,9 +82,9 @@ def share_shown(window: Window, lattice: Lattice) -> float:
     """
     x1, y1, x2, y2 = window.region(lattice)
     width, height = lattice.size
-    across = max(min(x2, width) - max(x1, 0.0), 0.0)
-    down = max(min(y2, height) - max(y1, 0.0), 0.0)
-    return across * down / (width * height)
+    width_shown = max(min(x2, width) - max(x1, 0.0), 0.0)
+    height_shown = max(min(y2, height) - max(y1, 0.0), 0.0)
+    return width_shown * height_shown / (width * height)
 
 
 def _window_at(window: Window, region: Sequence[float], scale: float, lattice: Lattice) -> Window:

@@ -107,14 +107,14 @@ class SearchFacts:
         visible = self.belief.visible.sum().clamp(1)
         unexplored = float(self.belief.unexplored.sum() / visible)
         detected = sum(score >= DETECTION_SCORE for score in scores_of_looks)
-        # Logarithms and their divisors bring numbers of objects and of looks to the range of the others.
-        others = [
+        # Logarithms and their divisors bring numbers of objects and of looks to the range of the other_facts.
+        other_facts = [
             math.log(self._expected_finds() + 1e-3) / 4,
             unexplored,
             math.log1p(detected) / 2,
             math.log(len(scores_of_looks)) / 2,
         ]
-        return torch.cat([features(scores), torch.tensor(others)])
+        return torch.cat([features(scores), torch.tensor(other_facts)])
 
     def _expected_finds(self) -> float:
         """Estimate how many new objects of the target looks of the last level, side by side, would find."""

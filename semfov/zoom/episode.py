@@ -178,22 +178,26 @@ class _Recent(Generic[_Belief]):
 
     def _forget(self, span: float) -> None:
         """Forget looks that the newest one replaces, and those older than a span in seconds."""
-        first = self.kept[0]
         newest = self.kept[-1]
-        if newest is not first and newest.original.window == first.original.window:
+        if self._is_new_overview(newest):
             self.kept = [newest, *self.kept[1:-1]]
-            first = newest
+        overview = self.kept[0]
         # An old overview is kept until there is a new one, as all other looks are predicted from it.
-        kept = []
+        counting = []
         for look in self.kept:
             is_recent = newest.time - look.time <= span
             is_replaced = look.current.window == newest.current.window
-            if look in (first, newest) or (is_recent and not is_replaced):
-                kept.append(look)
-        self.kept = kept
+            if look in (overview, newest) or (is_recent and not is_replaced):
+                counting.append(look)
+        self.kept = counting
         at_next_frame = newest.time + self.source.passed
-        is_old = at_next_frame - first.time > span
-        self.lacks_overview = is_old or share_shown(first.current.window, self.source.lattice) < _LEAST_SHOWN
+        is_old = at_next_frame - overview.time > span
+        self.lacks_overview = is_old or share_shown(overview.current.window, self.source.lattice) < _LEAST_SHOWN
+
+    def _is_new_overview(self, newest: KeptLook) -> bool:
+        """Tell whether the newest look was taken at the window of the overview again."""
+        overview = self.kept[0]
+        return newest is not overview and newest.original.window == overview.original.window
 
 
 def look_by_look(

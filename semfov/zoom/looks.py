@@ -81,11 +81,16 @@ class Window:
         x, y, magnification = self.fixation
         width, height = lattice.size
         # Half of the window, about its centre in edges of pixels.
-        across = lattice.canvas[0] / magnification / 2
-        down = lattice.canvas[1] / magnification / 2
+        half_width = lattice.canvas[0] / magnification / 2
+        half_height = lattice.canvas[1] / magnification / 2
         x += 0.5
         y += 0.5
-        return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
+        return (
+            max(x - half_width, 0.0),
+            max(y - half_height, 0.0),
+            min(x + half_width, float(width)),
+            min(y + half_height, float(height)),
+        )
 
     def centre(self, lattice: Lattice) -> tuple[float, float]:
         """Centre `(x, y)` in pixels of the part of the picture that it shows, which may end before the window does."""
@@ -130,9 +135,9 @@ def half_steps(lattice: Lattice) -> Iterator[Window]:
     """Yield the windows of all levels that are half a window apart, and those at the right and lower borders."""
     for level in range(lattice.levels):
         half = max(1, lattice.span(level) // 2)
-        across, down = lattice.places(level)
-        for row in sorted({*range(0, down, half), down - 1}):
-            for column in sorted({*range(0, across, half), across - 1}):
+        columns, rows = lattice.places(level)
+        for row in sorted({*range(0, rows, half), rows - 1}):
+            for column in sorted({*range(0, columns, half), columns - 1}):
                 yield Window.on(lattice, (level, column, row))
 
 
@@ -191,24 +196,36 @@ class LiveWindowLooks(WindowLooks):
         self._prepared[window] = self.eye.resample(self.view, fixation, [window.within])
 
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[WindowLook]:
-        hints = hints or any(window.points_closer(self.lattice) for window in windows)
         resampled = self._prepared.get(windows[0]) if len(windows) == 1 else None
         self._prepared.clear()
+        # Work beside a look is asked for before each look.
         meanwhile = self.meanwhile
         self.meanwhile = None
-        fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
-        within = [window.within for window in windows]
-        looks = self.eye.detect(self.view, fixations, within, hints=hints, resampled=resampled, meanwhile=meanwhile)
-        return [_look_at(looks, n, window, self.lattice) for n, window in enumerate(windows)]
+        detected = self.eye.detect(
+            self.view,
+            torch.tensor([window.fixation for window in windows], dtype=torch.float64),
+            [window.within for window in windows],
+            hints=hints or any(window.points_closer(self.lattice) for window in windows),
+            resampled=resampled,
+            meanwhile=meanwhile,
+        )
+        return [_look_at(detected, number, window, self.lattice) for number, window in enumerate(windows)]
 
 
-def _look_at(looks: WindowDetections, number: int, window: Window, lattice: Lattice) -> WindowLook:
-    """Take one of several looks: a batch of one, without padding."""
-    detections = looks.detections
+def _look_at(detected: WindowDetections, number: int, window: Window, lattice: Lattice) -> WindowLook:
+    """Make one of several looks: a batch of one, without padding.
+
+    Args:
+        detected: what all looks show.
+        number: of the look.
+        window: where it looked.
+        lattice: lattice of the picture.
+    """
+    detections = detected.detections
     if len(detections.mask) > 1:
         count = int(detections.mask[number].sum())
         detections = detections[number : number + 1].take(slice(count))
-    hints = None if looks.hints is None else looks.hints[number]
+    hints = None if detected.hints is None else detected.hints[number]
     gist = None
     if hints is None:
         scores = detections.scores[0, :, 1:]
@@ -218,12 +235,12 @@ def _look_at(looks: WindowDetections, number: int, window: Window, lattice: Latt
     else:
         scores = hints.scores
     is_photograph = lattice.levels == 1
-    best_scores = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
+    highest_scores = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
     return WindowLook(
         window,
         detections,
-        cut=looks.cut[number, : detections.mask.shape[1]],
-        show=best_scores,
+        cut=detected.cut[number, : detections.mask.shape[1]],
+        show=highest_scores,
         gist=gist,
         hints=hints if is_photograph and gist is None else None,
     )

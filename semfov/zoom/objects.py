@@ -187,24 +187,32 @@ def _joined(batches: Sequence[Detections]) -> Detections:
 def detected_boxes(looks: Sequence[WindowLook], target: int | Sequence[int] | None, *, shares: bool) -> DetectedBoxes:
     """Collect the boxes of all detections, each with its best class of the targets.
 
-    Scores are those of the vectors, on which a certainty is fitted (`shares`), or the detector's own.
+    Args:
+        looks: looks at one picture.
+        target: class 1..K, or several, as for `merge`.
+        shares: whether scores are those of the vectors, on which a certainty is fitted, or the detector's own.
     """
     batches = [look.detections for look in looks]
     detections = _joined(batches)
     class_scores = detections.scores[0, :, 1:] if shares else detections.class_scores[0]
-    all_classes = range(1, class_scores.shape[-1] + 1)
-    classes = [target] if isinstance(target, int) else list(target or all_classes)
-    columns = [label - 1 for label in classes]
-    scores_without_padding = class_scores * detections.mask[0, :, None]
-    scores, best = scores_without_padding[:, columns].max(-1)
+    class_scores = class_scores * detections.mask[0, :, None]  # 0 for padding
+    labels = _labels_of(target, class_scores.shape[-1])
+    scores, best = class_scores[:, labels - 1].max(-1)
     counts = torch.tensor([batch.mask.shape[1] for batch in batches])
-    number = torch.arange(len(looks)).repeat_interleave(counts)
+    look_of_box = torch.arange(len(looks)).repeat_interleave(counts)
     magnifications = torch.tensor([look.window.fixation[2] for look in looks]).to(scores)
     return DetectedBoxes(
         boxes=detections.boxes[0],
         scores=scores,
-        labels=torch.tensor(classes)[best],
-        looks=number,
+        labels=labels[best],
+        looks=look_of_box,
         cut=torch.cat([look.cut for look in looks]),
-        magnifications=magnifications[number],
+        magnifications=magnifications[look_of_box],
     )
+
+
+def _labels_of(target: int | Sequence[int] | None, classes: int) -> Tensor:
+    """List the classes from 1 that a target names, `(T,)`; all of them for none."""
+    if isinstance(target, int):
+        return torch.tensor([target])
+    return torch.tensor([*target]) if target else torch.arange(1, classes + 1)
