@@ -12,6 +12,7 @@ from eval.stream.identity import IdentityCounts
 from eval.stream.run import FILM, StreamConfig, StreamOutcome, StreamRun
 from eval.stream.ways import CANDIDATES
 from eval.zoom.objects import average_precision
+from semfov.agents.window_episode import LIKELY, LISTED
 from semfov.errors import check_data
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import plus_minus, table
@@ -66,7 +67,8 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         "",
         *table(precisions),
         "",
-        "Precision / recall of the objects that are listed, from 0.5 on.",
+        f"Precision / recall of the objects that are listed: of the agent from probability {LISTED} on, of others from "
+        f"score {LIKELY}.",
         "",
         *table(listed),
         "",

@@ -51,6 +51,7 @@ from semfov.zoom.window_sums import Cells
 
 PASSES = 24  # default for the largest number of passes of the detector
 LIKELY = 0.5  # default for the least probability of the objects that a record counts
+LISTED = 0.35  # the same in a stream: half of the best F1 of flights, where a list reaches it (Lipton et al., 2014)
 NEW_OBJECTS = 0.01  # default for the least number of new objects that a look must be expected to find
 
 
@@ -277,8 +278,11 @@ class WindowSession:
     @property
     def _score_threshold(self) -> float:
         """Probability, or score, from which on objects count."""
-        usual = SCORE_THRESHOLD if self._certainty is None else LIKELY
-        return usual if self.task.score_threshold is None else self.task.score_threshold
+        if self.task.score_threshold is not None:
+            return self.task.score_threshold
+        if self._certainty is None:
+            return SCORE_THRESHOLD
+        return LIKELY if self.tracker is None else LISTED
 
     def _merged(self, looks: Sequence[LookAtWindow]) -> MergedLooks:
         """Make what merges the objects of looks when they are asked for; what changes is computed now."""
