@@ -291,7 +291,7 @@ class HeadPath(Record):
         Returns:
             `(3,)`, pan to the right, tilt up, and field of view, in degrees.
         """
-        return self.views.poses[self.looks[look].action // self.views.cells]
+        return self.views.poses[self.looks[self._place(look, "look")].action // self.views.cells]
 
     def gaze(self, look: int) -> Tensor:
         """Point of the scene that the eye fixated in a look.
@@ -302,7 +302,7 @@ class HeadPath(Record):
         Returns:
             `(D,)`, a unit direction in a panorama, or pixels of a flat scene.
         """
-        return self.views.gaze[self.looks[look].action]
+        return self.views.gaze[self.looks[self._place(look, "look")].action]
 
     def direction(self, look: int) -> tuple[float, float]:
         """Direction in which the eye looked, as a head would turn to it.
@@ -326,7 +326,7 @@ class HeadPath(Record):
         Returns:
             The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
         """
-        detections = self.looks[look].in_view
+        detections = self.looks[self._place(look, "look")].in_view
         confidence = detections.confidence[0]
         labels = detections.labels[0]
         chosen = detections.mask[0] & (confidence >= score)

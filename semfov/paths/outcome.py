@@ -114,10 +114,10 @@ class Outcome(ABC):
         check(not isinstance(index, str), "record", "the place of a look, from 0", f"{index!r}{remedy}")
         return self.looks[index]
 
-    def _place(self, number: int) -> int:
+    def _place(self, number: int, argument: str = "number") -> int:
         """Count a look from the start; refuse one that the record has not."""
         count = len(self)
-        check_whole(number, "number", -count, count - 1)
+        check_whole(number, argument, -count, count - 1)
         return number % count
 
     @property

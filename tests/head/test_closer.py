@@ -5,6 +5,7 @@ import torch
 
 from semfov import Detections, Eye, Flat, Foveation, HeadAgent, Panorama
 from semfov.belief.observers import SemanticMap, Target
+from semfov.errors import InputError
 from semfov.head import ExploreGain, PanTiltCamera, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.closer import CloserLooks
@@ -211,6 +212,9 @@ def test_a_small_object_is_looked_at_closely_and_the_record_is_stored(agent, spe
     for look in range(len(path)):
         assert torch.equal(loaded.pose(look), path.pose(look))
         assert torch.equal(loaded.gaze(look), path.gaze(look))
+    for method in (path.pose, path.gaze, path.direction, path.places):
+        with pytest.raises(InputError, match=r"look: expected .*, got 9"):
+            method(9)
     assert torch.equal(loaded.objects.boxes, path.objects.boxes)
     assert len(path.objects) == 1  # the closer look shows the object that the first one did
 
