@@ -187,7 +187,7 @@ class Motion:
 
 def _values(tensor: Tensor) -> NDArray[np.float64]:
     """View numbers as an array: maps are so few numbers that PyTorch spends four times as long in calls."""
-    return np.asarray(tensor.detach().double().numpy())
+    return np.asarray(tensor.detach().cpu().double().numpy())
 
 
 def _local_scales(matrices: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
