@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(
-    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], similarity: NDArray[np.float64] | None = None
+    cv2: ModuleType, first: NDArray[np.uint8], second: NDArray[np.uint8], similarity: NDArray[np.float64] | None = None
 ) -> Agreement:
     """Compare a frame, moved, with another one.
 
@@ -71,7 +72,7 @@ def agreement(
 
 
 def blocks_of_rival(
-    cv2: Any,
+    cv2: ModuleType,
     first: NDArray[np.uint8],
     second: NDArray[np.uint8],
     similarity: NDArray[np.float64],
@@ -94,7 +95,7 @@ def blocks_of_rival(
     return int((is_compared & (correlation < _ALIKE) & is_compared_too & (otherwise >= _ALIKE)).sum())
 
 
-def largest_change(cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
+def largest_change(cv2: ModuleType, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
     """Find the largest mean difference of a block of two frames of one size, in grey values."""
     blocks = _Blocks.of(*first.shape)
     (sums,) = blocks.sums(cv2.integral(cv2.absdiff(first, second)))
@@ -148,7 +149,7 @@ class _Blocks:
         rows = np.repeat(chosen, np.diff(self.down), axis=0)
         return np.repeat(rows, np.diff(self.across), axis=1).astype(np.uint8) * 255
 
-    def shown_by(self, cv2: Any, similarity: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def shown_by(self, cv2: ModuleType, similarity: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which of them another frame of this size shows as a whole, if a similarity `(2, 3)` moves it here."""
         back = cv2.invertAffineTransform(similarity)
         # A block is convex, so its corner pixels tell. They are taken from the nearest pixel of the other frame.
@@ -158,7 +159,7 @@ class _Blocks:
 
 
 def _compared(
-    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], similarity: NDArray[np.float64] | None
+    cv2: ModuleType, first: NDArray[np.uint8], second: NDArray[np.uint8], similarity: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Tell which blocks of a frame, moved, can be compared with another one, and their correlations."""
     height, width = second.shape
@@ -173,7 +174,7 @@ def _compared(
 
 
 def _correlations(
-    cv2: Any, first: NDArray[np.uint8], second: NDArray[np.uint8], blocks: _Blocks
+    cv2: ModuleType, first: NDArray[np.uint8], second: NDArray[np.uint8], blocks: _Blocks
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Compute Pearson's correlation of each block of two frames.
 

@@ -10,7 +10,8 @@ Where only the last frame fits, that one becomes the key frame, and `_anchor` is
 the scene has been exchanged little by little. Invariant: the key frame is not before the anchor.
 """
 
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -169,7 +170,7 @@ class CameraMotion:
     def __init__(self, patience: int = 12) -> None:
         with needing("OpenCV", "motion of the camera", "opencv-python-headless"):
             import cv2
-        self._cv2: Any = cv2
+        self._cv2: ModuleType = cv2
         self.patience = patience
         self._key: GreyFrame | None = None  # None before the first frame
         self._key_to_last = _STILL  # `(3, 3)`, motion from the key frame to the last frame, in reduced pixels

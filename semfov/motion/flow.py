@@ -1,6 +1,6 @@
 """How corners of one frame moved to another, and the similarities that describe it."""
 
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ _MOST_TURN = 25.0  # largest turn between two frames, in degrees
 
 
 def flow_between(
-    cv2: Any, first: GreyFrame, second: GreyFrame, guess: NDArray[np.float64]
+    cv2: ModuleType, first: GreyFrame, second: GreyFrame, guess: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
     """Follow the corners of a frame into another one, and fit a similarity to them by RANSAC.
 
@@ -52,7 +52,7 @@ def flow_between(
     return None
 
 
-def corners_stay(cv2: Any, first: GreyFrame, second: GreyFrame, most: float) -> bool:
+def corners_stay(cv2: ModuleType, first: GreyFrame, second: GreyFrame, most: float) -> bool:
     """Tell whether nearly all corners of a frame are still there in another one, in a quarter of the flow's time.
 
     Args:
@@ -72,7 +72,7 @@ def corners_stay(cv2: Any, first: GreyFrame, second: GreyFrame, most: float) -> 
 
 
 def rival_between(
-    cv2: Any, first: GreyFrame, second: GreyFrame, similarity: NDArray[np.float64], part: NDArray[np.uint8]
+    cv2: ModuleType, first: GreyFrame, second: GreyFrame, similarity: NDArray[np.float64], part: NDArray[np.uint8]
 ) -> NDArray[np.float64] | None:
     """Find the motion that corners have in common in a part of a frame that does not move as the rest does.
 
@@ -100,7 +100,7 @@ def rival_between(
 
 
 def _followed(
-    cv2: Any,
+    cv2: ModuleType,
     corners: NDArray[np.float32],
     first: GreyFrame,
     second: GreyFrame,
@@ -123,7 +123,7 @@ def _followed(
 
 
 def _fit(
-    cv2: Any, before: NDArray[np.float32], after: NDArray[np.float32]
+    cv2: ModuleType, before: NDArray[np.float32], after: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Fit a similarity `(3, 3)` to corners `(n, 1, 2)`; returns it, and which of them agree with it."""
     similarity, agree = cv2.estimateAffinePartial2D(before, after, ransacReprojThreshold=_RESIDUAL)

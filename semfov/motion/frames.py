@@ -2,7 +2,7 @@
 
 import math
 from functools import cached_property
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ class GreyFrame:
         ratio: `(x, y)`, pixels of the frame for one of the reduced one.
     """
 
-    def __init__(self, cv2: Any, frame: NDArray[np.uint8]) -> None:
+    def __init__(self, cv2: ModuleType, frame: NDArray[np.uint8]) -> None:
         self._cv2 = cv2
         height, width = frame.shape[:2]
         # Means of whole pixels take a fifth of the time of others; a rest at the right and below is left out.

@@ -4,6 +4,7 @@ Edges of blocks of a broken film, and combs of two half frames, stay where they 
 behind them moves. A lorry before a scene has more corners than what is left of the scene beside it.
 """
 
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ _OFF = 0.8  # reduced pixels from which on a block is off
 _EXPLAINED = 0.6  # least share of the squared differences of a block that its shift explains
 
 
-def coarse_shift(cv2: Any, first: GreyFrame, second: GreyFrame, similarity: NDArray[np.float64]) -> float:
+def coarse_shift(cv2: ModuleType, first: GreyFrame, second: GreyFrame, similarity: NDArray[np.float64]) -> float:
     r"""Estimate how far the coarse picture is off after a motion, in the quarter of the frame where that is least.
 
     Things that move on their own spoil some quarters, a wrong motion all of them.
@@ -47,7 +48,7 @@ def coarse_shift(cv2: Any, first: GreyFrame, second: GreyFrame, similarity: NDAr
     return float(np.min(parts.shift[tells], initial=np.inf))
 
 
-def share_off(cv2: Any, first: GreyFrame, second: GreyFrame, similarity: NDArray[np.float64]) -> float:
+def share_off(cv2: ModuleType, first: GreyFrame, second: GreyFrame, similarity: NDArray[np.float64]) -> float:
     """Compute the share of the blocks of a frame that are off by a pixel or so after a motion, each as a whole.
 
     Args:
@@ -92,7 +93,7 @@ class _Parts(NamedTuple):
     @classmethod
     def of(
         cls,
-        cv2: Any,
+        cv2: ModuleType,
         first: GreyFrame,
         second: GreyFrame,
         similarity: NDArray[np.float64],
@@ -120,7 +121,7 @@ class _Parts(NamedTuple):
         return cls(ratio * np.hypot(right, below), explained, slope, seen, pixels)
 
 
-def _flattened(cv2: Any, grey: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
+def _flattened(cv2: ModuleType, grey: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
     """Reduce a frame to a size `(width, height)`, without the mean of the surroundings of each pixel."""
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(small - cv2.blur(small, (_AROUND, _AROUND)), (0, 0), 1.0), np.float32)
