@@ -226,42 +226,72 @@ class CameraMotion:
             return Motion.still()
         self._stands_still = False
         key, fit = self._fit_to_key_or_last(key, last, present)
-        # Stripes have no corners, or any motion along them fits. The key frame tells, so that a slow drift is seen.
-        is_doubted = fit is None or fit.is_repeated
-        least = _CLEAR if fit is None else max(_CLEAR, fit.median - _AS_GOOD)
-        if is_doubted and unmoved is not None and self._is_unchanged(unmoved, present, least):
+        if unmoved is not None and self._shows_no_drift(unmoved, present, fit):
             return Motion.still()
         if fit is None:
             self._begin_at(present)
             return Motion.still() if self._is_same(last, present) else None
-        last_to_present = fit.similarity @ np.linalg.inv(self._key_to_last)
-        rival = None if fit.rival is None else fit.rival @ np.linalg.inv(self._key_to_last)
-        shift = _largest_shift(last_to_present, present.grey.shape) * max(present.ratio)
-        is_certain = self._is_certain(_Fit(last_to_present, rival, fit.median), self._course) and (
-            self._goes_on(last_to_present) or not self._is_divided(key, present, fit.similarity)
-        )
-        is_still = shift < _STILL_SHIFT
-        # Edges of the blocks of a broken film stay, too, but the blocks change.
-        if not is_certain or (
-            fit.is_repeated and not (is_still and largest_change(self._cv2, last.grey, present.grey) < _SAME)
-        ):
+        to_last = np.linalg.inv(self._key_to_last)
+        rival = None if fit.rival is None else fit.rival @ to_last
+        since_last = _Fit(fit.similarity @ to_last, rival, fit.median)
+        is_still = _largest_shift(since_last.similarity, present.grey.shape) * max(present.ratio) < _STILL_SHIFT
+        is_believed = self._is_believed(since_last, key, present, fit.similarity)
+        if fit.is_repeated:
+            # Edges of the blocks of a broken film stay, too, but the blocks change.
+            is_believed = is_believed and is_still and largest_change(self._cv2, last.grey, present.grey) < _SAME
+        if not is_believed:
             self._begin_at(present)
             if self._course is None:
-                self._course = last_to_present
+                self._course = since_last.similarity
             return None
-        self._course = last_to_present
+        self._course = since_last.similarity
         if is_still:
             self._key = key
             self._stands_still = True
             return Motion.still()
-        # As with the motion of the key frame, that of a camera that stands is left out: its noise would add up.
+        self._move_on(key, fit.similarity, since_last.similarity, present)
+        return _at_full_size(since_last.similarity, present.ratio)
+
+    def _shows_no_drift(self, unmoved: GreyFrame, present: GreyFrame, fit: _Fit | None) -> bool:
+        """Tell whether the camera stands before a scene in which no motion can be fitted, or several fit.
+
+        Stripes have no corners, or any motion along them fits. The key frame tells, so that a slow drift is seen.
+
+        Args:
+            unmoved: the key frame, from which the camera has not moved.
+            present: the present frame.
+            fit: the motion that was fitted; None: none fits.
+        """
+        if fit is not None and not fit.is_repeated:
+            return False
+        least = _CLEAR if fit is None else max(_CLEAR, fit.median - _AS_GOOD)
+        return self._is_unchanged(unmoved, present, least)
+
+    def _is_believed(
+        self, since_last: _Fit, key: GreyFrame, present: GreyFrame, key_to_present: NDArray[np.float64]
+    ) -> bool:
+        """Tell whether a motion is the camera's: no other is as good, and it goes on or explains all of the frame."""
+        if not self._is_certain(since_last, self._course):
+            return False
+        return self._goes_on(since_last.similarity) or not self._is_divided(key, present, key_to_present)
+
+    def _move_on(
+        self,
+        key: GreyFrame,
+        key_to_present: NDArray[np.float64],
+        last_to_present: NDArray[np.float64],
+        present: GreyFrame,
+    ) -> None:
+        """Keep a believed motion; a frame that shows little of the anchor begins anew.
+
+        The motions of a camera that stands do not come here: their noise would add up.
+        """
         self._anchor_to_last = last_to_present @ self._anchor_to_last
         if _share_in_view(self._anchor_to_last, present.grey.shape) < _LEAST_IN_VIEW:
             self._begin_at(present)
-        else:
-            self._key = key
-            self._key_to_last = fit.similarity
-        return _at_full_size(last_to_present, present.ratio)
+            return
+        self._key = key
+        self._key_to_last = key_to_present
 
     def _fit_to_key_or_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> tuple[GreyFrame, _Fit | None]:
         """Fit the present frame to the key frame, or where it fits none to the last frame, which is the key then.
