@@ -7,6 +7,9 @@ photographs are dealt into folds. An observation model is fitted through the bel
 (`semfov.fit.through_belief`), and searches those of its own. The table has the targets found after some gaze shifts,
 and the difference to the learned target evidence, photograph by photograph. The model that is fitted on all photographs
 is saved in `out`. If the command is stopped, repeat it to continue.
+
+With `--belief.search_model` nothing is fitted, and this model searches all photographs; with `--data.ids` they may be
+those that neither it nor the target evidence was fitted on.
 """
 
 import sys
@@ -112,28 +115,36 @@ class _Folds:
         config = self.config
         ids = config.out / f"fold-{fold}.txt"
         write_text(ids, "".join(f"{name}\n" for name in self.ids[fold :: config.folds]))
-        common = {name: getattr(config, name) for name in _COMMON}
-        run = SearchRun(
-            SearchConfig(
-                **common,
-                data=replace(config.data, ids=ids, limit=None),
-                belief=replace(config.belief, search_model=str(model)),
-                policies=tuple(_STEPS.values()),
-                out=config.out / f"fold-{fold}",
-            )
-        )
-        finish(run, "searching")
-        names = dict(zip(run.policies, _STEPS, strict=True))
-        records, _ = collect_records(run)
-        return [{**record, "policy": names[record["policy"]], "fold": fold} for record in records]
+        belief = replace(config.belief, search_model=str(model))
+        data = replace(config.data, ids=ids, limit=None)
+        records = search_by_steps(replace(config, data=data, belief=belief, out=config.out / f"fold-{fold}"))
+        return [{**record, "fold": fold} for record in records]
 
 
-_COMMON = ("detector", "cache", "workers", "scheduler", "sensor", "store", "protocol")
-"""Settings that the searches of all folds share."""
+_COMMON = ("data", "belief", "out", "detector", "cache", "workers", "scheduler", "sensor", "store", "protocol")
+"""Settings of searches."""
 
 
-def chain_summary(records: Sequence[ResultRecord], shifts: int) -> str:
-    """Write the table, as Markdown: the targets found by each policy, and the differences to the target evidence."""
+def search_by_steps(config: ChainConfig) -> list[ResultRecord]:
+    """Search photographs by all policies; the learned chain has the model of `belief.search_model`."""
+    run = SearchRun(SearchConfig(**{name: getattr(config, name) for name in _COMMON}, policies=tuple(_STEPS.values())))
+    finish(run, "searching")
+    names = dict(zip(run.policies, _STEPS, strict=True))
+    records, _ = collect_records(run)
+    return [{**record, "policy": names[record["policy"]]} for record in records]
+
+
+def chain_summary(records: Sequence[ResultRecord], shifts: int, model: str | None = None) -> str:
+    """Write the table, as Markdown: the targets found by each policy, and the differences to the target evidence.
+
+    Args:
+        records: the searches.
+        shifts: largest number of gaze shifts.
+        model: the model of the learned chain; None for those that were fitted on the other folds.
+
+    Returns:
+        The caption and the table.
+    """
     at = [number for number in _SHIFTS if number <= shifts]
     curves = {name: _by_photograph(records, name, shifts) for name in _STEPS}
     rows = [["policy", *(f"CP@{number}" for number in at)]]
@@ -143,11 +154,12 @@ def chain_summary(records: Sequence[ResultRecord], shifts: int) -> str:
         if name != _HEAD:
             rows.append([f"{name} - {_HEAD}", *_cells(curve - curves[_HEAD], at, sign="+")])
     photographs, searches = len(curves[_HEAD]), sum(record["policy"] == _HEAD for record in records)
+    learned = "the model that was fitted on the other folds" if model is None else f"`{model}`"
     return "\n".join(
         [
             f"Targets found within n gaze shifts (%), ± standard error over {photographs} photographs; {searches} "
-            "searches by each policy. *learned*: by the model that was fitted on the other folds. *target evidence*: "
-            "the model that is shipped, which may have been fitted on these photographs.",
+            f"searches by each policy. *learned*: by {learned}. *target evidence*: the model that is shipped, which "
+            "may have been fitted on these photographs.",
             "",
             *table(rows),
             "",
@@ -169,7 +181,15 @@ def _cells(curve: FloatArray, at: Sequence[int], sign: str = "") -> list[str]:
 
 
 def compare_chains(config: ChainConfig) -> None:
-    """Fit and search in folds, and write the table, the records and the model that is fitted on all photographs."""
+    """Fit and search in folds, or search by a given model; write the table, the records and what was fitted."""
+    given = config.belief.search_model
+    records = _fit_and_search(config) if given is None else search_by_steps(config)
+    text = chain_summary(records, config.protocol.shifts, given)
+    announce(text, write_summary(config.out, "chain", text, records))
+
+
+def _fit_and_search(config: ChainConfig) -> list[ResultRecord]:
+    """Fit and search in folds; saves the models of the folds, and the one that is fitted on all photographs."""
     folds = _Folds(config)
     records: list[ResultRecord] = []
     for fold in range(config.folds):
@@ -177,8 +197,7 @@ def compare_chains(config: ChainConfig) -> None:
         folds.fit(fold).save(model)
         records += folds.search(fold, model)
     folds.fit(None).save(config.out / "search.safetensors")
-    text = chain_summary(records, config.protocol.shifts)
-    announce(text, write_summary(config.out, "chain", text, records))
+    return records
 
 
 main = command(compare_chains, ChainConfig, __doc__)

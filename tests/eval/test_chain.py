@@ -32,3 +32,9 @@ def test_the_table_has_means_over_photographs_and_paired_differences():
     assert rows["target evidence"] == ["75.0 ± 25.0", "75.0 ± 25.0"]
     assert rows["learned - target evidence"] == ["-50.0 ± 50.0", "-25.0 ± 75.0"]
     assert rows["as shipped - target evidence"] == ["-75.0 ± 25.0", "-25.0 ± 25.0"]
+
+
+def test_the_caption_names_the_model_of_the_learned_chain():
+    records = [record(policy, scene, 1) for policy in POLICIES for scene in (7, 8)]
+    assert "*learned*: by the model that was fitted on the other folds." in chain_summary(records, 5)
+    assert "*learned*: by `yolox-nano-search`." in chain_summary(records, 5, "yolox-nano-search")
