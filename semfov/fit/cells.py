@@ -21,7 +21,7 @@ MOST_PHOTOGRAPHS = 200
 _COUNTS = 4  # numbers of looks, each twice the one before
 _ITERATIONS = 60
 _LEAST = 1e-9  # of a probability whose logarithm is taken
-_PULL = 1e-4  # weight that keeps the numbers finite where cells hold nothing, or all the same
+_PULL = 1e-4  # weight that keeps the numbers finite where cells hold nothing, or looks tell them all apart
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,12 @@ def mapped_looks(
         cells: columns and rows of the grid.
 
     Returns:
-        The looks at each photograph with objects.
+        The looks at each of the first `MOST_PHOTOGRAPHS` photographs with objects.
     """
-    mapped = []
+    mapped: list[MappedLooks] = []
     for index in photographs:
+        if len(mapped) == MOST_PHOTOGRAPHS:
+            break
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
         answers = answers_of(annotation, grid, len(scenes.classes) + 1)
@@ -126,17 +128,17 @@ def fit_cells(model: FovealObservationModel, photographs: Sequence[MappedLooks],
     observer = SemanticMap(model)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        ratio = torch.cat([_closest_looks(observer, mapped, generator) for mapped in photographs])
+        ratio = torch.cat([_closest_looks(observer, mapped, generator) for mapped in photographs]).double()
     answers = torch.cat([mapped.answers.expand(_COUNTS, -1, -1) for mapped in photographs])
     start = model.log_cell.detach().clone()
     optimiser = torch.optim.LBFGS([model.log_cell], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
 
     def loss_of() -> Tensor:
         optimiser.zero_grad()
-        likelihood = observer.likelihood(ratio)
-        right = (likelihood * answers).sum(-1) / likelihood.sum(-1)
+        log_probability = observer.log_likelihood(ratio).log_softmax(-1)
+        log_right = log_probability.masked_fill(~answers, -torch.inf).logsumexp(-1)
         pull = (model.log_cell - start).square().sum()
-        loss = _PULL * pull - right.clamp(min=_LEAST).log().mean()
+        loss = _PULL * pull - log_right.mean()
         loss.backward()
         return loss
 

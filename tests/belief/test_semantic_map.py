@@ -1,14 +1,17 @@
 """The semantic map: loops over cells, the closest look, cells without detections, gradients, its fit."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief.observers import SemanticMap
+from semfov.data.scene import Annotation
 from semfov.errors import DataError
-from semfov.fit.cells import MappedLooks, fit_cells, map_loss, mean_map_loss
+from semfov.fit import cells
+from semfov.fit.cells import MappedLooks, fit_cells, map_loss, mapped_looks, mean_map_loss
 
 GRID = Grid(5, 4, (100, 80))
 FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
@@ -134,6 +137,41 @@ def test_the_fit_finds_how_often_cells_hold_nothing(looks):
     assert float(share.detach()) == pytest.approx(0.75, abs=1e-3)
     assert all(torch.equal(fom.state_dict()[key], value) for key, value in others.items())
     assert all(parameter.grad is None for parameter in fom.parameters())
+
+
+def test_numbers_stay_finite_where_looks_tell_all_cells_apart():
+    """Scores leave no doubt, so that the likelihood grows with the exponent without end."""
+    fom = FovealObservationModel.identity(["a", "b"], [0.2])
+    grid = Grid(4, 4, (40, 40))
+    box = torch.tensor([[[0.0, 0.0, 19.0, 19.0]]]).expand(8, 1, 4)
+    covered = grid.footprint(box[0])[0]
+    photographs = []
+    for name in (1, 2) * 4:
+        scores = torch.tensor([0.001, 0.381, 0.381])
+        scores[name] = 0.618
+        answers = torch.zeros(16, 3, dtype=torch.bool)
+        answers[:, 0], answers[:, name] = ~covered, covered
+        seen = Detections(box, scores.expand(8, 1, 3), torch.ones(8, 1, dtype=torch.bool))
+        photographs.append(MappedLooks(seen, grid.centres[:8], grid, answers))
+    fit_cells(fom, photographs)
+    miss, exponent, background = fom.log_cell.exp().tolist()
+    assert 0 < miss < 1
+    assert 0 < background < 1
+    assert 2 < exponent < 1000
+    assert mean_map_loss(fom, photographs) < 0.01
+
+
+def test_photographs_without_objects_do_not_count_as_read(monkeypatch):
+    monkeypatch.setattr(cells, "MOST_PHOTOGRAPHS", 1)
+    boxes = torch.tensor([[0.0, 0.0, 50.0, 50.0]])
+    one = Annotation(boxes, torch.tensor([1]), torch.tensor([False]), (100, 80))
+    none = Annotation(boxes[:0], one.labels[:0], one.crowd[:0], one.size)
+    held = {0: none, 1: one, 2: one}
+    scenes = SimpleNamespace(annotation=held.__getitem__, classes=("cup", "cat"))
+    samples = SimpleNamespace(looks_at=lambda index: (index, FIXATIONS))
+    (only,) = mapped_looks(scenes, samples, range(3), (5, 4))
+    assert only.detections == 1
+    assert only.answers.sum(0).tolist() == [11, 9, 0]
 
 
 def test_a_fit_needs_a_photograph():

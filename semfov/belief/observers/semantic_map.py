@@ -15,7 +15,7 @@ from semfov.detection.detections import Detections
 from semfov.observation.foveal import FovealObservationModel
 
 _LEAST = 1e-6  # of the likelihood of background, by which the others are divided
-_WEAK = 1e-5  # Dirichlet parameter of a prior that one look outweighs
+_WEAK = 1e-5  # ε, the Dirichlet parameter of a prior that one look outweighs
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,9 @@ class SemanticMap(Observer):
     .. math:: \lambda_k(x) = \Bigl(m + \sum_{l \ni x} \frac{p(S_l \mid k, d_l)}{p(S_l \mid 0, d_l)}\Bigr)^a,
               \qquad \lambda_0(x) = w
 
-    It is fused with a prior that it outweighs by Kaplan's rule (`semfov.fusion.kaplan`), so that the belief is
-    proportional to λ. A closer look replaces a farther one, because looks at a static scene are not independent.
+    Kaplan's rule (`semfov.fusion.kaplan`) fuses it with a prior ε = 1e-5 of every class. The mean of the belief is then
+    :math:`(\varepsilon + P_k) / (1 + (K + 1) \varepsilon)` with :math:`P_k = \lambda_k / \sum_j \lambda_j`, which is as
+    good as P. A closer look replaces a farther one, because looks at a static scene are not independent.
 
     Args:
         model: calibrates the scores, and has m, a and w (`FovealObservationModel.log_cell`).
@@ -76,31 +77,30 @@ class SemanticMap(Observer):
         covered = grid.footprint(detections.boxes) * detections.mask[..., None]
         return CellLook(covered.to(ratio).mT @ ratio, grid.distance(fixation).to(ratio))
 
-    def likelihood(self, ratio: Tensor) -> Tensor:
-        """Compute the likelihood of every class in a cell.
+    def log_likelihood(self, ratio: Tensor) -> Tensor:
+        """Compute the logarithm of the likelihood of every class in a cell.
 
         Args:
             ratio: `(..., K+1)`, sums of its detections (`CellLook`).
 
         Returns:
-            `(..., K+1)`, λ; differentiable in the numbers of the model.
+            `(..., K+1)`, ln λ; differentiable in the numbers of the model.
         """
-        miss, exponent, background = self.model.log_cell.exp().to(ratio)
-        objects = (miss + ratio[..., 1:]).pow(exponent)
-        return torch.cat([background.expand_as(objects[..., :1]), objects], -1)
+        log_miss, log_exponent, log_background = self.model.log_cell.to(ratio)
+        # Not the likelihood, which is larger than any number of 32 bits where the exponent is.
+        objects = log_exponent.exp() * (log_miss.exp() + ratio[..., 1:]).log()
+        return torch.cat([log_background.expand_as(objects[..., :1]), objects], -1)
 
     def unseen(self, like: Tensor) -> Tensor:
         """Compute the probabilities of all classes in a cell in which nothing was detected, `(K+1,)`."""
-        likelihood = self.likelihood(like.new_zeros(self.components))
-        return likelihood / likelihood.sum()
+        return self.log_likelihood(like.new_zeros(self.components)).softmax(-1)
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
         """Take the likelihood of cells to which the look is closer than all before."""
         old = dirichlet_belief(belief)
         cells = own(look, CellLook, "look")
         prior = torch.full_like(old.beta, _WEAK)
-        likelihood = self.likelihood(cells.ratio.to(prior))
-        fused = RULES["kaplan"](prior, likelihood / likelihood.amax(-1, keepdim=True))
+        fused = RULES["kaplan"](prior, self.log_likelihood(cells.ratio.to(prior)).softmax(-1))
         is_closer = (cells.distance < old.closest)[..., None]
         return replace(
             old,
