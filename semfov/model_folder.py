@@ -26,9 +26,6 @@ from semfov.zoom.evidence import GlimpseEvidence
 
 _FolderModel = FovealObservationModel | TargetEvidence | Verification | GlimpseEvidence
 
-RAW_OBSERVATION = "raw-observation.safetensors"
-"""Name of the file of an observation model that takes raw scores as they are, for explorations."""
-
 KINDS: dict[str, type[_FolderModel]] = {
     "observation": FovealObservationModel,
     "evidence": TargetEvidence,
@@ -85,12 +82,6 @@ class ModelFolder:
         """File of a part, whether the agent uses it or not; None if there is none."""
         entry = self.manifest.parts.get(lookup(part, PARTS, "part"))
         return None if entry is None or entry.file is None else inside(self.path, entry.file)
-
-    def map_file(self) -> Path | None:
-        """File of the observation model for explorations, of raw scores where these were better; None without one."""
-        file = self.file("observation")
-        takes_raw = file is not None and self.manifest.parts["observation"].settings.get("map") == "raw"
-        return self.path / RAW_OBSERVATION if takes_raw else file
 
     def used(self, part: str) -> bool:
         """Whether the agent uses a part."""
@@ -182,6 +173,18 @@ class ModelFolder:
             )
         return FovealObservationModel.from_pretrained(file)
 
+    def map_model(self) -> FovealObservationModel | None:
+        """Load the observation model of explorations, of raw scores where these were better; None without one."""
+        if self.file("observation") is None:
+            return None
+        fitted = self.observation()
+        of_map = self.manifest.parts["observation"].settings.get("map", {})
+        if of_map.get("scores") != "raw":
+            return fitted
+        return FovealObservationModel.identity(
+            fitted.classes, fitted.edges, cell=of_map["raw_cell"], metadata=fitted.metadata
+        ).eval()
+
     def arguments(self, *, detector: str | PathLike[str] | None = None, **options: Any) -> dict[str, Any]:
         """Make the arguments of `semfov.ActivePerception`, of the models that are used.
 
@@ -219,9 +222,8 @@ class ModelFolder:
 
     def _exploration(self, eye: Eye) -> tuple[Observer, Policy]:
         """Make the observer and the policy of explorations: the semantic map, or random looks without a model."""
-        file = self.map_file()
-        if file is None:
+        model = self.map_model()
+        if model is None:
             return Semantic(len(self.manifest.classes) + 1), Policy("random")
         sensor = self.manifest.sensor
-        model = FovealObservationModel.from_pretrained(file)
         return SemanticMap(model), Policy("closer-look", fovea=eye.sensor.width(sensor) / sensor["reference"])

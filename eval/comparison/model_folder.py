@@ -34,7 +34,7 @@ def with_models(config: _Config) -> _Config:
     names = {"model": "observation", "target_model": "evidence"}
     columns, rows = folder.manifest.grid
     models: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
-    models["map_model"] = _text(folder.map_file())
+    models["map_model"] = _text(config.models if files["observation"] else None)
     belief = replace(config.belief, columns=columns, rows=rows, **models)  # type: ignore[arg-type]
     detector = _detector_of(folder, config.detector)
     named = type(config)().policies != config.policies
@@ -75,7 +75,7 @@ def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfi
 def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> str | PolicyConfig:
     """Return the policy that the agent of a folder uses."""
     if config.task == "exploration":
-        return PolicyConfig("closer-look", "learned") if folder.map_file() else "random-raw"
+        return PolicyConfig("closer-look", "learned") if folder.file("observation") else "random-raw"
     if folder.used("evidence"):
         return EVIDENCE
     if not folder.used("tempering"):

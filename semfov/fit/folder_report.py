@@ -9,7 +9,7 @@ from semfov.fit.part import PartInputs
 from semfov.runs.tables import table
 
 _TITLES = {
-    "observation": "Observation model (explorations)",
+    "observation": "Observation model (scores of detections)",
     "tempering": "Tempering",
     "evidence": "Target evidence (searches)",
     "verification": "Verification (closer looks)",
@@ -54,7 +54,8 @@ def folder_report(inputs: PartInputs, seconds: float) -> str:
         "",
         "The agent uses a part only if it is better than raw scores by more than one standard error of the paired "
         "difference over the held-out photographs. The verification is compared with the same agent without closer "
-        "looks, and the evidence by magnification with looks at slices of large pictures in the order of raw scores.",
+        "looks, and the evidence by magnification with looks at slices of large pictures in the order of raw scores. "
+        "The semantic map takes calibrated or raw scores, whichever tell better what cells hold.",
         "",
         *table(_part_rows(inputs)),
         "",
@@ -74,6 +75,9 @@ def _part_rows(inputs: PartInputs) -> list[list[str]]:
     for name, fitted in inputs.results.items():
         used = "yes" if fitted.part.used else _UNUSED.get(name, "no, raw")
         rows.append([_TITLES[name], used, fitted.part.why])
+        if "map" in fitted.part.settings:
+            of_map = fitted.part.settings["map"]
+            rows.append(["Semantic map (explorations)", f"yes, {of_map['scores']} scores", of_map["why"]])
     return rows
 
 
@@ -97,9 +101,9 @@ def thin_classes(counts: Mapping[str, int], thin: int) -> list[str]:
             lines += [f"**{words} to learn from** ({len(names)} classes): {', '.join(names)}.", ""]
     if lines:
         lines += [
-            "The target evidence and the map process the scores of all classes with one network; only one number per "
-            "class, its frequency, is separate. The observation model changes the scores of a class without examples "
-            "very little.",
+            "The target evidence processes the scores of all classes with one network; only one number per class, its "
+            "frequency, is separate. The semantic map has three numbers for all classes. The observation model changes "
+            "the scores of a class without examples very little.",
             "",
         ]
     return lines

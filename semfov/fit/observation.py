@@ -11,14 +11,13 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.eye import Eye
-from semfov.fit.cells import MOST_PHOTOGRAPHS, fit_cells, mapped_looks, mean_map_loss
+from semfov.fit.cells import fit_cells, mapped_looks, mean_map_loss
 from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.samples import Samples, all_cells
 from semfov.fit.training import split
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.metrics.episodes import FloatArray
-from semfov.model_folder import RAW_OBSERVATION
 from semfov.observation import DirichletStatistics, FovealObservationModel, MissCounts, fit_discriminative
 from semfov.viz import plot_reliability, save_figure
 from semfov.zoom.eye import WindowEye
@@ -118,7 +117,7 @@ class ObservationFit(PartFit):
         judged = samples[held_out]
         model = self._fit_model(samples, samples[~held_out])
         raw = FovealObservationModel.identity(self.run.scenes.classes, self._edges).eval()
-        scores, losses = self._fit_maps(samples, {"raw": raw, "calibrated": model})
+        losses = self._fit_maps(samples, {"raw": raw, "calibrated": model})
         with torch.inference_mode():
             posteriors = {
                 "raw": raw.calibrate(judged.scores, judged.distance),
@@ -141,25 +140,25 @@ class ObservationFit(PartFit):
             f"detections, evaluated on {len(judged)} detections in {len(judged.scene.unique())} held-out photographs.",
             rows,
         )
-        report += (
-            f"\nExplorations use {scores} scores: in maps of the held-out photographs the negative log of what a cell "
-            f"holds is {losses['calibrated']:.3f} with calibrated scores, and {losses['raw']:.3f} with raw ones.\n"
-        )
-        raw.save(self.config.out / RAW_OBSERVATION)
-        part = self.write("observation", model, gain.better, why, map=scores)
+        of_map = {
+            "scores": min(losses, key=losses.__getitem__),
+            "raw_cell": raw.log_cell.detach().exp().tolist(),
+            "why": f"negative log of what a cell holds {losses['calibrated']:.3f} with calibrated scores, "
+            f"{losses['raw']:.3f} with raw ones",
+        }
+        part = self.write("observation", model, gain.better, why, map=of_map)
         return PartResult(part, report, ["reliability.png"])
 
-    def _fit_maps(self, samples: Samples, models: Mapping[str, FovealObservationModel]) -> tuple[str, dict[str, float]]:
-        """Fit what looks say about cells; returns with which scores maps are better, and the loss with each."""
+    def _fit_maps(self, samples: Samples, models: Mapping[str, FovealObservationModel]) -> dict[str, float]:
+        """Fit what looks say about cells with each model; returns the loss of its maps of held-out photographs."""
         scenes, cells, every = self.run.scenes, self.config.cells, self.settings["holdout"]
         fitted_on = [index for index in range(len(scenes)) if index % every]
         judged_on = [index for index in range(len(scenes)) if index % every == 0]
-        photographs = mapped_looks(scenes, samples, fitted_on[:MOST_PHOTOGRAPHS], cells)
-        judged = mapped_looks(scenes, samples, judged_on[:MOST_PHOTOGRAPHS], cells)
+        photographs = mapped_looks(scenes, samples, fitted_on, cells)
+        judged = mapped_looks(scenes, samples, judged_on, cells)
         for model in models.values():
             fit_cells(model, photographs, seed=self.settings["seed"])
-        losses = {name: mean_map_loss(model, judged or photographs) for name, model in models.items()}
-        return min(losses, key=losses.__getitem__), losses
+        return {name: mean_map_loss(model, judged or photographs) for name, model in models.items()}
 
     @property
     def _edges(self) -> list[float]:

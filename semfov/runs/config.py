@@ -177,7 +177,8 @@ class BeliefConfig(Settings):
         search_model: observation model fitted through the belief, by name or file (None: the one shipped for the
             detector).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
-        map_model: observation model of the semantic map, by name or file (None: ours for the detector and sensor).
+        map_model: observation model of the semantic map, by name or file, or a folder of models (None: ours for the
+            detector and sensor).
     """
 
     columns: Side = 10

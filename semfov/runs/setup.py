@@ -1,6 +1,7 @@
 """Makes scenes, detector, eye and models from settings."""
 
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, TypeVar
 
 from semfov.belief import TargetEvidence, Verification
@@ -12,6 +13,7 @@ from semfov.eye import Eye
 from semfov.io.compatibility import learned_for, trained_for
 from semfov.io.files import read_text
 from semfov.io.pretrained import shipped_model
+from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
@@ -149,8 +151,16 @@ def make_fitted(name: str | None, eye: Eye) -> FovealObservationModel:
 
 
 def make_map(name: str | None, eye: Eye) -> FovealObservationModel:
-    """Load an observation model for the map of all classes: by name, or ours for the fovea's growth."""
-    return make_observation(_own_model(eye) if name is None else name, eye)
+    """Load an observation model for the map of all classes: by name, of a folder, or ours for the fovea's growth."""
+    if name is None:
+        name = _own_model(eye)
+    if not Path(name).is_dir():
+        return make_observation(name, eye)
+    model = ModelFolder(name).map_model()
+    if model is None:
+        raise InputError(f"map_model: expected a folder with an observation model, got {name} without")
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.requires_grad_(False)
 
 
 def observation_name(eye: Eye) -> str:

@@ -45,6 +45,7 @@ from semfov.io.manifest import PARTS, Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
 from semfov.runs.progress import WholeBar, task_bar, track
+from semfov.runs.setup import make_map
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network, write_photographs
 from tests.refusals import refused, unusable
 from tests.small import once
@@ -289,6 +290,30 @@ def test_a_part_that_does_not_improve_is_not_used(home, tmp_path):
     assert with_models(given).policies == ("non-predictive-raw", "target-evidence")
     (explored,) = with_models(ExploreConfig(models=folder, policies=("recommended",))).policies
     assert (explored.policy, explored.scores) == ("closer-look", "learned")
+
+
+@pytest.mark.parametrize("scores", ["raw", "calibrated"])
+def test_maps_take_the_scores_that_tell_better_what_cells_hold(home, tmp_path, scores):
+    folder = copy_models(home, tmp_path)
+    part = Manifest.read(folder).parts["observation"]
+    of_map = part.settings["map"]
+    assert f"| Semantic map (explorations) | yes, {of_map['scores']} scores" in " ".join(
+        (folder / "report.md").read_text().split()
+    )
+    cell = [0.125, 2.0, 0.5]
+    part = replace(part, settings={"map": {**of_map, "scores": scores, "raw_cell": cell}})
+    rewrite_manifest(folder, observation=part)
+    fitted = ModelFolder(folder).observation()
+    expected = fitted if scores == "calibrated" else FovealObservationModel.identity(CLASSES, fitted.edges, cell=cell)
+    eye = ModelFolder(folder).eye()
+    study = with_models(ExploreConfig(models=folder, policies=("recommended",)))
+    for got in (
+        ActivePerception.from_pretrained(folder).exploring.observer.model,
+        make_map(study.belief.map_model, eye),
+    ):
+        assert torch.equal(got.log_alpha, expected.log_alpha)
+        assert torch.equal(got.log_cell, expected.log_cell)
+        assert got.metadata == fitted.metadata
 
 
 def photograph_with(colour, place):
