@@ -9,7 +9,7 @@ from tests.small import cells_of
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 
-BELIEFS = ["raw", "calibrated", "tempered", "learned", "learned map"]
+BELIEFS = ["raw", "calibrated", "tempered", "learned", "semantic map"]
 FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")
 
 
