@@ -88,8 +88,7 @@ class PictureJob(ABC, Generic[_Options_co]):
         options = self.options
         if self.truth is not None:
             # A picture that the annotations lack is reported now, and not after hours.
-            for source in self.sources:
-                self.truth.image_id(source.name)
+            self.truth.check_pictures([source.name for source in self.sources])
         if self.every:
             first = "none for find, which begins with the whole picture"
             check(options.start is None, "start", first, repr(options.start))

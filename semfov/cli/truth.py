@@ -2,8 +2,7 @@
 
 import warnings
 from collections import defaultdict
-from collections.abc import Collection, Sequence
-from itertools import takewhile
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 from urllib.parse import unquote
@@ -50,9 +49,10 @@ class Truth:
             warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
 
     def image_id(self, name: str, size: tuple[int, int] | None = None) -> Id:
-        """Find the id of a picture; of several of one name that whose folders agree best, letter by letter if need be.
+        """Find the id of a picture by its name; of several of one name that whose folders agree best.
 
-        Names agree in any letter case, and as other systems and addresses write them: `K%C3%BCche.JPG` for `Küche.jpg`.
+        Where no image is named as the picture is, names agree in any letter case, and as other systems and addresses
+        write them: `K%C3%BCche.JPG` for `Küche.jpg`.
 
         Args:
             name: path of the picture.
@@ -64,28 +64,47 @@ class Truth:
         Raises:
             DataError: no image, or several, have this name, or its size is another one.
         """
-        parts = _parts(name)
-
-        def agreement(image: Id) -> tuple[int, int]:
-            """Count the last parts of both paths that agree, and those that are equal."""
-            image_parts = _parts(self.annotations.images[image]["file_name"])
-            pairs = [*zip(reversed(parts), reversed(image_parts), strict=False)]
-            agreeing = takewhile(lambda pair: _plain(pair[0]) == _plain(pair[1]), pairs)
-            equal = takewhile(lambda pair: pair[0] == pair[1], pairs)
-            return len([*agreeing]), len([*equal])
-
-        images = sorted(self._images.get(_plain(parts[-1]), ()), key=agreement)
-        is_ambiguous = len(images) > 1 and agreement(images[-1]) == agreement(images[-2])
+        images = self._named(name, str)
+        if len(images) != 1:
+            images = self._named(name, _plain)
         expected = f"one image with the file_name of {name}"
-        check_data(bool(images) and not is_ambiguous, f"annotations {self.path}", expected, len(images))
-        best = images[-1]
-        stated = self.annotations.size(best)
+        check_data(len(images) == 1, f"annotations {self.path}", expected, len(images))
+        (image,) = images
+        stated = self.annotations.size(image)
         if size is not None and stated is not None and stated != size:
             raise DataError(
                 f"annotations {self.path}: expected {name} to have {stated[0]} × {stated[1]} px, got {size[0]} × "
                 f"{size[1]}; its boxes are in another frame"
             )
-        return best
+        return image
+
+    def _named(self, name: str, spelled: Callable[[str], str]) -> list[Id]:
+        """List the images of a picture's name, those whose folders agree best, by the spelling of the parts of paths.
+
+        Args:
+            name: path of the picture.
+            spelled: writes a part of a path as it is compared.
+        """
+        parts = _parts(name)
+        agreements = {}
+        for image in self._images.get(_plain(parts[-1]), ()):
+            image_parts = _parts(self.annotations.images[image]["file_name"])
+            agreements[image] = _common_end([*map(spelled, parts)], [*map(spelled, image_parts)])
+        best = max(agreements.values(), default=0)
+        return [image for image, agreement in agreements.items() if agreement == best > 0]
+
+    def check_pictures(self, names: Sequence[str]) -> None:
+        """Raise `DataError` unless each of some pictures has an image of its own.
+
+        Args:
+            names: paths of the pictures.
+        """
+        pictures: dict[Id, str] = {}
+        for name in names:
+            image = self.image_id(name)
+            taken = f"the same for {pictures.get(image)} and {name}"
+            check_data(image not in pictures, f"annotations {self.path}", "an image for each picture", taken)
+            pictures[image] = name
 
     def categories(self, classes: Collection[str]) -> dict[str, Id]:
         """Find the categories of the file that are among some classes.
@@ -119,6 +138,16 @@ class Truth:
 def _plain(part: str) -> str:
     """Write a part of a path without what differs between systems: letter case, composed letters, percent signs."""
     return normalize("NFC", unquote(part)).casefold()
+
+
+def _common_end(parts: Sequence[str], others: Sequence[str]) -> int:
+    """Count the last parts that two paths have in common."""
+    count = 0
+    for part, other in zip(reversed(parts), reversed(others), strict=False):
+        if part != other:
+            break
+        count += 1
+    return count
 
 
 def _parts(name: str) -> tuple[str, ...]:

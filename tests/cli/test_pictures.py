@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -271,6 +272,20 @@ def test_pictures_are_found_as_other_systems_and_addresses_write_their_names(mak
     assert [truth.image_id(name) for name in ("b/x.jpg", "B/X.jpg", "c/x.jpg")] == [3, 4, 3]
     assert truth.image_id("100%.png") == 5
     unusable("expected one image with the file_name of", truth.image_id, "z.jpg")
+
+
+def test_an_exact_name_wins_and_no_two_pictures_take_one_image(run, photo, make_truth, tmp_path):
+    truth = make_truth("a.jpg", "dir/A.jpg", "B.jpg", "dir/b.JPG", "K%C3%BCche/c.jpg", "Bad/c.jpg")
+    assert [truth.image_id(name) for name in ("/x/dir/a.jpg", "/x/A.jpg", "dir/b.jpg")] == [1, 2, 4]
+    assert truth.image_id("K\u00fcche/c.jpg") == 5
+    unusable("expected one image with the file_name of x/b.jpg, got 2", truth.image_id, "x/b.jpg")
+    names = "IMG_1.png", "img_1.png"
+    for name in names:
+        shutil.copy(photo, tmp_path / name)
+    make_truth(names[0])
+    files = *(tmp_path / name for name in names), "--annotations", tmp_path / "truth.json"
+    code, printed = run("find", *files, "--out", tmp_path / "boxes.coco.json")
+    assert (code, "expected an image for each picture, got the same for" in printed.err) == (1, True)
 
 
 def test_boxes_of_annotations_that_look_like_fractions_are_told(make_truth, tmp_path):
