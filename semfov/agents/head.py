@@ -153,7 +153,7 @@ class HeadAgent(nn.Module):
         return HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=_first_action(settings), duration=_duration(settings),
-            seed=settings.seed, prior=settings.given_share,
+            seed=settings.seed, prior=settings.given_share, assumed=prior.assumed,
         ).run()  # fmt: skip
 
     def find_all(
@@ -257,6 +257,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         duration: time limit of the scene in seconds.
         seed: of the generator that breaks ties.
         prior: how often the target is there, as it was given for the observer; None for none.
+        assumed: how often the observer assumes that it is there; None if it is not known.
     """
 
     def __init__(
@@ -274,6 +275,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         duration: float = _DURATION,
         seed: int = 0,
         prior: float | None = None,
+        assumed: float | None = None,
     ) -> None:
         super().__init__(Goal.of(agent.classes, target, targets), limits)
         check_number(duration, "duration", 0, float("inf"))
@@ -289,6 +291,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         self.score_threshold = agent.eye.detector.score_threshold
         self._detector = agent.eye.detector.name
         self._prior = prior
+        self._assumed = assumed
         self._steps = look_around(
             views,
             live(agent.eye, views),
@@ -365,6 +368,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
             decision=decision,
             ending=self.ending,
             prior=self._prior,
+            assumed=self._assumed,
             targets=self.goal.targets,
             photograph=None if picture is None else reduced_copy(picture),
             detector=self._detector,

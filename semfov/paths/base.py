@@ -54,8 +54,7 @@ class Record(Conversion):
         decision: decision of a search; None for exploration, and for a search without one.
         prior: share of the pictures that hold the target, as it was given to the search; None for none.
         assumed: that share as the probability of the decision has it, which is one half without a `prior`
-            (`probability_at` gives others). None where it is not known, and for a head, whose number is that of its
-            most probable cell.
+            (`probability_at` gives others). None where it is not known.
         targets: class indices 1..K of a search for several classes; otherwise empty.
         score_threshold: score from which on objects count, in windows their probability (`words.threshold`).
         unseen: number of objects that further looks are expected to show, and its variance; None where the scores are

@@ -137,7 +137,8 @@ class Outcome(ABC):
                   - \operatorname{logit} \pi_{\mathrm{assumed}}
 
         (`semfov.belief.prior.with_prior`). It is that of the looks that were made: a search with this `prior` may end
-        after others.
+        after others. For a head, whose probability is that of its most probable cell, the change is an upper bound:
+        that of a search with this `prior` is smaller.
 
         Args:
             prior: share of the pictures that hold the target, above 0 and below 1.

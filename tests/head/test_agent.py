@@ -79,25 +79,37 @@ def test_a_prior_scales_all_cells_of_a_view_as_it_changes_the_presence(agent, pa
     agent.target_evidence.shares = torch.full((3,), fitted)
     agent.target_evidence.judge[-1].bias.fill_(1.0)  # no cell is more probable than the view
 
-    def look(prior):
+    def look(prior, assumed):
         path = agent.search(Panorama(panorama), "blue", SearchSettings(passes=1, prior=prior), chance=chance)
-        assert (path.prior, path.assumed) == (None if prior == "fit" else prior, None)
-        refused("record: expected a search by models", path.probability_at, 0.5)
+        assert (path.prior, path.assumed) == (None if prior == "fit" else prior, pytest.approx(assumed))
         return path.maps[0].double()
 
-    usual = look("fit")
+    usual = look("fit", fitted)
     seen = usual != torch.tensor(chance, dtype=torch.float32)
     assert 0 < int(seen.sum()) < len(seen)
     odds = []
     for prior in (0.1, 0.4):
         k = prior / (1 - prior) * (1 - fitted) / fitted
-        rare = look(prior)
+        rare = look(prior, prior)
         never = k * chance / (1 - chance)
         torch.testing.assert_close(rare[~seen], torch.full_like(rare[~seen], never / (1 + never)))
         ratio = rare[seen] / usual[seen]
         torch.testing.assert_close(ratio, ratio.mean().expand_as(ratio), rtol=1e-4, atol=0)
         odds.append(float((k - ratio.mean()) / (k * (ratio.mean() - 1))))
     assert odds[0] == pytest.approx(odds[1], rel=1e-3)
+
+
+def test_the_probability_for_another_share_changes_as_a_search_with_it_or_more(agent, panorama):
+    agent.target_evidence.shares = torch.full((3,), 0.8)
+    paths = {}
+    for prior in (None, 0.1, 0.9):
+        paths[prior] = agent.search(Panorama(panorama), "blue", SearchSettings(passes=2, confirm=1.0, prior=prior))
+    usual = paths[None]
+    assert (usual.prior, usual.assumed) == (None, 0.5)
+    probability = usual.decision.probability
+    assert usual.probability_at(0.5) == probability
+    assert usual.probability_at(0.1) <= paths[0.1].decision.probability < probability
+    assert probability < paths[0.9].decision.probability <= usual.probability_at(0.9)
 
 
 def test_detections_of_a_path_equal_those_of_the_eye(agent, panorama):
