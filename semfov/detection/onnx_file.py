@@ -166,35 +166,56 @@ def names_beside(path: Path) -> list[str] | None:
     return None
 
 
-def _names_under(key: str) -> Callable[[str], list[str | int]]:
-    """Make the reader of names under a key of YAML or JSON: a list, or by their numbers."""
+class _TextsAndNull(yaml.BaseLoader):
+    """Loader of YAML that makes texts alone, of `no` and `on`, too, but for what is null: `~`, `null` and nothing."""
 
-    def names(text: str) -> list[str | int]:
-        try:
-            content = yaml.load(text, yaml.BaseLoader)  # noqa: S506 (it makes texts alone, of `no` and `on`, too)
-        except (yaml.YAMLError, RecursionError, ValueError):
-            return []
-        return _listed(content.get(key)) if isinstance(content, Mapping) else []
 
-    return names
+_NULL = "tag:yaml.org,2002:null"
+_TextsAndNull.add_implicit_resolver(_NULL, re.compile("(~|null|Null|NULL|)$"), ["~", "n", "N", ""])
+_TextsAndNull.add_constructor(_NULL, lambda _loader, _node: None)
+
+
+def _names_in_yaml(text: str) -> list[str | int]:
+    """List the names of a data set for YOLO, which are a list, or by their numbers."""
+    try:
+        content = yaml.load(text, _TextsAndNull)  # noqa: S506 (it makes texts alone)
+    except (yaml.YAMLError, RecursionError, ValueError):
+        return []
+    return _listed(content.get("names")) if isinstance(content, Mapping) else []
+
+
+def _names_in_config(text: str) -> list[str | int]:
+    """List the names of a model of `transformers`, which are by their numbers."""
+    try:
+        content = json.loads(text)
+    except (RecursionError, ValueError):
+        return []
+    return _listed(content.get("id2label")) if isinstance(content, Mapping) else []
 
 
 def _names_in_lines(text: str) -> list[str]:
-    """List the names of a file with a name a line, which may begin with its number: `0 cat`, `0: cat`."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    numbered = [_NUMBERED.fullmatch(line) for line in lines]
-    numbers = [int(match[1]) for match in numbered if match]
-    if numbers in ([*range(len(lines))], [*range(1, len(lines) + 1)]):
-        return [match[2] for match in numbered if match]
-    return lines
+    """List the names of a file with a name a line, which may begin with the number of the line.
+
+    `0: cat` is a name with its number. `1 cat` may also be a name that begins with a number, as `1 euro` does: it is
+    one unless three lines or more are counted, and their names differ without the numbers, too.
+    """
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    numbered = [match for match in map(_NUMBERED.fullmatch, lines) if match]
+    numbers = [int(match["number"]) for match in numbered]
+    names = [match["name"] for match in numbered]
+    are_counted = numbers in ([*range(len(lines))], [*range(1, len(lines) + 1)])
+    are_marked = all(match["mark"] for match in numbered)
+    are_distinct = len({*names}) == len(names) >= _COUNTED
+    return names if are_counted and (are_marked or are_distinct) else lines
 
 
-_NUMBERED = re.compile(r"\s*(\d{1,6})(?:\s*[:,=]|\s)\s*(.+)")  # a name with its number
+_COUNTED = 3  # least number of lines whose numbers, with blanks after them, are those of the lines
+_NUMBERED = re.compile(r"(?P<number>\d{1,6})(?:\s*(?P<mark>[:,=])|\s)\s*(?P<name>.+)")  # a name with its number
 
 _NAMES_BESIDE: dict[str, Callable[[str], list[str | int] | list[str]]] = {
-    **dict.fromkeys(("data.yaml", "data.yml"), _names_under("names")),
+    **dict.fromkeys(("data.yaml", "data.yml"), _names_in_yaml),
     **dict.fromkeys(("classes.txt", "labels.txt", "obj.names"), _names_in_lines),
-    "config.json": _names_under("id2label"),
+    "config.json": _names_in_config,
 }
 """Files beside a model with the names of classes, in the order in which they are looked for, and how they are read."""
 

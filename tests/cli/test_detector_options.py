@@ -17,6 +17,7 @@ from semfov.cli.commands import SUBCOMMANDS
 from semfov.cli.main import _in_command_words, _message_options, main
 from semfov.cli.options import DetectorOptions
 from semfov.detection.load import loader_options
+from semfov.detection.onnx_file import names_beside
 from tests.refusals import refused
 from tests.small import write_network
 
@@ -127,6 +128,8 @@ NAMES = ("vehicle", "car", "taxi")
         ({}, {"classes.txt": "background\nvehicle\ncar\ntaxi\n"}),
         ({}, {"obj.names": "vehicle\ncar\ntaxi\n"}),
         ({}, {"config.json": '{"id2label": {"0": "vehicle", "1": "car", "2": "taxi"}}'}),
+        ({}, {"config.json": '{\n\t"id2label": {"0": "vehicle", "1": "car", "2": "taxi"}}'}),
+        ({}, {"data.yaml": "names: [cat, dog, ~]", "classes.txt": "0=vehicle\n1=car\n2=taxi"}),
         ({}, {"data.yaml": "names: [cat, dog]", "mine.json": '{"classes": ["vehicle", "car", "taxi"]}'}),
     ],
 )
@@ -134,6 +137,23 @@ def test_names_are_found_in_the_metadata_and_beside_the_file(metadata, beside, n
     for name, text in beside.items():
         (tmp_path / name).write_text(text)
     assert load_detector(network(columns(), metadata=metadata), head="yolov8").classes == NAMES
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("1 euro\n2 euro\n", ["1 euro", "2 euro"]),
+        ("1 euro\n2 euro\n3 euro\n", ["1 euro", "2 euro", "3 euro"]),
+        ("1 person\n", ["1 person"]),
+        ("0: person\n", ["person"]),
+        ("1 , cat\n2,dog\n", ["cat", "dog"]),
+        ("1 cat\n2 dog\n5 cup\n", ["1 cat", "2 dog", "5 cup"]),
+        ("0 cat\n1 dog\n2 3 cups\n", ["cat", "dog", "3 cups"]),
+    ],
+)
+def test_a_number_before_a_name_is_left_out_where_it_counts_the_lines(text, names, tmp_path):
+    (tmp_path / "classes.txt").write_text(text)
+    assert names_beside(tmp_path / "mine.onnx") == names
 
 
 def test_names_beside_the_file_that_are_too_many_are_counted(network, tmp_path):
