@@ -230,6 +230,8 @@ class Outcome(ABC):
         each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
         or a head. Of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`) it is twice the sum
         (`semfov.zoom.certainty.number_of_faint`), and not known in a large picture in which no other class is clear.
+        For the target of a search it is at least the probability of the decision, since a picture that holds the target
+        holds one or more.
         """
         return NumberByClass({name: mean for name, (mean, _) in self._claimed().items()})
 

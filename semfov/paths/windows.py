@@ -42,6 +42,7 @@ _LATTICE = {
     "canvas": Array(Number(low=1, whole=True), 2),
     "magnifications": Array(POSITIVE, least=1, ascending=True),
 }
+_LEAST_SAID = 0.5  # expected number from which on it is said of a class without a listed object
 _CLEAR = 0.7  # score from which on an object of any class is clear
 _OBJECTS = ("boxes", "scores", "labels", "passes")
 
@@ -119,8 +120,9 @@ class WindowWords(Words):
     def objects(self) -> str:
         """Number of the objects, by class where classes were searched for, and how many to expect in all.
 
-        Such as `36 people found; expect 45 ± 9 in all`, or `No cup found`. Without a class to search for no number in
-        all is given, since the small rests of all classes add up to many.
+        Such as `36 people found; expect 45 ± 9 in all`, or `No cup found`; to which a detector hardly reacts, `2 people
+        found; expect at a guess 9.0 ± 9.9 in all`. Without a class to search for no number in all is given, since the
+        small rests of all classes add up to many.
         """
         record = self.record
         expected = []
@@ -138,19 +140,22 @@ class WindowWords(Words):
         return f" ({number} in all)" if number else ""
 
     def _expected(self, label: int) -> str:
-        """Say the expected number of objects of a class and its standard deviation, such as `45 ± 9`.
+        """Say the expected number of objects of a class and its standard deviation, such as `45 ± 9` or `0.8 ± 1.9`.
 
-        Empty where no number is estimated, and where none is listed and less than one is expected.
+        Empty where no number is estimated, and where none is listed and less than one half is expected.
         """
         record = self.record
         if record.unseen is None:
             return ""
         mean, variance = record._numbers().get(label, (math.nan, math.nan))
         listed = len(record.objects.of([label]))
-        if math.isnan(mean) or (not listed and mean < 1):
+        if math.isnan(mean) or (not listed and mean < _LEAST_SAID):
             return ""
-        error = round(variance**0.5)
-        return f"{mean:.0f} ± {error}" if error else f"{mean:.0f}"
+        error = variance**0.5
+        # Whole numbers would hide a small error, and read as `expect 1 cups`.
+        places = 0 if error >= 1 and max(mean, error) >= 10 else 1
+        guess = "" if record._reacts_to([label]) else "at a guess "
+        return f"{guess}{mean:.{places}f} ± {error:.{places}f}"
 
     @property
     def _ending(self) -> str:
@@ -318,7 +323,8 @@ class ZoomPath(Record):
     def _numbers(self) -> dict[int, tuple[float, float]]:
         """Mean and variance of the number of objects of each class; NaN where none is estimated.
 
-        The objects that no look has shown are shared among the classes by the sums of their probabilities.
+        The objects that no look has shown are shared among the classes by the sums of their probabilities. That of the
+        target of a search is no less than the probability that the picture holds it: E[N] ≥ P(N ≥ 1).
         """
         labels = self.sought or tuple(self.candidates.labels.unique().tolist())
         chances = {label: self.candidates.of([label]).scores for label in labels}
@@ -334,6 +340,10 @@ class ZoomPath(Record):
                 numbers[label] = number_of_faint(chances[label])
             else:
                 numbers[label] = (math.nan, math.nan)
+        if self.decision is not None and self.target in numbers:
+            mean, variance = numbers[self.target]
+            # The decision knows the prior and the closer looks, which the candidates do not.
+            numbers[self.target] = (max(mean, self.decision.probability), variance)  # NaN stays
         return numbers
 
     @cached_property

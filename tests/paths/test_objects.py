@@ -152,13 +152,13 @@ def test_objects_are_those_of_the_targets_from_the_threshold_on():
 @pytest.mark.parametrize(
     ("chances", "unseen", "words"),
     [
-        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 cups found; expect 4 ± 2 in all"),  # 4.4 ± 1.51
-        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 cups found; expect 3 ± 1 in all"),  # 3.0 ± 1.1
+        ([0.9, 0.9, 0.9, 0.2], (1.5, 0.25), "3 cups found; expect 4.4 ± 1.6 in all"),
+        ([0.9, 0.9, 0.9, 0.3], (0.0, 0.0), "3 cups found; expect 3.0 ± 1.1 in all"),
         ([*[0.9] * 2, *[0.7] * 2], (8.0, 0.0), "4 cups found; expect 11 ± 3 in all"),  # 11.2 ± 3.47
         ([0.9, *[0.3] * 9], (0.0, 0.0), "1 cup found"),
-        ([0.9, 0.1], (0.0, 0.0), "1 cup found; expect 1 ± 1 in all"),
+        ([0.9, 0.1], (0.0, 0.0), "1 cup found; expect 1.0 ± 0.5 in all"),
         ([*[0.6] * 5, *[0.4] * 20], (0, 0), "5 cups found; expect 11 ± 4 in all"),  # 11 ± 4.0
-        ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 cups found; expect 2 ± 1 in all"),  # 2.4 ± 1.2
+        ([0.6, 0.6, 0.6, 0.6], (0.0, 0.0), "4 cups found; expect 2.4 ± 1.2 in all"),
         ([0.2], (0.0, 0.0), "No cup found"),
     ],
 )
@@ -189,8 +189,24 @@ def test_a_photograph_has_a_number_where_the_detector_hardly_reacts():
     path = replace(path, candidates=faint)
     assert path.expected["cup"] == pytest.approx(2.4)
     assert path.expected_error["cup"] == pytest.approx((4 * 0.21 + 3.4**2) ** 0.5)
-    assert path.describe() == "No cup, no cat found; expect 2 ± 4 cups in all. 0 looks"
+    assert path.describe() == "No cup, no cat found; expect at a guess 2.4 ± 3.5 cups in all. 0 looks"
     assert isnan(replace(path, targets=()).expected["cup"])  # which nobody asked for
+    fewer = replace(path, candidates=faint[:1])
+    assert fewer.describe() == "No cup, no cat found; expect at a guess 0.6 ± 1.7 cups in all. 0 looks"
+
+
+@pytest.mark.parametrize("probability", [0.2, 0.71])
+def test_a_search_expects_no_fewer_than_the_probability_that_one_is_there(probability):
+    """In words, files and rows; closer looks and the prior are known to the decision alone."""
+    lattice = Lattice.over((640, 480), (416, 416))
+    faint = Objects(torch.rand(1, 4), torch.tensor([0.2]), torch.ones(1).long(), torch.zeros(1).long())
+    parts = {"looks": (), "score_threshold": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES, "target": 1}
+    decision = Decision("undecided", probability)
+    path = ZoomPath(lattice=lattice, candidates=faint, decision=decision, **parts)
+    assert replace(path, decision=None).expected["cup"] == pytest.approx(0.4)
+    for numbers in (path.expected, path.to_dict()["expected"]):
+        assert numbers["cup"] == pytest.approx(max(0.4, probability))
+    assert path.expected_error == replace(path, decision=None).expected_error
 
 
 @pytest.mark.parametrize(("clear", "given"), [(4, False), (5, True)])
@@ -219,11 +235,11 @@ def test_a_number_is_claimed_class_by_class():
     error = 0.09 + 0.16 + 0.1 * share + (0.3 * path.expected["cup"]) ** 2
     assert path.expected_error["cup"] == pytest.approx(error**0.5)
     assert replace(path, spread=0.0).expected_error["cup"] == pytest.approx((0.25 + 0.1 * share) ** 0.5)
-    assert path.words.objects == "2 cups, no cat found; expect 2 ± 1 cups in all"
+    assert path.words.objects == "2 cups, no cat found; expect 2.0 ± 0.8 cups in all"
     every = replace(path, targets=())
     # Of all classes only those are counted of which something is listed.
-    assert every.words.classes == "2 cups (2 ± 1 in all)"
-    assert replace(every, score_threshold=0.1).words.classes == "3 cats, 2 cups (2 ± 1 in all)"
+    assert every.words.classes == "2 cups (2.0 ± 0.8 in all)"
+    assert replace(every, score_threshold=0.1).words.classes == "3 cats, 2 cups (2.0 ± 0.8 in all)"
     assert replace(every, unseen=None).words.classes == "2 cups"
     assert isnan(path.expected["cat"])
     assert isnan(path.expected_error["cat"])
