@@ -131,8 +131,13 @@ class WindowWords(Words):
             if number:
                 name = f" {plural(record.classes[label])}" if len(record.sought) > 1 else ""
                 expected.append(f"{number}{name}")
-        text = super().objects
+        text = self._listed
         return f"{text}; expect {', '.join(expected)} in all" if expected else text
+
+    @property
+    def _listed(self) -> str:
+        """Number of the objects that are listed, by class."""
+        return super().objects
 
     def _number_in_all(self, label: int) -> str:
         """Say in brackets how many objects of a class to expect, such as ` (45 ± 9 in all)`; empty if not known."""
@@ -429,6 +434,20 @@ class WindowMomentWords(WindowWords, MomentWords):
         """Describe objects or decision at the frame in a few words."""
         text = self.decision or self.objects
         return f"{text}; the camera lost the scene" if self.record.lost else text
+
+    @property
+    def _listed(self) -> str:
+        """Number of the objects that are listed, by class, with a word of doubt where fewer are expected.
+
+        A stream lists objects of low probabilities, too, so that it may list more of them than there are.
+        """
+        record = self.record
+        doubtful = [
+            label
+            for label in record.sought
+            if self._expected(label) and len(record.objects.of([label])) > round(record.expected[record.classes[label]])
+        ]
+        return f"{super()._listed}, some of them doubtful" if doubtful else super()._listed
 
     @property
     def lines(self) -> list[str]:

@@ -11,7 +11,7 @@ from semfov import Detections, Flat, Grid, Objects, Panorama
 from semfov.cli.outcome import _looks_text
 from semfov.decision import CloseUp, Decision
 from semfov.head.views import Views
-from semfov.paths import HeadPath, ZoomPath
+from semfov.paths import HeadPath, WindowMoment, ZoomPath
 from semfov.paths.head import head_looks
 from semfov.paths.look import detections_in_words
 from semfov.paths.windows import looks_at_windows
@@ -173,6 +173,31 @@ def test_the_number_in_all_is_the_expected_one_with_its_error(chances, unseen, w
     numbers = values["expected"]["cup"], values["expected_error"]["cup"]
     exact = pytest.approx((path.expected["cup"], path.expected_error["cup"]), rel=1e-3)
     assert numbers == (exact if "expect" in words else (None, None))
+
+
+@pytest.mark.parametrize(
+    ("chances", "targets", "words"),
+    [
+        ([(1, 0.6)] * 6, (1,), "6 cups found, some of them doubtful; expect 4 ± 1 in all"),  # 3.6 ± 1.3
+        ([(1, 0.9)] * 6, (1,), "6 cups found, some of them doubtful; expect 5 ± 1 in all"),
+        ([(1, 0.95)] * 6, (1,), "6 cups found; expect 6 ± 1 in all"),
+        (
+            [*[(1, 0.6)] * 6, (2, 0.95)],
+            (1, 2),
+            "6 cups, 1 cat found, some of them doubtful; expect 4 ± 1 cups, 1 cats in all",
+        ),
+        ([(1, 0.6)] * 6, (), "6 objects found"),
+    ],
+)
+def test_a_stream_that_lists_more_than_it_expects_says_so(chances, targets, words):
+    labels, scores = torch.tensor([label for label, _ in chances]), torch.tensor([chance for _, chance in chances])
+    found = Objects(torch.rand(len(chances), 4), scores, labels, torch.zeros_like(labels))
+    lattice = Lattice.over((2560, 1920), (416, 416))
+    moment = WindowMoment(
+        lattice=lattice, classes=CLASSES, target=None, targets=targets, looks=(), candidates=found, unseen=(0.0, 0.0),
+        spread=0.0, score_threshold=0.35, number=0, next_window=Window.overview(lattice),
+    )  # fmt: skip
+    assert moment.describe() == words
 
 
 def test_a_photograph_has_a_number_where_the_detector_hardly_reacts():
