@@ -16,6 +16,7 @@ from torch import Tensor
 
 from semfov.agent import ActivePerception
 from semfov.belief.grid import Grid
+from semfov.belief.prior import PriorLike
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.doorkeeper import Doorkeeper, token_for
 from semfov.cli.options import AppOptions
@@ -179,7 +180,7 @@ class _Calls:
             target: class, or all of them.
             task: one of `_TASKS`.
             passes: largest number of passes of the detector.
-            prior: for a search, share of such pictures that hold the class; empty for one half.
+            prior: for a search, share of such pictures that hold the class, or `fit`; empty for one half.
             visitor: who asks.
 
         Returns:
@@ -267,14 +268,17 @@ def _framed(page: str) -> str:
     return f'<iframe title="The looks" sandbox="allow-scripts" srcdoc="{escape(page)}"></iframe>'
 
 
-def _share(text: str | None) -> float | None:
-    """Read a share that was typed; None for an empty text. Whether it is one, a search checks."""
-    if not (text or "").strip():
+def _share(text: str | None) -> PriorLike:
+    """Read a share that was typed, or `fit`; None for an empty text. Whether it is one, a search checks."""
+    typed = (text or "").strip()
+    if not typed:
         return None
+    if typed == "fit":
+        return "fit"
     try:
-        return float(text or "")
+        return float(typed)
     except ValueError:
-        raise InputError(f"prior: expected a share above 0 and below 1, such as 0.2, got {text}") from None
+        raise InputError(f"prior: expected fit, or a share above 0 and below 1, such as 0.2, got {typed}") from None
 
 
 def _read(path: str | None) -> Tensor:
@@ -367,7 +371,7 @@ def _lay_out_panel(calls: _Calls) -> _Panel:
         prior = gradio.Textbox(
             label="Share of your pictures that hold the class",
             placeholder="0.5",
-            info="For a search.",
+            info="For a search; fit takes that of the fit.",
             interactive=False,
         )
     return _Panel(picture, task, target, go, end, example, passes, prior)

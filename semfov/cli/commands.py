@@ -82,7 +82,7 @@ usage: semfov search [PICTURE ...] --target CLASS [options]
 {_AGENT}
 {_LOOKS}
   --confirm P          found from this probability on; --stop-below P: stop if the chance of a new hit is lower
-  --closer N           most closer looks (0: none); --prior P: share of pictures with it (default: 0.5)
+  --closer N           most closer looks (0: none); --prior P: share of pictures with it, or fit (default: 0.5)
   --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
 {_OUTPUT}
 """,
@@ -200,13 +200,13 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   VIDEO, FOLDER, URL   a video file, a folder of frames, or an address such as rtsp://… that OpenCV can open
   --camera N           number of a camera; Ctrl-C ends it
   --target CLASS       class to search for (default: explore)
-  --find CLASSES       classes of which all objects are to be found, with commas between them
+  --find CLASSES       classes, with commas, of which all objects are to be found (default: from probability 0.35 on)
   --how KIND           auto (default: windows of any frame), fovea, or windows
   --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
   --rate R             rate at which evidence fades, per second (0: never; default: 2.5 for a fovea, 0.75 for windows)
   --confirm P          found from this probability on; --stop-below P: no closer look if the chance of a hit is lower
   --closer N           most closer looks in the time until half of the evidence has faded (0: none)
-  --prior P            share of the frames that hold the target (default: 0.5)
+  --prior P            share of the frames that hold the target, or fit: that of the fit (default: 0.5)
 {_AGENT}
   --start 5,5          first cell as column,row, or its number; --seed N draws it
   --out FILE           video to write (.mp4 or .avi), with gaze and belief, or windows and objects
