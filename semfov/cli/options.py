@@ -112,7 +112,8 @@ class PictureOptions(LookSettings, AgentOptions):
         annotations: annotation file in COCO's format; `--out FILE.coco.json` is then a list of results with its ids of
             pictures and categories, and their average precision is printed.
         report: HTML page to write, in which to step through the looks.
-        crops: folder for what the box of each object shows, as JPEG, with a folder for each class.
+        crops: folder for what the box of each object shows, as JPEG, with a folder for each class; of a search without
+            one the best place.
         labels: folder for labels in the format of YOLO, a text file for each picture (`semfov.paths.Record.to_yolo`).
         looks: print every look.
         workers: number of processes that look at several pictures (each takes the memory of a detector).

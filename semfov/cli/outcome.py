@@ -56,10 +56,10 @@ def _decision_text(record: Record, decision: Decision) -> str:
     decided_by = record.words.decided_by
     measure = "probability that the picture holds it:" if decided_by == "probability" else decided_by
     probability = f"{measure} {decision.probability:.2f}"
-    if decision.outcome == "absent":
-        return f"{name} is {record.words.doubt}not there, {probability}"
-    if decision.outcome == "undecided":
-        return "; ".join(filter(None, (f"{record.words.verdict(name)}, {probability}", record.words.best_place)))
+    if decision.outcome != "found":
+        is_absent = decision.outcome == "absent"
+        verdict = f"{name} is {record.words.doubt}not there" if is_absent else record.words.verdict(name)
+        return "; ".join(filter(None, (f"{verdict}, {probability}", record.words.best_place)))
     point = record.found_at
     place = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
     edges = "" if decision.box is None else f", box {box_text(decision.box.tolist())}"
@@ -215,7 +215,7 @@ def _labels(record: Record, source: PictureSource, options: PictureOptions) -> d
 
 
 def _crops(record: Record, source: PictureSource, options: PictureOptions) -> dict[str, bytes]:
-    """Cut out what the box of each object shows, if that is wanted; returns the files by their paths."""
+    """Cut out what the box of each object shows, or of a search the best place; returns the files by their paths."""
     if options.crops is None:
         return {}
     files = {}
@@ -223,6 +223,11 @@ def _crops(record: Record, source: PictureSource, options: PictureOptions) -> di
     for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
         folder = options.crops / plain_name(record.classes[label]) / source.place.parent
         files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)
+    if not files and record.best_place is not None:
+        box, _ = record.best_place
+        (crop,) = record.crops(source.picture(), boxes=box[None])
+        folder = options.crops / plain_name(str(record.target_name)) / source.place.parent
+        files[str(folder / f"{source.place.stem}-best.jpg")] = jpeg(crop, 92)
     return files
 
 

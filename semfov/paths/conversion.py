@@ -17,6 +17,7 @@ from semfov.data.classes import canonical_name
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
+from semfov.decision import Decision
 from semfov.detection.exchange import CocoResult, category_ids, coco_results, named_detections
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
@@ -132,7 +133,8 @@ class Conversion(Outcome, OtherWords):
         """Convert the outcome, the objects (`object_rows`) and the looks (`rows`) to JSON values.
 
         Returns:
-            Values by name; None for the box of what was not found, and for numbers and errors that are not claimed.
+            Values by name. Point and box of a search are those of the found target, or of the best place of one that
+            leaves it open, as `outcome` tells; None without one, and for numbers and errors that are not claimed.
         """
         width, height = self.size
         return {
@@ -152,20 +154,26 @@ class Conversion(Outcome, OtherWords):
         }
 
     def _decision_values(self) -> Values:
-        """Make JSON values of the decision, with the point and the box of a found target; empty without one."""
+        """Make JSON values of the decision, with the place of the target or the best place; empty without one."""
         decision = self.decision
         if decision is None:
             return {}
-        point = (None, None) if self.found_at is None else self.found_at
-        found_box = decision.box if decision.outcome == "found" else None
-        box = [None] * 4 if found_box is None else found_box.tolist()
         return {
             "outcome": decision.outcome,
             "probability": digits(decision.probability),
             "prior": self.prior,
             "assumed": None if self.assumed is None else round(self.assumed, 6),
-            **_rounded_place(*point, *box),
+            **self._decided_place(decision),
         }
+
+    def _decided_place(self, decision: Decision) -> dict[str, float | None]:
+        """Make JSON values of the place of a found target, or of the best place: a point and a box."""
+        if self.best_place is not None:
+            x1, y1, x2, y2 = self.best_place[0].tolist()
+            return _rounded_place((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2)
+        point = (None, None) if self.found_at is None else self.found_at
+        found_box = decision.box if decision.outcome == "found" else None
+        return _rounded_place(*point, *([None] * 4 if found_box is None else found_box.tolist()))
 
     def object_rows(self) -> list[Values]:
         """Make a table of the objects, of plain values, most confident first.
@@ -342,21 +350,24 @@ class Conversion(Outcome, OtherWords):
         """
         width, height = self.size
         lines = []
-        for label, (x1, y1, x2, y2) in zip(self.objects.labels.tolist(), self._boxes_inside(), strict=True):
+        for label, (x1, y1, x2, y2) in zip(
+            self.objects.labels.tolist(), self._boxes_inside(self.objects.boxes), strict=True
+        ):
             middle = f"{(x1 + x2) / 2 / width:.6f} {(y1 + y2) / 2 / height:.6f}"
             extent = f"{(x2 - x1) / width:.6f} {(y2 - y1) / height:.6f}"
             lines.append(f"{label - 1} {middle} {extent}\n")
         return _written("".join(lines), path)
 
-    def crops(self, picture: LargePicture | ImageLike | None = None) -> list[Tensor]:
+    def crops(self, picture: LargePicture | ImageLike | None = None, *, boxes: Tensor | None = None) -> list[Tensor]:
         """Cut what the box of each object shows out of the picture.
 
         Args:
             picture: the picture in full size; None takes the file that the record comes from, with the values and
                 bands that were shown.
+            boxes: `(M, 4)`, other boxes to cut out, such as that of the best place; None takes those of the objects.
 
         Returns:
-            `(3, h, w)` bytes of each of the objects, in their order, at least a pixel wide and high.
+            `(3, h, w)` bytes of each of the boxes, in their order, at least a pixel wide and high.
 
         Raises:
             InputError: no picture is given, or the record's is not known, or it has another size.
@@ -366,7 +377,7 @@ class Conversion(Outcome, OtherWords):
         width, height = self.size
         check(opened.size == (width, height), "picture", f"the record's, {width} × {height} px", opened.size)
         crops = []
-        for x1, y1, x2, y2 in self._boxes_inside():
+        for x1, y1, x2, y2 in self._boxes_inside(self.objects.boxes if boxes is None else boxes):
             # A box without area, or at the right or lower border, still has a pixel.
             left = min(int(x1), width - 1)
             top = min(int(y1), height - 1)
@@ -383,10 +394,10 @@ class Conversion(Outcome, OtherWords):
             raise InputError("picture: expected the picture, as the record does not come from a file, got None")
         return open_large(self.source, **(self.shown or {}))
 
-    def _boxes_inside(self) -> list[list[float]]:
-        """Cut the boxes of the objects at the borders of the picture."""
+    def _boxes_inside(self, boxes: Tensor) -> list[list[float]]:
+        """Cut boxes `(M, 4)` at the borders of the picture."""
         width, height = self.size
-        return self.objects.boxes.minimum(torch.tensor([width, height] * 2)).clamp(min=0).tolist()
+        return boxes.minimum(torch.tensor([width, height] * 2)).clamp(min=0).tolist()
 
     def to_geojson(
         self, path: str | PathLike[str] | None = None, *, source: str | PathLike[str] | None = None

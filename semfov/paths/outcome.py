@@ -24,6 +24,7 @@ from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
 from semfov.paths.merging import distances_to, merge_fixations
 
+_DOUBTFUL = 0.1  # probability from which on an absent target is only probably absent
 _CONFIRMING = 0.5  # probability from which on a closer look confirms that the target is there
 
 
@@ -258,9 +259,21 @@ class Outcome(ABC):
         return self.targets or (() if self.target is None else (self.target,))
 
     @property
+    def is_doubtful(self) -> bool:
+        """Whether a search leaves it open if the target is there: it is undecided, or only probably absent."""
+        decision = self.decision
+        if decision is None or decision.outcome == "found":
+            return False
+        said = round(decision.probability, 2)  # as the sentences have it
+        return decision.outcome == "undecided" or said >= _DOUBTFUL
+
+    @property
     def best_place(self) -> tuple[Tensor, float] | None:
-        """Where the target of an undecided search is most likely, a box `(4,)`, and its probability or score."""
-        if self.decision is None or self.decision.outcome != "undecided":
+        """Where the target of a search is most likely that leaves it open, a box `(4,)`, and its probability or score.
+
+        None where the target was found, is surely absent (below a probability of 0.1), or where nothing is like it.
+        """
+        if not self.is_doubtful:
             return None
         places = [(look.box, look.place) for look in self.closer]
         if not places:

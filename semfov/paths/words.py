@@ -12,7 +12,6 @@ from semfov.paths.outcome import Outcome
 
 _MATTERS = 0.1  # change of the probability, at one half, from which on the assumed share is said
 _CLEAR = 0.5  # probability or score from which on a place was clearly seen as the target
-_DOUBTFUL = 0.1  # probability from which on an absent target is only probably absent
 
 
 class Words(ABC):
@@ -138,8 +137,7 @@ class Words(ABC):
         decision = self.record.decision
         if decision is None or decision.outcome != "absent":
             return ""
-        said = round(decision.probability, 2)  # as the sentences have it
-        return "probably " if said >= _DOUBTFUL else ""
+        return "probably " if self.record.is_doubtful else ""
 
     @property
     def _is_seen_clearly(self) -> bool:
@@ -150,7 +148,7 @@ class Words(ABC):
 
     @property
     def best_place(self) -> str:
-        """The most likely place of the target of an undecided search; empty for others and without one."""
+        """The most likely place of the target of a search that leaves it open; empty for others and without one."""
         place = self.record.best_place
         if place is None:
             return ""

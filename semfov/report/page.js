@@ -74,7 +74,7 @@
     const target = frame("path", episode.image, `Photograph with fixations 0 to ${fixation}, now at ${place(visited[fixation])}`);
     for (const truth of episode.truth) target.append(box(truth, { stroke: TRUTH, "stroke-width": 3 * unit(), "stroke-dasharray": `${8 * unit()} ${5 * unit()}` }));
     if (episode.outcome.box !== null && fixation === episode.fixations.length - 1) {
-      const dashes = episode.found ? "none" : `${8 * unit()} ${5 * unit()}`; // the best place of an undecided search
+      const dashes = episode.found ? "none" : `${8 * unit()} ${5 * unit()}`; // the best place of a search that leaves it open
       target.append(box(episode.outcome.box, { stroke: "white", "stroke-width": 5 * unit() }), box(episode.outcome.box, { stroke: FOUND, "stroke-width": 3 * unit(), "stroke-dasharray": dashes }));
     }
     // Colours go from dark to bright over the whole episode, however much of it is shown.

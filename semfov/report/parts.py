@@ -99,7 +99,8 @@ class Part(ABC):
         """List the objects with what their boxes show, most confident first."""
         objects = self.data["objects"]
         if not self.data["count"]:
-            return "<p>No objects were found.</p>"
+            doubt = " The best place, not sure enough, is dashed." if self.data["best"] else ""
+            return f"<p>No objects were found.{doubt}</p>"
         heads = ["#", "", "class", "score", self.look, "box"]
         if self.data["turns"]:
             heads.insert(heads.index(self.look), "pan, tilt")

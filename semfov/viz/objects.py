@@ -120,7 +120,7 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
     """List the boxes of a record in the order in which they are drawn.
 
     First come places that a closer look refuted, then the objects, the most confident last, over the others, and then
-    the best place of an undecided search. A box over the seam of a panorama is drawn at both ends.
+    the best place of a search that leaves it open. A box over the seam of a panorama is drawn at both ends.
 
     Args:
         record: the record.

@@ -90,7 +90,10 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     assert path.to_dict()["summary"].endswith(" Best place: box 50,40–70,55, probability 0.30.")
     told = _looks_text(path).splitlines()
     assert [line.endswith(", as decided") for line in told if "closer look " in line][:2] == [False, True]
-    for other in (None, Decision("absent", 0.1), Decision("found", 0.9, 0, torch.tensor(LEFT))):
+    values = path.to_dict()
+    assert [values[name] for name in ("outcome", "x", "y", "x1", "y1", "x2", "y2")] == ["undecided", 60, 47.5, *RIGHT]
+    assert replace(path, decision=Decision("absent", 0.1)).words.best_place == path.words.best_place
+    for other in (None, Decision("absent", 0.09), Decision("found", 0.9, 0, torch.tensor(LEFT))):
         assert replace(path, decision=other).words.best_place == ""
     assert small.with_looks(replace(path, closer=()), detections=[look(), look()]).words.best_place == ""
 
