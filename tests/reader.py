@@ -27,7 +27,7 @@ def fill(folder: Path) -> dict[str, object]:
     _save(Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image, folder / "harbour.jpg")
     (folder / "drone.jpg").symlink_to("harbour.jpg")
     _save(Panoramas(scenes, width=1024, count=1)[0].image, folder / "panorama.jpg")
-    for name in ("FLIGHT/1.jpg", "FLIGHT/2.jpg", "drafts/a.png"):
+    for name in ("FLIGHT/1.jpg", "FLIGHT/2.jpg", "HOLIDAY/1.jpg", "HOLIDAY/2.jpg", "drafts/a.png"):
         (folder / name).parent.mkdir(exist_ok=True)
         _save(scenes[3].image, folder / name, (960, 640))
     for number, name in enumerate(("before.png", "after.png")):

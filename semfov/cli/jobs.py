@@ -341,7 +341,7 @@ def _any_of_classes(options: SearchOptions, classes: Sequence[str], error: Input
         if options.how == "fovea" or options.start is not None or options.shifts is not None:
             return dict.fromkeys(names, 1.0)
         raise InputError(
-            f"{error}; a search is for one class, `semfov find` takes several, and --how fovea any of them"
+            f"{error}; a search is for one class: for any of several add --how fovea, for all use `semfov find`"
         ) from None
     if "did you mean" in str(error):
         raise error

@@ -222,6 +222,7 @@ def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Val
         counts = ", ".join(f"{times} {name}" for name, times in endings.items())
         skipped = f"{len(faults)} skipped" if faults else ""
         print(f"{count} pictures: {'; '.join(filter(None, [counts, _found_in_all(files), skipped]))}")
+        print(_assumed_in_all(files), end="")
     return [files.rows[number] for number in range(count)]
 
 
@@ -231,6 +232,16 @@ def _found_in_all(files: PictureFiles) -> str:
         return ""
     counts = Counter(line["class"] for row in files.rows.values() for line in row.get("objects", ()))
     return f"{', '.join(counted(number, name) for name, number in counts.most_common())} found" if counts else ""
+
+
+def _assumed_in_all(files: PictureFiles) -> str:
+    """Say how many pictures the probabilities of searches assume to hold the target; empty where it is not known."""
+    shares = {row.get("assumed") for row in files.rows.values()} - {None}
+    if len(shares) != 1:
+        return ""
+    (share,) = shares
+    how_many = "half" if share == 0.5 else f"{100 * share:.3g} %"
+    return f"The probabilities assume that {how_many} of the pictures hold it (--prior).\n"
 
 
 def _skip(job: PictureJob[PictureOptions], files: PictureFiles, number: int, fault: SemfovError) -> None:

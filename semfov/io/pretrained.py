@@ -153,7 +153,7 @@ def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
         return name
     names = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))
     raise InputError(
-        f"detector: no {kind.title} is shipped for {name!r}, only for {', '.join(names)}; fit all models to it with "
-        f"`{fit_command(model)}` or semfov.fit_detector, and load them with "
-        "ActivePerception.from_pretrained('mymodels'); ActivePerception.raw needs no model"
+        f"detector: no {kind.title} is shipped for {name!r}, only for {', '.join(names)}; without a fit use "
+        f"ActivePerception.raw, or fit all models to it with `{fit_command(model)}` or semfov.fit_detector, and load "
+        "them with ActivePerception.from_pretrained('mymodels')"
     )

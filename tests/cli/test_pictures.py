@@ -334,8 +334,9 @@ def test_a_search_of_pictures_is_a_table_with_a_line_for_each(run, photo, tmp_pa
     folder.mkdir()
     photo.rename(folder / "a.png")
     Image.new("RGB", (160, 120), (100, 100, 100)).save(folder / "b.png")
-    code, _ = run("search", folder, "--target", "red", "--shifts", 4, "--out", tmp_path / "found.csv")
+    code, printed = run("search", folder, "--target", "red", "--shifts", 4, "--out", tmp_path / "found.csv")
     assert code == 0
+    assert "The probabilities assume" not in printed.out  # which are scores
     with (tmp_path / "found.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
     assert (first["outcome"], second["outcome"]) == ("found", "undecided")
@@ -654,13 +655,17 @@ def test_a_large_picture_is_looked_at_in_windows_and_closely(run, large, agent, 
     assert len(episode["looks"]) == int(episode["passes"])
     _, printed = run(*search, "--closer", 0)
     assert "closer look" not in printed.out
-    _, printed = run(
-        "search", large, "--target", "red", "--confirm", 1, "--stop-below", 0, "--passes", 3, "--closer", 0
-    )
+    undecided = ("--confirm", 1, "--stop-below", 0, "--passes", 3, "--closer", 0)
+    _, printed = run("search", large, "--target", "red", *undecided, "--out", tmp_path / "place.csv")
     # The red square is at 1000, 700 to 1040, 740.
     place = re.search(r"red undecided, .*; best place: box (\d+),(\d+)–(\d+),(\d+), score 0\.\d\d$", printed.out, re.M)
     assert place
     assert [int(edge) for edge in place.groups()] == pytest.approx([1000, 700, 1040, 740], abs=8)
+    with (tmp_path / "place.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["outcome"] == "undecided"
+    box = [float(row[name]) for name in ("x1", "y1", "x2", "y2")]
+    assert box == pytest.approx([1000, 700, 1040, 740], abs=8)
 
 
 def test_remedies_are_in_the_words_of_the_command(run, large):

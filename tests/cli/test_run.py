@@ -7,7 +7,7 @@ import os
 import shutil
 import signal
 import threading
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from semfov import DataError, InputError, read_image
 from semfov.cli import outcome, written
 from semfov.cli.jobs import FindJob
 from semfov.cli.options import FindOptions
+from semfov.cli.search import _assumed_in_all
 from semfov.gaze.policies import Policy
 from semfov.paths import Record
 from semfov.runs.command import run_command
@@ -111,6 +112,20 @@ def test_a_fault_at_one_picture_is_a_row_with_its_reason(
     printed = capsys.readouterr().err
     assert f"skipped {folder / 'abc'[number]}.png" in printed
     assert 'raise KeyError("a fault of the code")' in printed
+
+
+@pytest.mark.parametrize(
+    ("shares", "told"),
+    [
+        ((0.5, 0.5), "The probabilities assume that half of the pictures hold it (--prior).\n"),
+        ((0.05,), "The probabilities assume that 5 % of the pictures hold it (--prior).\n"),
+        ((0.5, 0.1), ""),
+        ((None,), ""),
+    ],
+)
+def test_a_search_of_many_pictures_tells_what_its_probabilities_assume(shares, told):
+    rows = {number: {"assumed": share} for number, share in enumerate(shares)}
+    assert _assumed_in_all(SimpleNamespace(rows={**rows, 9: {"error": "unreadable"}})) == told
 
 
 def test_pictures_with_long_names_end_no_command(run, photo, tmp_path):

@@ -23,7 +23,7 @@ REFUSED = {
     "search --target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "search --target mug": "target: unknown class 'mug'; did you mean 'cup'?",
     "search --target qqq": "airplane and 75 more; `semfov detectors NAME` lists them",
-    "search --target cup,fork": "; a search is for one class, `semfov find` takes several, and --how fovea any of them",
+    "search --target cup,fork": "; a search is for one class: for any of several add --how fovea, for all",
     "search": "target: expected a class, --target cup, got none; `semfov detectors yolox-nano` lists them",
     "find --target cup,zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
     "find --start 5,5": "start: expected none for find",

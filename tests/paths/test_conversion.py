@@ -61,6 +61,8 @@ def test_labels_of_yolo_are_shares_and_crops_the_pixels_of_the_boxes(record):
     crops = record.crops(picture)
     assert torch.equal(crops[2], picture[:, 5:20, 40:61])
     assert [tuple(crop.shape) for crop in crops] == [(3, 9, 8), (3, 30, 20), (3, 15, 21)]
+    (middle,) = record.crops(picture, boxes=torch.tensor([[10.0, 20, 30, 90]]))
+    assert torch.equal(middle, picture[:, 20:60, 10:30])
     refused("picture: expected the record's, 80 × 60 px", record.crops, picture[:, :30])
     refused("as the record does not come from a file, got None", record.crops)
 

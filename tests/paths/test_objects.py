@@ -3,12 +3,14 @@
 import json
 from dataclasses import replace
 from math import isnan
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from semfov import Detections, Flat, Grid, Objects, Panorama
-from semfov.cli.outcome import _looks_text
+from semfov.cli.outcome import _crops, _looks_text
 from semfov.decision import CloseUp, Decision
 from semfov.head.views import Views
 from semfov.paths import HeadPath, WindowMoment, ZoomPath
@@ -90,6 +92,9 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     assert path.to_dict()["summary"].endswith(" Best place: box 50,40–70,55, probability 0.30.")
     told = _looks_text(path).splitlines()
     assert [line.endswith(", as decided") for line in told if "closer look " in line][:2] == [False, True]
+    options, source = SimpleNamespace(crops=Path("out")), SimpleNamespace(place=Path("in/a.png"))
+    source.picture = lambda: torch.zeros(3, 60, 80)
+    assert list(_crops(path, source, options)) == [str(Path("out/cup/in/a-best.jpg"))]
     values = path.to_dict()
     assert [values[name] for name in ("outcome", "x", "y", "x1", "y1", "x2", "y2")] == ["undecided", 60, 47.5, *RIGHT]
     assert replace(path, decision=Decision("absent", 0.1)).words.best_place == path.words.best_place
