@@ -1,6 +1,7 @@
 """The record of a folder of fitted models: their detector and sensor, the parts, and which of the parts are used."""
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
@@ -20,6 +21,9 @@ _MOST_BYTES = 2**24
 
 PARTS = ("observation", "tempering", "evidence", "verification", "windows")
 """Parts that a folder may hold, in the order in which they are fitted."""
+
+_FORMER_MAP = "map"
+"""Name of the part of its own that was the map in folders of earlier versions."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
 
@@ -46,8 +50,7 @@ _RECORD = {
     # Further values depend on the sensor, which checks them when it is made.
     "sensor": Object({"name": Text(), "reference": Number(above=0)}, Json(), ("name", "reference")),
     "grid": Array(Number(1, 200), 2),
-    # Folders of earlier versions have a map of its own, which is not read.
-    "parts": Object(dict.fromkeys((*PARTS, "map"), _PART)),
+    "parts": Object(dict.fromkeys((*PARTS, _FORMER_MAP), _PART)),
     "training": Object(others=Json()),
 }
 
@@ -102,6 +105,10 @@ class Manifest:
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
         record = _read_record(Path(folder) / FILE)
+        if _FORMER_MAP in record["parts"]:
+            warnings.warn(
+                f"{folder}: its map is of an earlier version and is not read; run semfov fit again", stacklevel=2
+            )
         parts = {name: Part(**part) for name, part in record["parts"].items() if name in PARTS}
         for part in parts.values():
             _check_file(part, Path(folder))

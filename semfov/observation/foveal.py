@@ -23,6 +23,7 @@ from semfov.observation.statistics import DirichletStatistics
 
 _MOST_TEMPERING = 100
 _MOST_DISTANCE = 10  # larger ones are taken for pixels: no fixation lies ten longer sides from a box of its image
+_MOST_LOG_CELL = 50  # of the logarithms of m, a and w
 
 
 class FovealObservationModel(Pretrained):
@@ -97,7 +98,7 @@ class FovealObservationModel(Pretrained):
             "log_exponents": Field(("N",), low=-10, high=10, optional=True),
             "log_miss": Field(("K+1", "N"), low=-50, high=50, optional=True),
             "refutation": Field((), low=0, high=1, optional=True),
-            "log_cell": Field((3,), low=-50, high=50, optional=True),
+            "log_cell": Field((3,), low=-_MOST_LOG_CELL, high=_MOST_LOG_CELL, optional=True),
         },
         {"classes": CLASSES, "epsilon": Number(above=0, high=1)},
     )
@@ -153,8 +154,6 @@ class FovealObservationModel(Pretrained):
             powers = alpha.new_ones(levels)
         rho = torch.as_tensor(refutation).detach().to(alpha).clone()
         check(0 <= float(rho) <= 1, "refutation", "a number from 0 to 1", refutation)
-        of_cells = _table(torch.as_tensor(cell), "cell", (3,), alpha)
-        assert of_cells is not None
 
         self.log_alpha = nn.Parameter(alpha.detach().log())
         self.register_buffer("edges", borders)
@@ -165,7 +164,7 @@ class FovealObservationModel(Pretrained):
         self.log_exponents = nn.Parameter(powers.log())
         self.log_miss = None if odds is None else nn.Parameter(odds.log())
         self.refutation = nn.Parameter(rho)
-        self.log_cell = nn.Parameter(of_cells.log())
+        self.log_cell = nn.Parameter(_checked_log_cell(cell, alpha))
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
@@ -530,6 +529,20 @@ def _checked_borders(edges: Sequence[float] | Tensor, like: Tensor) -> Tensor:
     return borders
 
 
+def _checked_log_cell(cell: Sequence[float] | Tensor, like: Tensor) -> Tensor:
+    """Check m, a and w, and return their logarithms, `(3,)`."""
+    are_numbers = isinstance(cell, Tensor) or (
+        isinstance(cell, Sequence) and all(isinstance(number, int | float) for number in cell)
+    )
+    check(are_numbers, "cell", "three positive numbers", repr(cell))
+    numbers = torch.as_tensor(cell).detach().to(like)
+    check(tuple(numbers.shape) == (3,), "cell", "shape (3,)", tuple(numbers.shape))
+    logarithms = numbers.log()
+    is_inside = bool((logarithms.abs() <= _MOST_LOG_CELL).all())  # not so for NaN
+    check(is_inside, "cell", f"numbers from e^-{_MOST_LOG_CELL} to e^{_MOST_LOG_CELL}", numbers.tolist())
+    return logarithms
+
+
 def _table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor) -> Tensor | None:
     """Check a table that may be left out, and copy it; odds and exponents must be positive."""
     if table is None:
@@ -537,7 +550,7 @@ def _table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor
     check(tuple(table.shape) == shape, name, f"shape {shape}", tuple(table.shape))
     check_finite(table, name)
     copied = table.detach().to(like).clone()
-    if name in ("exponents", "miss_odds", "cell"):
+    if name in ("exponents", "miss_odds"):
         check(bool((copied > 0).all()), name, "positive numbers", float(copied.min()))
     return copied
 

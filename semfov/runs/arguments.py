@@ -15,14 +15,14 @@ import yaml
 
 from semfov.errors import check
 from semfov.io.ranges import NOUNS, CheckedSettings, Form
-from semfov.runs.settings import load_yaml
-from semfov.words import FORMER, dashed, note_of_former
+from semfov.runs.settings import Settings, load_yaml
+from semfov.words import FORMER, dashed, note_of_dropped, note_of_former
 
 _FLAGS = ("true", "false", "yes", "no", "True", "False")
 """Words that may follow a flag as its value."""
 
 
-def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options: Container[str]) -> list[str]:
+def usual_form(arguments: Sequence[str], config: type[Settings], options: Container[str]) -> list[str]:
     """Bring arguments into the form that the parser understands.
 
     Names of options may have dashes, a flag needs no value, several words or numbers no brackets, and `none` is the
@@ -34,7 +34,8 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
         options: the options of the parser, with underscores, such as `--stop_below`.
 
     Returns:
-        The words for the parser. Those that it does not know stay as they are.
+        The words for the parser. Those that it does not know stay as they are; an option of earlier versions is left
+        out, with a note in standard error.
 
     Raises:
         InputError: an option that takes one value is given twice, or one that takes a file is given no name.
@@ -49,6 +50,11 @@ def usual_form(arguments: Sequence[str], config: type[CheckedSettings], options:
         # Everything else is left to the parser, with its messages.
         name, has_value, text = word.partition("=")
         option = f"--{_in_python(name[2:])}"
+        if word.startswith("--") and option[2:] in config.dropped:
+            print(f"note: {note_of_dropped(name)}", file=sys.stderr)
+            if not has_value and words and not words[0].startswith("--"):
+                words.popleft()
+            continue
         if not word.startswith("--") or option not in options:
             usual.append(word)
             continue
@@ -72,11 +78,12 @@ def _in_python(name: str) -> str:
     return f"{setting}_" if iskeyword(setting) else setting  # --try is `try_`
 
 
-def in_present_names(text: str, config: type[CheckedSettings]) -> str:
+def in_present_names(text: str, config: type[Settings]) -> str:
     """Give the settings of a file the names that they have in Python.
 
     Args:
-        text: YAML, with names of options, present or earlier ones; an earlier one is noted in standard error.
+        text: YAML, with names of options, present or earlier ones; an earlier one is noted in standard error, and left
+            out where nothing took its place.
         config: dataclass of the settings.
 
     Returns:
@@ -95,6 +102,9 @@ def in_present_names(text: str, config: type[CheckedSettings]) -> str:
     renamed: dict[str, object] = {}
     for name, value in ((str(key), value) for key, value in values.items()):
         setting = _in_python(name)
+        if setting in config.dropped:
+            print(f"note: {note_of_dropped(name)}", file=sys.stderr)
+            continue
         present = FORMER.get(setting, setting)
         if present in known and setting not in known:
             print(f"note: {note_of_former(name, present)}", file=sys.stderr)

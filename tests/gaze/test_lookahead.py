@@ -92,6 +92,7 @@ def test_before_the_first_look_every_cell_gains():
     # A fovea as wide as the image sees all cells.
     torch.testing.assert_close(got, torch.full((1, 20), 20 * 0.75 * _CORRECTED))
     refused("fovea: expected a positive number", ExpectedGain, GRID, 0.0)
+    refused("grid: expected a Grid, got Linear", ExpectedGain, torch.nn.Linear(1, 1), GRID)
 
 
 LEARNED = {

@@ -3,6 +3,7 @@
 Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of the paper's source.
 """
 
+import math
 import warnings
 
 import numpy as np
@@ -126,6 +127,22 @@ def test_learned_exponents_change_a_level_and_their_defaults_change_no_bit():
     assert middle.any()
     torch.testing.assert_close(model.calibrate(scores, distance)[middle], weak.calibrate(scores, distance)[middle])
     assert torch.equal(model.calibrate(scores, distance)[~middle], plain.calibrate(scores, distance)[~middle])
+
+
+@pytest.mark.parametrize(
+    ("cell", "expected"),
+    [
+        ("abc", "three positive numbers, got 'abc'"),
+        (None, "three positive numbers, got None"),
+        ((0.1, "1", 0.2), "three positive numbers"),
+        ((0.1, 1.0), r"shape \(3,\), got \(2,\)"),
+        ((0.1, 1.0, 0.0), r"numbers from e\^-50 to e\^50"),
+        ((0.1, math.nan, 0.1), r"numbers from e\^-50 to e\^50"),
+        ((0.1, 1.0, 1e23), r"numbers from e\^-50 to e\^50, got .*e\+22"),
+    ],
+)
+def test_numbers_of_cells_that_no_file_could_hold_are_refused(cell, expected):
+    refused(f"^cell: expected {expected}", FovealObservationModel, table(), EDGES, CLASSES, cell=cell)
 
 
 def test_parameters_of_a_search_are_saved_and_files_without_them_are_read(tmp_path):
