@@ -236,7 +236,7 @@ def _found_in_all(files: PictureFiles) -> str:
 
 def _assumed_in_all(files: PictureFiles) -> str:
     """Say how many pictures the probabilities of searches assume to hold the target; empty where it is not known."""
-    shares = {row.get("assumed") for row in files.rows.values()} - {None}
+    shares = {row["assumed"] for row in files.rows.values() if row.get("assumed") is not None}
     if len(shares) != 1:
         return ""
     (share,) = shares
