@@ -33,8 +33,7 @@ _CLEAR = 0.93  # correlation of the blocks from which on the fine detail alone i
 _COARSE_SHIFT = 0.4  # reduced pixels by which what is coarse may move otherwise than the fine detail
 _AS_GOOD = 0.02  # by so much they correlate less, at most, where the camera may have stood still as well
 _AHEAD = 0.1  # by so much the blocks correlate better than after a shift by which the frame repeats itself
-_STEADY = 4.0  # reduced pixels by which a motion differs from the last one at most, where it has a rival
-_GOES_ON = 1.0  # the same of a motion that goes on, however much moves otherwise
+_STEADY = 4.0  # reduced pixels by which a motion that goes on differs from the last one at most: a hand is unsteady
 _MOST_OFF = 1 / 8  # share of the blocks, a row of them, that are off where a motion is one of two
 _GOING_ON = 2  # number of blocks that move as before from which on another motion is not that of the camera
 
@@ -140,9 +139,9 @@ class CameraMotion:
     by it, correlates with the present one in most blocks that have texture. It is doubted
 
     - if the key frame correlates nearly as well a period away, as bricks and rows of windows do, unless nothing moved;
-    - if a part of the frame moves otherwise, until the motion goes on as before: that may be a lorry before the camera,
-      or all that is left of the scene behind one. A part is a motion that corners have in common, blocks that move as
-      the frames before did, or a row of blocks that are off;
+    - if a part of the frame moves otherwise, until the motion goes on nearly as before: that may be a lorry before the
+      camera, or all that is left of the scene behind one. A part is a motion that corners have in common, blocks
+      that move as the frames before did, or a row of blocks that are off;
     - if what is coarse moves otherwise than its edges, as in a film that was compressed too much;
     - if the picture of the key frame has gone little by little, as in a dissolve;
     - if there is nothing to follow, unless the frame is the same: in the dark, before a clear sky, or before blinds.
@@ -152,7 +151,8 @@ class CameraMotion:
     A doubted motion is none. The next frames are then compared with the key frame before it, too, for `patience`
     frames, so that a short disturbance loses nothing.
 
-    A similarity describes a scene that is flat or far away. Parallax of near objects counts as their own motion.
+    A similarity describes a scene that is flat or far away. Parallax of near objects counts as their own motion: the
+    first frames behind them are doubted.
 
     Args:
         patience: number of frames for which what was seen before a disturbance is kept.
@@ -331,7 +331,7 @@ class CameraMotion:
         """Tell whether the camera moves as it did between the frames before."""
         if self._course is None or self._last is None:
             return False
-        return _difference(last_to_present, self._course, self._last.grey.shape) < _GOES_ON
+        return _difference(last_to_present, self._course, self._last.grey.shape) < _STEADY
 
     def _is_divided(self, key: GreyFrame, present: GreyFrame, similarity: NDArray[np.float64]) -> bool:
         """Tell whether the motion from the key frame is one of two: blocks are off, or some move as before."""

@@ -275,3 +275,17 @@ def test_blocks_that_move_otherwise_are_counted():
     count = blocks_of_rival(cv2, before.contrast, after.contrast, far, still)
     assert 0 < count <= 20 + 1
     assert blocks_of_rival(cv2, before.contrast, after.contrast, still, still) == 0
+
+
+def test_an_unsteady_hand_is_followed_behind_something_near():
+    """The camera sways; a near thing of a quarter of the view moves by 0.6 of that, too."""
+    picture, patch, camera, lost = scene(), scene(seed=5)[:300, :200], CameraMotion(), 0
+    swaying = [(600 + 32 * np.sin(number / 3), 700 + 16 * np.cos(number / 2)) for number in range(16)]
+    views = [view(picture, *place) for place in swaying]
+    for number, (frame, _) in enumerate(views):
+        x, y = (round(220 - 0.6 * (swaying[number][0] - 600)), round(40 - 0.6 * (swaying[number][1] - 700)))
+        frame[y : y + 300, x : x + 200] = patch
+        motion = camera.step(frame).motion
+        lost += motion is None
+        assert motion is None or error(motion, views[number - 1][1], views[number][1]) < 1.5
+    assert lost <= 4
