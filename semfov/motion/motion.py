@@ -174,7 +174,7 @@ class Motion:
         return _values(points) @ self.matrix[2, :2] + 1.0
 
     def boxes(self, boxes: Tensor) -> Tensor:
-        """Map boxes (`moved_boxes`).
+        """Map boxes (`moved_boxes`), without gradients.
 
         Args:
             boxes: `(..., 4)`, `(x1, y1, x2, y2)` in pixels of the first frame.
