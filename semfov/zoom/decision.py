@@ -107,7 +107,7 @@ class SearchFacts:
         visible = self.belief.visible.sum().clamp(1)
         unexplored = float(self.belief.unexplored.sum() / visible)
         detected = sum(score >= DETECTION_SCORE for score in scores_of_looks)
-        # Logarithms and their divisors bring numbers of objects and of looks to the range of the other_facts.
+        # Logarithms and their divisors bring numbers of objects and of looks to the range of the others.
         other_facts = [
             math.log(self._expected_finds() + 1e-3) / 4,
             unexplored,
