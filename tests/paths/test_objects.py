@@ -186,13 +186,13 @@ def test_the_number_in_all_is_the_expected_one_with_its_error(chances, unseen, w
 @pytest.mark.parametrize(
     ("chances", "targets", "words"),
     [
-        ([(1, 0.6)] * 6, (1,), "6 cups found, some of them doubtful; expect 4 ± 1 in all"),  # 3.6 ± 1.3
-        ([(1, 0.9)] * 6, (1,), "6 cups found, some of them doubtful; expect 5 ± 1 in all"),
-        ([(1, 0.95)] * 6, (1,), "6 cups found; expect 6 ± 1 in all"),
+        ([(1, 0.6)] * 6, (1,), "6 cups found, some of them doubtful; expect 3.6 ± 1.2 in all"),
+        ([(1, 0.9)] * 6, (1,), "6 cups found, some of them doubtful; expect 5.4 ± 0.7 in all"),
+        ([(1, 0.95)] * 6, (1,), "6 cups found; expect 5.7 ± 0.5 in all"),
         (
             [*[(1, 0.6)] * 6, (2, 0.95)],
             (1, 2),
-            "6 cups, 1 cat found, some of them doubtful; expect 4 ± 1 cups, 1 cats in all",
+            "6 cups, 1 cat found, some of them doubtful; expect 3.6 ± 1.2 cups, 0.9 ± 0.2 cats in all",
         ),
         ([(1, 0.6)] * 6, (), "6 objects found"),
     ],
