@@ -264,7 +264,7 @@ def run(capsys, one_thread):
 
 def written_files(printed):
     """The files that a command lists as written, after checking that they exist."""
-    names = [line.strip() for line in printed.partition("written:\n")[2].partition("\n\n")[0].splitlines()]
+    names = re.findall(r"^  (.+)$", printed.partition("written:\n")[2].partition("\n\n")[0], re.M)
     assert names
     assert [name for name in names if not Path(name).is_file()] == []
     return names
