@@ -18,6 +18,9 @@ _BEYOND = -1e6  # pixels where there is no frame
 _STILL = np.eye(3)
 _ROUNDING = 1e-9 + 1e-5 * _STILL  # by so much the matrix of a camera that stands still may differ from it
 
+# A point on the horizon has the weight 0: its place is infinite, which is no reason to warn.
+_with_horizon = np.errstate(divide="ignore", invalid="ignore")
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -116,6 +119,7 @@ class Motion:
         """Invert the motion: the map from the second frame to the first."""
         return Motion.of(np.linalg.inv(self.matrix))
 
+    @_with_horizon
     def points(self, points: Tensor) -> Tensor:
         """Map points.
 
@@ -158,6 +162,7 @@ class Motion:
         """
         return self.is_ahead((boxes[..., :2] + boxes[..., 2:]) / 2)
 
+    @_with_horizon
     def scale_at(self, points: Tensor) -> Tensor:
         """Compute the local scale: pixels of the second frame for one of the first, as the root of the areas' ratio.
 
@@ -205,6 +210,7 @@ def _are_ahead(matrices: NDArray[np.float64], weights: NDArray[np.float64]) -> N
     return np.asarray(is_affine | (weights * np.sign(np.linalg.det(matrices)) > 0))
 
 
+@_with_horizon
 def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     r"""Map boxes, each by a motion of its own: their centres move, and their sides are scaled; they stay upright.
 

@@ -99,3 +99,15 @@ def test_what_is_behind_a_camera_that_turns_has_no_place_in_its_frame(pan, tilt)
     boxes = motion.boxes(torch.from_numpy(np.c_[places - 2, places + 2]))
     hidden = boxes[torch.from_numpy(clear & (depth[:, 2] <= 0))]
     assert bool((hidden < -1e5).all())
+
+
+def test_points_on_the_horizon_lie_infinitely_far_without_a_warning():
+    """The camera turns so far that the column x = 128 maps to infinity; a box there is behind the camera's plane."""
+    motion = Motion([[1, 0, 0], [0, 1, 0], [-1 / 128, 0, 1]])
+    assert motion.points(torch.tensor([[128.0, 5.0]])).isinf().all()
+    assert motion.scale_at(torch.tensor([[128.0, 5.0]])).isinf().all()
+    box = motion.boxes(torch.tensor([[120.0, 10.0, 136.0, 30.0]]))
+    assert not motion.shows(torch.tensor([[120.0, 10.0, 136.0, 30.0]])).any()
+    assert (box < 0).all()
+    # Nested calls, and calls from threads, restore what was set before.
+    assert np.geterr()["divide"] == "warn"
