@@ -15,7 +15,7 @@ from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.errors import check, check_data, needing
 from semfov.io.files import read_text
 from semfov.motion import Motion
-from semfov.zoom.carrying import inside_frame
+from semfov.observation.matching import inside_frame
 
 CourseName = Literal["still", "slow", "usual", "fast", "turning", "shaking", "moving", "moving-slow"]
 

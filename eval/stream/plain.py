@@ -12,7 +12,7 @@ from eval.stream.ways import Way
 from semfov.detection.objects import Objects
 from semfov.detection.selection import Selection, suppress
 from semfov.motion import CameraMotion, Motion
-from semfov.zoom.carrying import inside_frame
+from semfov.observation.matching import inside_frame
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import LiveWindowLooks, Window
 

@@ -16,9 +16,8 @@ from semfov.agents.window_objects import seen_by
 from semfov.data.inputs import FRAME
 from semfov.detection.objects import Objects
 from semfov.motion import CameraMotion, CameraStep
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, inside_frame
 from semfov.tracking import Tracker
-from semfov.zoom.carrying import inside_frame
 from semfov.zoom.episode import KeptLook, carry_along
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice

@@ -27,6 +27,7 @@ from semfov.detection import SCORE_THRESHOLD, Detections, Objects
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check
 from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
+from semfov.observation.matching import inside_frame
 from semfov.paths import Ending, WindowMoment, ZoomPath
 from semfov.paths.conversion import Values
 from semfov.paths.stimulus import reduced_copy
@@ -36,7 +37,6 @@ from semfov.tracking import Tracker, Tracks
 from semfov.tracking.gain import value_of_windows
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.blank import blank_cells
-from semfov.zoom.carrying import inside_frame
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.closer import USUAL_WINDOW, closer_window, look_closely
 from semfov.zoom.decision import DecisionsByScore, WindowDecisions, decisions_of
@@ -237,9 +237,10 @@ class WindowSession:
 
     @property
     def kept_looks(self) -> list[KeptLook]:
-        """The looks that count, in their order."""
+        """The looks that count and show some of the present frame, in their order."""
         chosen = () if self.step is None else self.step.kept_looks
-        return sorted([*chosen, *self._closer_looks], key=lambda look: look.number)
+        in_view = [look for look in (*chosen, *self._closer_looks) if look.in_view]
+        return sorted(in_view, key=lambda look: look.number)
 
     def record_fields(self, looks: Sequence[LookAtWindow]) -> Values:
         """Collect what the record of a picture and that of a frame have alike.

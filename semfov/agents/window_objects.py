@@ -10,8 +10,8 @@ from torch import Tensor
 
 from semfov.detection import Objects
 from semfov.detection.objects import FAINTEST
+from semfov.observation.matching import inside_frame
 from semfov.tracking import Seen
-from semfov.zoom.carrying import inside_frame
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.episode import KeptLook
 from semfov.zoom.eye import BORDER

@@ -177,11 +177,13 @@ def _rate(frames: int, seconds: float) -> str:
 def _legend(live: LivePerception, moment: Moment) -> list[str]:
     """Say what the line of a frame has in it, and when a search is decided."""
     place = "(x, y) × magnification" if moment.belief_map(len(moment) - 1) is None else "cell (column, row)"
-    known = "what is known so far" if moment.decision is None else "what is decided so far (p: probability)"
+    known = "what is known so far" if moment.decision is None else "what is decided so far"
     lines = [f"  a line: frame, at {place} of the look: what it shows, with scores; then {known}"]
     if live.criterion is not None:
         lines.append(f"  found: when {live.criterion} (--confirm)")
         lines.append("  absent: when p is below one half, and no closer look is worth a frame (--stop-below)")
+    if moment.decision is not None:
+        lines.append("  p: the probability that the frame shows the target; there: that it is at the place found")
     return lines
 
 

@@ -18,7 +18,7 @@ from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.motion import Motion
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, inside_frame
 
 SAME = 0.5  # boxes with at least this overlap (intersection over union) are of the same object
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
@@ -59,6 +59,15 @@ class ExaminedPlace(NamedTuple):
     cells: Tensor
 
 
+class _CloserPlace(NamedTuple):
+    """The place `(4,)` of a closer look, its time, the probability of the target, and whether the frame shows it."""
+
+    time: float
+    box: Tensor
+    probability: float
+    in_view: bool = True
+
+
 class CandidatePlaces(ABC, Generic[LookType]):
     """Base of the places that seem to hold the target of one search, the most evident first, each listed once.
 
@@ -93,7 +102,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._now = 0.0  # seconds of the stream
         self._looks: list[tuple[float, Any]] = []  # time, and what a kind of places keeps of a look
         self._examined: list[ExaminedPlace] = []
-        self._places: list[tuple[float, float]] = []  # time and probability of each closer look
+        self._places: list[_CloserPlace] = []  # of the closer looks
 
     @abstractmethod
     def see(self, look: LookType) -> None:
@@ -144,7 +153,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         Returns:
             The closer look, for the record of the search.
         """
-        self._places.append((self._now, place))
+        self._places.append(_CloserPlace(self._now, box, place))
         return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._number)
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
@@ -176,18 +185,27 @@ class CandidatePlaces(ABC, Generic[LookType]):
         oldest = self._now - self.forgetting.span
         self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= oldest]
         self._examined = [place for place in self._examined if place.time >= oldest]
-        self._places = [(time, place) for time, place in self._places if time >= oldest]
+        self._places = [place for place in self._places if place.time >= oldest]
 
-    def follow(self, motion: Motion | None) -> None:
+    def follow(self, motion: Motion | None, size: tuple[int, int]) -> None:
         """Carry examined places along with the camera.
 
         All are forgotten where a frame fits none before, and those that are behind the camera now.
+
+        Args:
+            motion: how the camera moved.
+            size: `(width, height)` of the frames.
         """
         if motion is None:
             self._looks = []
             self._examined = []
             self._places = []
             return
+        if self._places:
+            moved = motion.boxes(torch.stack([place.box for place in self._places]))
+            in_view = inside_frame(moved, size).tolist()
+            judged = zip(self._places, moved, in_view, strict=True)
+            self._places = [place._replace(box=box, in_view=is_in_view) for place, box, is_in_view in judged]
         if not self._examined:
             return
         boxes = torch.stack([place.boxes for place in self._examined])

@@ -16,7 +16,7 @@ from semfov.decision.rule import FOUND, GO_ON, OUTCOMES, CloseUp, Decision, fina
 from semfov.episode import Step
 from semfov.errors import check, check_whole
 from semfov.motion import Motion
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, inside_frame
 
 MOST_CLOSER = 2
 """Number of closer looks after which a place is found that is probable enough; by default a search makes no more."""
@@ -26,10 +26,11 @@ _FLOOR = 1e-6
 
 
 class _Verdict(NamedTuple):
-    """A closer look at a place, and the seconds since then."""
+    """A closer look at a place, the seconds since then, and whether the present frame shows the place."""
 
     look: CloseUp
     age: float = 0
+    in_view: bool = True
 
 
 class _JudgedPlace(NamedTuple):
@@ -62,7 +63,8 @@ class Verifier(Generic[LookType]):
         thresholds: `confirm` for places, `place` and `stop_below` for candidates.
         most: largest number of closer looks that count at one time.
         criterion: what the decision `found` needs, in words.
-        verdicts: the closer looks that are not forgotten, in order, each with its age.
+        verdicts: the closer looks that are not forgotten, in order, each with its age. Only those whose place is in
+            view count.
         candidate: the place that is to be looked at closely now; None if there is none, and before the first look.
     """
 
@@ -91,7 +93,7 @@ class Verifier(Generic[LookType]):
 
     @property
     def looks(self) -> list[CloseUp]:
-        return [verdict.look for verdict in self.verdicts]
+        return [verdict.look for verdict in self.verdicts if verdict.in_view]
 
     def wait(self, passed: float = FRAME) -> None:
         """Let seconds pass. In a stream, call it before every frame."""
@@ -100,13 +102,18 @@ class Verifier(Generic[LookType]):
         aged = (verdict._replace(age=verdict.age + passed) for verdict in self.verdicts)
         self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
 
-    def follow(self, motion: Motion | None) -> None:
+    def follow(self, motion: Motion | None, size: tuple[int, int]) -> None:
         """Carry the candidate and examined places along.
 
-        All are forgotten where a frame fits none before, and those that are behind the camera now.
+        All are forgotten where a frame fits none before, and those that are behind the camera now. What has left the
+        frame is no reason for a decision until it comes back.
+
+        Args:
+            motion: how the camera moved.
+            size: `(width, height)` of the frames.
         """
         self._judged = None
-        self.places.follow(motion)
+        self.places.follow(motion, size)
         if motion is None:
             self.candidate = None
             self.verdicts = []
@@ -118,9 +125,13 @@ class Verifier(Generic[LookType]):
         if not self.verdicts:
             return
         boxes = torch.stack([verdict.look.box for verdict in self.verdicts])
-        verdicts = zip(self.verdicts, motion.shows(boxes).tolist(), motion.boxes(boxes), strict=True)
+        moved_boxes = motion.boxes(boxes)
+        in_view = inside_frame(moved_boxes, size).tolist()
+        verdicts = zip(self.verdicts, motion.shows(boxes).tolist(), moved_boxes, in_view, strict=True)
         self.verdicts = [
-            verdict._replace(look=replace(verdict.look, box=box)) for verdict, is_shown, box in verdicts if is_shown
+            verdict._replace(look=replace(verdict.look, box=box), in_view=is_in_view)
+            for verdict, is_ahead, box, is_in_view in verdicts
+            if is_ahead
         ]
 
     def see(self, look: LookType, *, last: bool = False) -> None:
@@ -132,7 +143,7 @@ class Verifier(Generic[LookType]):
                 box = follow_target(verdict.look.box, self.places.detections, verdict.look.target)
                 if box is not verdict.look.box:
                     moved = replace(verdict.look, box=box, cell=self.places.cell(box))
-                    self.verdicts[number] = verdict._replace(look=moved)
+                    self.verdicts[number] = verdict._replace(look=moved, in_view=True)
         self._is_last = last
         self._choose()
 
@@ -257,9 +268,10 @@ class Verifier(Generic[LookType]):
 
     @property
     def _judged_places(self) -> list[_JudgedPlace]:
-        """The closer looks that are not forgotten, in order."""
+        """The closer looks at places in view that are not forgotten, in order."""
         if self._judged is None:
-            self._judged = [_JudgedPlace(verdict, self._place(verdict)) for verdict in self.verdicts]
+            in_view = (verdict for verdict in self.verdicts if verdict.in_view)
+            self._judged = [_JudgedPlace(verdict, self._place(verdict)) for verdict in in_view]
         return self._judged
 
     @property

@@ -106,3 +106,17 @@ def _share_inside(boxes: Tensor, others: Tensor) -> Tensor:
     high = torch.minimum(boxes[:, None, 2:], others[:, 2:])
     area = (boxes[:, 2:] - boxes[:, :2]).prod(-1, keepdim=True).clamp(min=1e-6)
     return (high - low).clamp(min=0).prod(-1) / area
+
+
+def inside_frame(boxes: Tensor, size: tuple[int, int]) -> Tensor:
+    """Find boxes whose centre lies inside a frame.
+
+    Args:
+        boxes: `(..., 4)`.
+        size: `(width, height)` of the frame.
+
+    Returns:
+        `(...)` boolean.
+    """
+    centre = (boxes[..., :2] + boxes[..., 2:]) / 2
+    return ((centre >= 0) & (centre < boxes.new_tensor(size))).all(-1)

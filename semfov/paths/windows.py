@@ -460,7 +460,7 @@ class WindowMoment(ZoomPath, Moment):
     """The looks that count at one frame whose windows are looked at, and what they show.
 
     It is the record of these looks, the last of which is at this frame. Its objects are merged from them. Those of
-    earlier frames are where the camera shows their places now.
+    earlier frames are where the camera shows their places now; looks at what has left the frame are left out.
 
     Beside the attributes of `ZoomPath` and `Moment` it has what comes next.
 

@@ -215,7 +215,8 @@ class LooksPart(Part):
 
     def crop_source(self, found: Data) -> tuple[str, float, float]:
         """Find the picture of the look that shows an object most sharply."""
-        if self.data["turns"]:  # views of a head are no parts of the picture
+        # Views of a head are no parts of the picture, and an object that is tracked may be shown by no look of a frame.
+        if self.data["turns"] or not found["look"]:
             return f"{self.place}-picture", 0, 0
         index = found["look"] - 1
         left, top = self.data["looks"][index]["box"][:2]

@@ -6,6 +6,7 @@
 A look is carried from the frame in which it was taken, by the motion since then, so that nothing is resampled twice.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.motion import Motion, moved_boxes
+from semfov.observation.matching import inside_frame
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, nearest_cells
@@ -29,8 +31,8 @@ def carried(looks: Sequence[WindowLook], motions: Sequence[Motion], lattice: Lat
         lattice: lattice of the frames.
 
     Returns:
-        The looks in pixels of the other frame; windows and boxes may lie beyond the frame. Their windows are none of
-        the lattice's any more.
+        What the looks show of the other frame, in its pixels: detections that have left it are left out. Windows may
+        reach beyond the frame, and are none of the lattice's any more.
     """
     if not looks:
         return []
@@ -53,21 +55,24 @@ def _carried_look(look: WindowLook, motion: Motion, lattice: Lattice, window: Wi
     """Carry a look to a window with moved boxes `(n, 4)`; its hints are resampled."""
     detections = replace(look.detections, boxes=boxes[None])
     gist = None if look.gist is None else _carried_gist(look.gist, motion, lattice)
-    return replace(look, window=window, detections=detections, gist=gist)
+    carried_look = replace(look, window=window, detections=detections, gist=gist)
+    in_view = inside_frame(boxes, lattice.size)
+    return carried_look if bool(in_view.all()) else _without_what_left(carried_look, in_view)
 
 
-def inside_frame(boxes: Tensor, size: tuple[int, int]) -> Tensor:
-    """Find boxes whose centre lies inside a frame.
+def _without_what_left(look: WindowLook, in_view: Tensor) -> WindowLook:
+    """Leave out the detections of a look that have left the frame.
 
     Args:
-        boxes: `(..., 4)`.
-        size: `(width, height)` of the frame.
+        look: the look.
+        in_view: `(L,)` boolean, which of its detections the frame shows.
 
     Returns:
-        `(...)` boolean.
+        The look. Its strongest hints may have been those of what has left, so that what remains tells what it shows.
     """
-    centre = (boxes[..., :2] + boxes[..., 2:]) / 2
-    return ((centre >= 0) & (centre < boxes.new_tensor(size))).all(-1)
+    detections = look.detections.take(in_view)
+    show = look.show.minimum(detections.scores[0, :, 1:].amax(0)) if bool(in_view.any()) else look.show * 0
+    return replace(look, detections=detections, cut=look.cut[in_view], show=show)
 
 
 def share_shown(window: Window, lattice: Lattice) -> float:
@@ -80,11 +85,26 @@ def share_shown(window: Window, lattice: Lattice) -> float:
     Returns:
         From 0 to 1.
     """
-    x1, y1, x2, y2 = window.region(lattice)
-    width, height = lattice.size
-    width_shown = max(min(x2, width) - max(x1, 0.0), 0.0)
-    height_shown = max(min(y2, height) - max(y1, 0.0), 0.0)
-    return width_shown * height_shown / (width * height)
+    return _area(window.region(lattice)) / math.prod(lattice.size)
+
+
+def share_left(window: Window, lattice: Lattice) -> float:
+    """Compute the share of a carried window that the frame still shows.
+
+    Args:
+        window: the window, which may lie beyond the frame.
+        lattice: lattice of the frame.
+
+    Returns:
+        From 0 to 1.
+    """
+    assert window.within is not None
+    return _area(window.region(lattice)) / _area(window.within)
+
+
+def _area(box: tuple[float, float, float, float]) -> float:
+    x1, y1, x2, y2 = box
+    return max(x2 - x1, 0.0) * max(y2 - y1, 0.0)
 
 
 def _window_at(window: Window, region: Sequence[float], scale: float, lattice: Lattice) -> Window:

@@ -16,7 +16,7 @@ from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.motion import Motion
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, inside_frame
 from semfov.sensor.glimpse import window_around
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
@@ -87,6 +87,14 @@ class SearchLook(NamedTuple):
     hit_chance: float
 
 
+class _Scored(NamedTuple):
+    """Boxes `(M, 4)` of the target in one look, their scores `(M,)`, and which the present frame shows `(M,)`."""
+
+    boxes: Tensor
+    scores: Tensor
+    in_view: Tensor
+
+
 class CandidateBoxes(CandidatePlaces[SearchLook]):
     r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
 
@@ -120,7 +128,8 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
-            self._looks.append((self._now, (look.detections.boxes[0][of_target], scores[of_target])))
+            boxes = look.detections.boxes[0][of_target]
+            self._looks.append((self._now, _Scored(boxes, scores[of_target], torch.ones(len(boxes)).bool())))
 
     @property
     def hit_chance(self) -> float:
@@ -168,21 +177,21 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         self._change()
         super().wait(passed)
 
-    def follow(self, motion: Motion | None) -> None:
+    def follow(self, motion: Motion | None, size: tuple[int, int]) -> None:
         """Carry the boxes of the target along, too; those that come to lie behind the camera are dropped."""
         self._change()
-        super().follow(motion)
+        super().follow(motion, size)
         if motion is None or not self._looks:
             return
         # The boxes of all looks are moved together.
-        parts = [boxes for _, (boxes, _) in self._looks]
+        parts = [scored.boxes for _, scored in self._looks]
         counts = [len(boxes) for boxes in parts]
         together = torch.cat(parts)
-        moved_boxes = motion.boxes(together).split(counts)
-        is_ahead = motion.shows(together).split(counts)
+        moved = motion.boxes(together)
+        columns = [column.split(counts) for column in (moved, inside_frame(moved, size), motion.shows(together))]
         moved_looks = []
-        for (time, (_, scores)), boxes, ahead in zip(self._looks, moved_boxes, is_ahead, strict=True):
-            moved_looks.append((time, (boxes[ahead], scores[ahead])))
+        for (time, scored), boxes, in_view, ahead in zip(self._looks, *columns, strict=True):
+            moved_looks.append((time, _Scored(boxes[ahead], scored.scores[ahead], in_view[ahead])))
         self._looks = moved_looks
 
     def probability(self, look: CloseUp) -> float:
@@ -201,13 +210,14 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         return self._chance(float((scores * overlaps).max()))
 
     def _boxes(self) -> tuple[Tensor, Tensor]:
-        """Boxes `(M, 4)` of the target that count, and their scores `(M,)`, faded."""
+        """Boxes `(M, 4)` of the target in view that count, and their scores `(M,)`, faded."""
         if not self._looks:
             return torch.zeros(0, 4), torch.zeros(0)
         keep = self.forgetting.keep
-        boxes_of_looks = [boxes for _, (boxes, _) in self._looks]
-        faded_scores = [scores * keep ** (self._now - time) for time, (_, scores) in self._looks]
-        return torch.cat(boxes_of_looks), torch.cat(faded_scores)
+        boxes = torch.cat([scored.boxes for _, scored in self._looks])
+        faded_scores = torch.cat([scored.scores * keep ** (self._now - time) for time, scored in self._looks])
+        in_view = torch.cat([scored.in_view for _, scored in self._looks])
+        return boxes[in_view], faded_scores[in_view]
 
     def _chance(self, score: float) -> float:
         """Probability that the target is where the highest score is this one (the formula of the class)."""
@@ -284,5 +294,5 @@ class PhotographPlaces(CandidateBoxes):
 
     def _hit_chance_at(self, place: CandidatePlace) -> float:
         """Chance that a look at a place shows the target, if no closer look so far has."""
-        surest = max((probability for _, probability in self._places), default=0.0)
+        surest = max((place.probability for place in self._places if place.in_view), default=0.0)
         return place.probability * (1 - surest)

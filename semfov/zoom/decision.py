@@ -14,9 +14,9 @@ from semfov.decision.candidates import LookAt
 from semfov.decision.state import DecisionState
 from semfov.episode import Forgetting
 from semfov.motion import Motion
+from semfov.observation.matching import inside_frame
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.carrying import inside_frame
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, SearchLook
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import PhotographEvidence
@@ -30,6 +30,7 @@ class _LookFacts(NamedTuple):
     """What one look of a search shows of the target.
 
     Attributes:
+        look: the look.
         score: highest score of the target, hints included.
         closest: the same for a look of the last level, 0 for others.
         named: highest score of a detection whose most probable class is the target.
@@ -37,6 +38,7 @@ class _LookFacts(NamedTuple):
         box: box `(4,)` of that detection; None without a detection.
     """
 
+    look: WindowLook
     score: float
     closest: float
     named: float
@@ -63,15 +65,18 @@ class SearchFacts:
         self.detected = False
 
     def see(self, looks: Sequence[WindowLook]) -> None:
-        """Take the looks that count after another look; those of earlier ones that are missing were forgotten."""
-        if len(looks) != len(self.looks) + 1:
-            self.looks = []
-        for look in looks[len(self.looks) :]:
-            self.add(look)
+        """Take the looks that count now; those that were carried along are others, and show what is in view."""
+        known = {id(facts.look): facts for facts in self.looks}
+        self.looks = [known.get(id(look)) or self._facts_of(look) for look in looks]
+        self._sum_up()
 
     def add(self, look: WindowLook) -> None:
         """Take in one look."""
         self.looks.append(self._facts_of(look))
+        self._sum_up()
+
+    def _sum_up(self) -> None:
+        """Find what all looks have shown; there must be one."""
         self.best = max(facts.score for facts in self.looks)
         surest = max(self.looks, key=lambda facts: facts.found)
         self.box = surest.box if surest.found > 0 else None
@@ -85,11 +90,11 @@ class SearchFacts:
         closest = score if is_closest else 0.0
         scores = look.detections.scores[0, :, target].detach().float().numpy()
         if not len(scores):
-            return _LookFacts(score, closest, named=0.0, found=0.0, box=None)
+            return _LookFacts(look, score, closest, named=0.0, found=0.0, box=None)
         is_named = look.detections.labels[0].numpy() == target
         named = float(scores[is_named].max(initial=0))
         best = int(scores.argmax())
-        return _LookFacts(score, closest, named, float(scores[best]), look.detections.boxes[0, best])
+        return _LookFacts(look, score, closest, named, float(scores[best]), look.detections.boxes[0, best])
 
     def case(self, hit_chance: float) -> Tensor:
         """Facts `(10,)` for `GlimpseEvidence.anywhere`: scores, what remains to be seen, and numbers of looks.
@@ -228,8 +233,10 @@ class DecisionsByPresence(WindowDecisions):
         self._is_large = belief.photograph is None
         self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
         self._presence: float | None = None  # that after the last look, once it was asked for
+        self._step: WindowStep[ZoomBelief | None] | None = None  # the last one
 
     def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
+        self._step = step
         self._facts.see(step.looks)
         self._fitted_chance = step.next_value
         self._presence = None
@@ -257,6 +264,12 @@ class DecisionsByPresence(WindowDecisions):
         outcome = OUTCOMES[self.outcome]
         box = self._facts.box if outcome == "found" else None
         return Decision(outcome, self.prior(self._fitted_presence()), None, box)
+
+    def follow(self, motion: Motion | None) -> None:
+        looks = () if motion is None or self._step is None else self._step.looks
+        if looks:
+            self._facts.see(looks)
+            self._presence = None
 
     def _fitted_presence(self) -> float:
         """Probability that the picture holds the target after the last look, by the prior of the fit."""
@@ -318,7 +331,10 @@ class DecisionsByCloserLooks(DecisionsByPresence):
         self.verifier.wait(passed)
 
     def follow(self, motion: Motion | None) -> None:
-        self.verifier.follow(motion)
+        super().follow(motion)
+        self.verifier.follow(motion, self.frame)
+        if self._facts.looks:
+            self.verifier.places.presence = self.prior(self._fitted_presence())
         candidate = self.candidate
         if candidate is not None and not bool(inside_frame(candidate.box, self.frame)):
             self.verifier.candidate = None  # a closer look would show another place

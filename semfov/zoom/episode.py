@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 from semfov.episode import Forgetting
 from semfov.motion import CameraStep, Motion
 from semfov.zoom.belief import Rates, ZoomBelief
-from semfov.zoom.carrying import carried, share_shown
+from semfov.zoom.carrying import carried, share_left, share_shown
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
@@ -26,6 +26,8 @@ _Guess = Callable[[Sequence[WindowLook], set[Window], Window | None], WindowChoi
 """Guesses the window to look at after one that is being looked at, which is among the windows; the last argument names
 it if it is not in the belief yet."""
 
+_LEAST_LEFT = 0.1  # share of its own window that a look must show of the frame, to count in it
+
 _LEAST_SHOWN = 0.75
 """Share of the frame that the look at the whole must show; below it the camera has moved on, and it is made anew."""
 
@@ -40,6 +42,8 @@ class KeptLook:
         value: the value that it was chosen for.
         number: number of its pass of the detector.
         seconds: time at its end, on the clock of the episode.
+        in_view: whether the present frame shows some of its window. One that has left the frame is kept until the
+            camera comes back.
     """
 
     def __init__(self, look: WindowLook, time: float, value: float, number: int = 0, seconds: float = 0.0) -> None:
@@ -49,6 +53,7 @@ class KeptLook:
         self.value = value
         self.number = number
         self.seconds = seconds
+        self.in_view = True
         self._motion: Motion | None = None  # of the camera since the look; None as long as it has stood still
 
     def moved(self, motion: Motion) -> Motion:
@@ -68,6 +73,7 @@ def carry_along(looks: Sequence[KeptLook], motion: Motion, lattice: Lattice) -> 
     motions = [look.moved(motion) for look in looks]
     for look, current in zip(looks, carried([look.original for look in looks], motions, lattice), strict=True):
         look.current = current
+        look.in_view = share_left(current.window, lattice) >= _LEAST_LEFT
 
 
 class WindowStep(Generic[_StepBelief_co]):
@@ -103,13 +109,17 @@ class WindowStep(Generic[_StepBelief_co]):
 
     @property
     def looks(self) -> list[WindowLook]:
-        """The looks that count, where they lie in the present frame."""
-        return [look.current for look in self.kept_looks]
+        """The looks at what the present frame shows, where they lie in it."""
+        return [look.current for look in self.kept_looks if look.in_view]
 
     @cached_property
     def choices(self) -> Sequence[WindowChoice]:
         """The windows to look at next and their values, chosen when they are first asked for."""
         return self._choose()
+
+    def choose_anew(self) -> None:
+        """Forget the choices, as the looks that count have moved."""
+        self.__dict__.pop("choices", None)
 
     @property
     def next_value(self) -> float:
@@ -122,7 +132,7 @@ class _Recent(Generic[_Belief]):
 
     Invariant: `belief` holds the looks of `kept`, where they lie in the present frame, and nothing else; `windows` are
     their windows. `aside` has the looks of a scene that the camera has lost and may find again. `lacks_overview` tells
-    whether the overview is too old, or shows too little of the frame; it is made anew then.
+    whether the overview is too old, or shows too little of the frame; it is made anew then. `step` is the last step.
     """
 
     def __init__(self, belief: _Belief, source: WindowLooks, forgetting: Forgetting | None) -> None:
@@ -133,6 +143,7 @@ class _Recent(Generic[_Belief]):
         self.aside: list[KeptLook] = []
         self.windows: set[Window] = set()
         self.lacks_overview = False
+        self.step: WindowStep[_Belief] | None = None
 
     @property
     def looks(self) -> list[WindowLook]:
@@ -167,6 +178,8 @@ class _Recent(Generic[_Belief]):
         if camera.recovered is not None or not camera.waits:
             self.aside = []
         self._believe_anew()
+        if self.step is not None:
+            self.step.choose_anew()
 
     def _believe_anew(self) -> None:
         """Make the belief of the looks that count."""
@@ -216,6 +229,7 @@ def look_by_look(
     its window. Where the order has no window left, the one that was looked at longest ago is looked at again.
     """
     recent = _Recent(belief, source, forgetting)
+    source.carry = recent.follow
     choose = partial(_next_choices, recent, order)
     choices = choose()
     while choices:
@@ -225,14 +239,9 @@ def look_by_look(
         looks = source.see(windows, hints=hints)
         for look, (_, value) in zip(looks, choices, strict=True):
             newest = recent.add(look, value)
-            step = WindowStep(newest, belief, tuple(recent.kept), choose)
+            recent.step = step = WindowStep(newest, belief, tuple(recent.kept), choose)
             yield step
-        camera = source.camera_step()
-        if camera is None or camera.is_still:
-            choices = step.choices
-        else:
-            recent.follow(camera)
-            choices = choose()
+        choices = step.choices
 
 
 def _next_choices(recent: _Recent[_Belief], order: Order) -> Sequence[WindowChoice]:

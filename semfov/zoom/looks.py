@@ -76,21 +76,20 @@ class Window:
 
     def region(self, lattice: Lattice) -> tuple[float, float, float, float]:
         """Part of the picture that it shows, `(x1, y1, x2, y2)` in picture pixels."""
-        if self.within is not None:
-            return self.within
-        x, y, magnification = self.fixation
+        x1, y1, x2, y2 = self._edges(lattice) if self.within is None else self.within
         width, height = lattice.size
+        # A camera that moves carries windows beyond the frame.
+        return max(x1, 0.0), max(y1, 0.0), min(x2, float(width)), min(y2, float(height))
+
+    def _edges(self, lattice: Lattice) -> tuple[float, float, float, float]:
+        """Edges `(x1, y1, x2, y2)` of a window of the lattice in picture pixels, which may lie beyond the picture."""
+        x, y, magnification = self.fixation
         # Half of the window, about its centre in edges of pixels.
         half_width = lattice.canvas[0] / magnification / 2
         half_height = lattice.canvas[1] / magnification / 2
         x += 0.5
         y += 0.5
-        return (
-            max(x - half_width, 0.0),
-            max(y - half_height, 0.0),
-            min(x + half_width, float(width)),
-            min(y + half_height, float(height)),
-        )
+        return x - half_width, y - half_height, x + half_width, y + half_height
 
     def centre(self, lattice: Lattice) -> tuple[float, float]:
         """Centre `(x, y)` in pixels of the part of the picture that it shows, which may end before the window does."""
@@ -153,13 +152,11 @@ class WindowLooks(ABC):
     """Gives the cells where there is nothing to see, `(rows, columns)`; None for none."""
     meanwhile: Callable[[], object] | None = None
     """Work for a second thread during the next look, where a detector leaves a core for it."""
+    carry: Callable[[CameraStep], object] | None = None
+    """Carries what is known along with the camera, as soon as a frame is shown before which it moved."""
 
     def prepare(self, window: Window) -> None:  # noqa: B027
         """Resample the window that is likely to be looked at next; stored looks need nothing."""
-
-    def camera_step(self) -> CameraStep | None:
-        """Take how the camera moved since this was last asked; None for a picture that stands still."""
-        return None
 
     @abstractmethod
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[WindowLook]:
@@ -174,7 +171,6 @@ class LiveWindowLooks(WindowLooks):
         self.view = view
         self.lattice = view.lattice
         self._prepared: dict[Window, Resampled] = {}
-        self._camera: CameraStep | None = None  # the motion of frames whose looks were closer ones
 
     def show(self, view: WindowView, passed: float, camera: CameraStep | None = None) -> None:
         """Take the next frame of a stream, the seconds that passed, and how the camera moved since the frame before."""
@@ -182,14 +178,8 @@ class LiveWindowLooks(WindowLooks):
         self.passed = passed
         self.time += passed
         self._prepared.clear()
-        if camera is not None:
-            self._camera = camera if self._camera is None else self._camera.then(camera)
-
-    def camera_step(self) -> CameraStep | None:
-        """Take how the camera moved since this was last asked."""
-        camera = self._camera
-        self._camera = None
-        return camera
+        if camera is not None and not camera.is_still and self.carry is not None:
+            self.carry(camera)
 
     def prepare(self, window: Window) -> None:
         fixation = torch.tensor([window.fixation], dtype=torch.float64)

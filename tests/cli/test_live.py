@@ -165,6 +165,7 @@ def test_closer_looks_at_a_video_are_printed_unless_they_are_switched_off(run, a
     )
     assert len(shown) == 1
     assert printed.out.splitlines()[2] == "  found: when a closer look gives p 0.7 there (--confirm)"
+    assert "p: the probability that the frame shows the target; there: that it is at the place found" in printed.out
     number, column, row = map(int, shown[0])
     # Red covers rows 40 to 60 of 120, and starts at column 10 of 160 per frame.
     assert 20 * column < 10 * number + 20

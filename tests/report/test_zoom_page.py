@@ -14,6 +14,7 @@ from semfov import InputError, Objects
 from semfov.decision import CloseUp, Decision
 from semfov.report import page_html
 from semfov.report.episode import episode_data
+from semfov.report.parts import part_of
 from semfov.report.zoom import _MOST_DETECTIONS, zoom_data
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
@@ -251,3 +252,12 @@ def test_a_wrong_picture_or_a_path_without_looks_is_refused(zoom_path, large_pic
         zoom_data(zoom_path, large_picture[:, :200], name="other")
     with pytest.raises(InputError, match="at least one look"):
         zoom_data(replace(zoom_path, looks=()), large_picture, name="other")
+
+
+def test_an_object_that_no_look_of_the_record_shows_is_cut_out_of_the_picture(zoom_path, large_picture):
+    """In a frame of a stream it may be tracked from looks that are no longer counted."""
+    data = zoom_data(zoom_path, large_picture, name="field")
+    data["objects"][0]["look"] = 0
+    rows = part_of(data, 3).objects_html().split("<tr ")[1:]
+    assert 'href="#large-3-picture"' in rows[0]
+    assert re.search(r'href="#large-3-look-\d-view"', rows[1])

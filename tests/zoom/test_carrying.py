@@ -11,9 +11,9 @@ import torch
 from semfov import Detections, Detector, InputError, WindowEye, ZoomAgent
 from semfov.detection.scores import Candidates
 from semfov.motion import Motion
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import box_iou, inside_frame
 from semfov.settings import StreamSettings
-from semfov.zoom.carrying import carried, inside_frame, share_shown
+from semfov.zoom.carrying import carried, share_shown
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook

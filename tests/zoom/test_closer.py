@@ -200,7 +200,7 @@ def test_what_the_camera_turns_away_from_is_forgotten_and_found_anew(looks):
     for _ in range(looks):
         judge.look()
     for _ in range(3):
-        judge.follow(motion)
+        judge.follow(motion, (240, 240))
         assert judge.candidate is None
         assert not judge.verdicts
     judge.see(look(5, 0.9, 0.5, ONE))
@@ -631,3 +631,105 @@ def test_all_objects_of_a_photograph_are_those_of_the_whole_and_of_slices(detect
     assert {look.window for look in all_.window_looks[1:]} == set(usual_slices(all_.lattice))
     assert len(all_.objects) >= len(one.objects)
     assert all_.ending == "windows" or all_.passes == 5
+
+
+def test_a_place_that_leaves_the_frame_counts_again_when_it_comes_back():
+    judge = verifier(FromScore(0.7), [0.8])
+    judge.see(look(1, 0.9, 0.5, ONE))
+    judge.look()
+    assert judge.decision().outcome == "found"
+    out = Motion.similarity(shift=(-125, 0))  # the box reaches from 100 to 140, and its middle to the left of the frame
+    judge.follow(out, LATTICE.size)
+    judge.see(SearchLook(seen([OTHER], [0.0]).detections, 2, 0.1, 0.8, 0.5))
+    assert judge.looks == []
+    assert judge.decision().outcome != "found"
+    assert judge.presence == pytest.approx(0.1)
+    judge.follow(out.inverse(), LATTICE.size)
+    decision = judge.decision()
+    assert decision.outcome == "found"
+    torch.testing.assert_close(decision.box, judge.looks[0].box)
+    assert decision.box.tolist() == pytest.approx(ONE, abs=1e-3)
+
+
+def panned(picture, lefts, width=512):
+    """Frames of a camera that turns to the right over a picture, each with its pose."""
+    for left in lefts:
+        yield picture[..., left : left + width], [[1, 0, lefts[0] - left], [0, 1, 0]]
+
+
+LEFTS = [200] * 6 + [300, 400, 500, 600, 760, 760, 760, 600, 400, 200]
+
+
+@pytest.fixture(scope="module")
+def pan():
+    """Moments, each with the left edge of its frame; a red square is at x from 640 to 703, y from 320 to 383."""
+    ground = 0.03 * torch.rand(3, 768, 1280, generator=torch.Generator().manual_seed(0))  # not blank
+    ground[:, 320:384, 640:704] = torch.tensor([1.0, 0, 0])[:, None, None]
+    live = ZoomAgent(WindowEye(Squares()), evidence()).stream(1, (), StreamSettings(rate=0.25))
+    frames = panned(ground, LEFTS)
+    return [(live.step(frame, pose=pose), left) for (frame, pose), left in zip(frames, LEFTS, strict=True)]
+
+
+def test_a_search_finds_what_the_frame_shows_and_remembers_the_rest(pan):
+    """What has left the frame is neither found nor listed, and is found again where the camera comes back."""
+    outcomes = [moment.decision.outcome == "found" for moment, _ in pan]
+    first = outcomes.index(True)
+    assert first < 6
+    assert outcomes[first:] == [left < 704 for left in LEFTS[first:]]
+    for moment, left in pan[first:]:
+        if left < 704:
+            x1, y1, x2, y2 = moment.decision.box.tolist()
+            assert 640 - left < (x1 + x2) / 2 < 704 - left
+            assert 320 < (y1 + y2) / 2 < 384
+        else:
+            assert moment.decision.box is None
+            assert len(moment.objects) == 0
+            assert moment.closer == ()
+
+
+def test_a_frame_without_the_target_is_judged_by_what_it_shows(pan):
+    gone = [moment.decision.probability for moment, left in pan if left > 704]
+    there = [moment.decision.probability for moment, left in pan if left < 704 and moment.decision.outcome == "found"]
+    assert max(gone) < 0.5 < min(there)
+
+
+def test_a_moment_and_its_page_have_the_looks_that_the_frame_shows(pan):
+    for moment, _ in pan:
+        data = moment.page_data()
+        for look, shown in zip(moment, data["looks"], strict=True):
+            for x1, y1, x2, y2 in (look.region, shown["box"]):
+                assert 0 <= x1 < x2 <= 512
+                assert 0 <= y1 < y2 <= 768
+            x, y = look.fixation
+            assert 0 <= x < 512
+            assert 0 <= y < 768
+        for found in data["objects"]:
+            assert 0 <= (found["box"][0] + found["box"][2]) / 2 < 512
+
+
+def test_looks_are_carried_along_in_a_frame_that_is_spent_on_a_closer_look(picture):
+    """The camera goes on by 40 px in every frame; the overview shows the first frame."""
+    live = ZoomAgent(WindowEye(Squares()), evidence()).stream(1, (), StreamSettings(rate=0.25))
+    picture[0, 320:384, 640:704] = 1
+    lefts = range(0, 480, 40)
+    overviews = []
+    for (frame, pose), left in zip(panned(picture, lefts, 800), lefts, strict=True):
+        moment = live.step(frame, pose=pose)
+        if moment.examined is not None:
+            overviews.append((moment.looks[0].region[2], 800 - left))
+            break
+    ((right, expected),) = overviews
+    assert expected < 800
+    assert right == pytest.approx(expected)
+
+
+def test_with_poses_of_a_still_camera_a_search_is_the_same_to_the_bit(detector, picture, one_thread):
+    agent = ZoomAgent(WindowEye(detector), evidence())
+    still = agent.stream(1, (), StreamSettings(rate=0.75), follows=False)
+    posed = agent.stream(1, (), StreamSettings(rate=0.75))
+    for _ in range(8):
+        one, other = still.step(picture), posed.step(picture, pose=np.eye(3))
+        assert one.decision.probability == other.decision.probability
+        assert one.decision.outcome == other.decision.outcome
+        assert [look.region for look in one] == [look.region for look in other]
+        assert torch.equal(one.objects.boxes, other.objects.boxes)
