@@ -289,9 +289,7 @@ class ActivePerception(nn.Module):
         if not (isinstance(search, Target) and isinstance(explore, SemanticMap)):
             got = f"{type(search).__name__} and {type(explore).__name__}"
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
-            raise InputError(
-                f"how: expected an agent with learned evidence and a semantic map for a head, got {got}; {remedy}"
-            )
+            raise InputError(f"how: expected learned evidence and a semantic map for a head, got {got}; {remedy}")
         return HeadAgent(self.eye, search.model, explore.model)
 
     def kind_of_look(

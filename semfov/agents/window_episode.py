@@ -595,8 +595,5 @@ def _objects_in_frame(tracks: Tracks, places: Mapping[int, int], size: tuple[int
 
 def _renumbered(closer: Sequence[CloseUp], places: Mapping[int, int]) -> tuple[CloseUp, ...]:
     """Give the closer looks that count the places of their looks in the record as numbers."""
-    return tuple(
-        replace(look, number=places[look.number])
-        for look in closer
-        if look.number is not None and look.number in places
-    )
+    counting = [look for look in closer if look.number is not None and look.number in places]
+    return tuple(replace(look, number=places[look.number]) for look in counting if look.number is not None)
