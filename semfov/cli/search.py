@@ -241,7 +241,7 @@ def _assumed_in_all(files: PictureFiles) -> str:
         return ""
     (share,) = shares
     how_many = "half" if share == 0.5 else f"{100 * share:.3g} %"
-    return f"The probabilities assume that {how_many} of the pictures hold it (--prior).\n"
+    return f"The probabilities assume that {how_many} of the pictures hold it. If you know better, give a prior.\n"
 
 
 def _skip(job: PictureJob[PictureOptions], files: PictureFiles, number: int, fault: SemfovError) -> None:

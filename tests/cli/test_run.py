@@ -117,8 +117,8 @@ def test_a_fault_at_one_picture_is_a_row_with_its_reason(
 @pytest.mark.parametrize(
     ("shares", "told"),
     [
-        ((0.5, 0.5), "The probabilities assume that half of the pictures hold it (--prior).\n"),
-        ((0.05,), "The probabilities assume that 5 % of the pictures hold it (--prior).\n"),
+        ((0.5, 0.5), "The probabilities assume that half of the pictures hold it. If you know better, give a prior.\n"),
+        ((0.05,), "The probabilities assume that 5 % of the pictures hold it. If you know better, give a prior.\n"),
         ((0.5, 0.1), ""),
         ((None,), ""),
     ],
