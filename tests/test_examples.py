@@ -155,7 +155,7 @@ def test_looking_around_turns_the_head_and_draws_it(run, tmp_path):
     seconds = [float(value) for value in re.findall(r"([\d.]+) s: head at yaw", output)]
     assert seconds == sorted(seconds)
     assert seconds[-1] <= 3
-    told = r"HeadPath: (?:\d+|No) objects? found in [\d.]+ s of eye and head: \d+ looks, (\d+) turns? of the head"
+    told = r"(?:\d+|No) objects? found in [\d.]+ s of eye and head: \d+ looks, (\d+) turns? of the head"
     turns = re.search(told, output)
     assert int(turns.group(1)) > 0
     for name in ("head.png", "head.gif"):

@@ -92,7 +92,14 @@ class SemanticMap(Observer):
         return torch.cat([log_background.expand_as(objects[..., :1]), objects], -1)
 
     def unseen(self, like: Tensor) -> Tensor:
-        """Compute the probabilities of all classes in a cell in which nothing was detected, `(K+1,)`."""
+        """Compute the probabilities of all classes in a cell in which nothing was detected.
+
+        Args:
+            like: a tensor of the device and the precision of the result.
+
+        Returns:
+            `(K+1,)`, background first.
+        """
         return self.log_likelihood(like.new_zeros(self.components)).softmax(-1)
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
