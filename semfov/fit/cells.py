@@ -110,7 +110,7 @@ def mean_map_loss(model: FovealObservationModel, photographs: Sequence[MappedLoo
 
 
 def fit_cells(model: FovealObservationModel, photographs: Sequence[MappedLooks], *, seed: int = 0) -> None:
-    """Learn what a look says about whole cells (`FovealObservationModel.log_cell`), in place.
+    """Learn what a look says about whole cells (its `log_cell`), in place.
 
     These are three numbers, the odds of a miss, an exponent, and the weight of background. They minimise the negative
     log of what cells hold (`map_loss`), after 1, 2, 4 and 8 looks in a random order. All else stays.

@@ -47,7 +47,7 @@ class SemanticMap(Observer):
     good as P. A closer look replaces a farther one, because looks at a static scene are not independent.
 
     Args:
-        model: calibrates the scores, and has m, a and w (`FovealObservationModel.log_cell`).
+        model: calibrates the scores, and has m, a and w (its `log_cell`).
 
     >>> model = FovealObservationModel.identity(["cup", "cat"], [0.2], cell=(0.01, 1.0, 1.0))
     >>> observer, grid = SemanticMap(model), Grid(2, 1, (10, 10))
