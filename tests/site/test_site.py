@@ -171,7 +171,7 @@ ASKED = {
     "gpu": "tasks/running",
     "label": "tasks/count",
     "count": "tasks/count",
-    "onnx": "detectors.html#an-onnx-model-of-your-own",
+    "onnx": "#an-onnx-model-of-your-own",
     "offline": "install",
 }
 """Words that a reader may ask for, and a page that is among the first three answers."""
