@@ -49,14 +49,13 @@ class Evidence(PretrainedForEye):
         readout_width: int,
         *,
         components: int,
-        more: int = 0,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.widths = look_width, readout_width
         self.metadata = dict(metadata or {})
         self.look = network(LOOK_FEATURES, look_width)
-        self.read = network(READOUT + more, readout_width)
+        self.read = network(READOUT, readout_width)
         self.prior = nn.Parameter(torch.zeros(components))
 
     def _record(self) -> dict[str, Any]:

@@ -209,15 +209,19 @@ class CameraMotion:
         """Compare the present frame with what was seen before a disturbance, which is given up after a while."""
         lost.waited += 1
         fit = self._between(lost.key, present, lost.key_to_last)
-        found = fit is not None and not fit.is_repeated and self._is_certain(fit, None)
-        found = found and fit is not None and share_off(self._cv2, lost.key, present, fit.similarity[:2]) < _MOST_OFF
-        if found or lost.waited >= self.patience:
+        if fit is not None and self._is_found(lost.key, present, fit):
             self._lost = None
-            if not found:
-                self._course = None
-        if fit is None or not found:
-            return None
-        return _at_full_size(fit.similarity @ np.linalg.inv(lost.key_to_last), present.ratio)
+            return _at_full_size(fit.similarity @ np.linalg.inv(lost.key_to_last), present.ratio)
+        if lost.waited >= self.patience:
+            self._lost = None
+            self._course = None
+        return None
+
+    def _is_found(self, key: GreyFrame, present: GreyFrame, fit: _Fit) -> bool:
+        """Tell whether a motion since before a disturbance is the camera's: it has no rival, and few blocks are off."""
+        if fit.is_repeated or not self._is_certain(fit, None):
+            return False
+        return share_off(self._cv2, key, present, fit.similarity[:2]) < _MOST_OFF
 
     def _since_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> Motion | None:
         """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""

@@ -110,15 +110,26 @@ class _Parts(NamedTuple):
         shown = cv2.erode(cv2.resize(shown, size, interpolation=cv2.INTER_AREA), np.ones((_BORDER, _BORDER))) == 255
         a, b = (_flattened(cv2, grey, size) for grey in (moved, second.grey))
         down, across = np.gradient((a + b) / 2)
-        x, y, difference = (values * shown for values in (across, down, b - a))
-        products = x * x, x * y, y * y, x * difference, y * difference, difference**2, shown, np.ones_like(shown)
-        xx, xy, yy, xd, yd, dd, seen, pixels = (_sums(values, counts) for values in products)
-        determinant = xx * yy - xy**2
-        slope = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+        x = across * shown
+        y = down * shown
+        difference = (b - a) * shown
+        # Σ g gᵀ, Σ g (B − A) and Σ (B − A)² of each part, whose 2 × 2 systems are solved in closed form.
+        slopes_xx = _sums(x * x, counts)
+        slopes_xy = _sums(x * y, counts)
+        slopes_yy = _sums(y * y, counts)
+        right_side_x = _sums(x * difference, counts)
+        right_side_y = _sums(y * difference, counts)
+        squared_difference = _sums(difference**2, counts)
+        determinant = slopes_xx * slopes_yy - slopes_xy**2
         with np.errstate(divide="ignore", invalid="ignore"):
-            right, below = -(yy * xd - xy * yd) / determinant, -(xx * yd - xy * xd) / determinant
-            explained = -(right * xd + below * yd) / dd
-        return cls(ratio * np.hypot(right, below), explained, slope, seen, pixels)
+            shift_x = -(slopes_yy * right_side_x - slopes_xy * right_side_y) / determinant
+            shift_y = -(slopes_xx * right_side_y - slopes_xy * right_side_x) / determinant
+            explained = -(shift_x * right_side_x + shift_y * right_side_y) / squared_difference
+        # The smaller eigenvalue of Σ g gᵀ.
+        slope = (slopes_xx + slopes_yy) / 2 - np.sqrt(((slopes_xx - slopes_yy) / 2) ** 2 + slopes_xy**2)
+        seen = _sums(shown, counts)
+        pixels = _sums(np.ones_like(shown), counts)
+        return cls(ratio * np.hypot(shift_x, shift_y), explained, slope, seen, pixels)
 
 
 def _flattened(cv2: ModuleType, grey: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
