@@ -50,19 +50,19 @@ def large_search() -> Run:
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     picture = to_bytes(Mosaics(scenes, 6, 6, tile=(640, 480), count=1)[0].image)
     detector, candidates = agent.eye.detector, list[Candidates]()
-    propose = detector.propose_bytes
+    propose = detector.propose_likely
 
-    def remembered(canvases: Tensor) -> Candidates:
-        candidates.append(propose(canvases))
+    def remembered(canvases: Tensor, least: float) -> Candidates:
+        candidates.append(propose(canvases, least))
         return candidates[-1]
 
     def search() -> ZoomPath:
         return agent.search(picture, "person", SearchSettings(passes=16, confirm=1.0, stop_below=0.0, closer=0))
 
-    vars(detector)["propose_bytes"] = remembered
+    vars(detector)["propose_likely"] = remembered
     search()
     again = cycle(candidates)
-    vars(detector)["propose_bytes"] = lambda canvases: next(again)
+    vars(detector)["propose_likely"] = lambda canvases, least: next(again)
     return search
 
 

@@ -20,7 +20,7 @@ from semfov.detection.onnx_file import OnnxSettings, check_canvas, names_beside,
 from semfov.detection.onnx_heads import HEADS, explain_misplacement, recognise
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.onnx_signature import Signature
-from semfov.detection.preprocessing import Preprocessing
+from semfov.detection.preprocessing import Preprocessing, check_bytes
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.errors import InputError, check, check_data, check_shape, lookup, values_known
@@ -100,14 +100,21 @@ class OnnxDetector(Detector):
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
-        self._check_canvas(canvas)
-        check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
-        return self._run(self.preprocessing(canvas.detach()))
+        return self.propose_likely(_checked_floats(canvas), 0.0)
 
     def propose_bytes(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas of bytes `(B, 3, H, W)`, converted directly to the input."""
+        check_bytes(canvas)
+        return self.propose_likely(canvas, 0.0)
+
+    def propose_likely(self, canvas: Tensor, least: float) -> Candidates:
+        """Compute the boxes of the head that may have a confidence; after the first pass few others are decoded."""
         self._check_canvas(canvas)
-        return self._run(self.preprocessing.of_bytes(canvas))
+        if canvas.dtype == torch.uint8:
+            image = self.preprocessing.of_bytes(canvas)
+        else:
+            image = self.preprocessing(_checked_floats(canvas).detach())
+        return self.decode(self.session(image), (image.shape[-1], image.shape[-2]), least)
 
     def propose_with_features(
         self, canvas: Tensor, layers: Sequence[str] | None = None
@@ -153,24 +160,23 @@ class OnnxDetector(Detector):
         same = height in (None, rows) and width in (None, columns)
         check(same, "canvas", fixed, f"{columns} × {rows} px; {remedy}")
 
-    def _run(self, image: Tensor) -> Candidates:
-        """Run the network on its input `(B, 3, H, W)`, and decode what it returns."""
-        return self.decode(self.session(image), (image.shape[-1], image.shape[-2]))
-
-    def decode(self, outputs: dict[str, Tensor], size: Canvas) -> Candidates:
+    def decode(self, outputs: dict[str, Tensor], size: Canvas, least: float = 0.0) -> Candidates:
         """Decode the outputs of the network.
 
         Args:
             outputs: the outputs by name.
             size: `(width, height)` of the canvas.
+            least: confidence from which on boxes are wanted; most others are left out after the first pass, which is
+                checked as a whole.
 
         Returns:
-            All boxes, with the scores of the classes.
+            The boxes, with the scores of the classes.
 
         Raises:
             DataError: the numbers cannot be those of this head.
         """
-        candidates = HEADS[self.head].decode(outputs, size, self._scores)
+        is_whole = self.logits or not self._first_checked  # logits are no bound of a confidence
+        candidates = HEADS[self.head].decode(outputs, size, self._scores, 0.0 if is_whole else least)
         count = candidates.boxes.shape[1]
         check_data(count <= _MOST_BOXES, self.name, f"at most {_MOST_BOXES:,} boxes", f"{count:,}")
         # A wrong head shows in the first pass, so later ones spend no time on it.
@@ -230,6 +236,12 @@ class OnnxDetector(Detector):
         if self.session.providers is not None:
             settings["providers"] = list(self.session.providers)
         return settings
+
+
+def _checked_floats(canvas: Tensor) -> Tensor:
+    """Return a canvas of floats; raises `InputError` for other numbers."""
+    check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
+    return canvas
 
 
 def _with_scores(candidates: Candidates, function: Callable[[Tensor], Tensor]) -> Candidates:

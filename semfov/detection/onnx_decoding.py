@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from semfov.detection.onnx_cells import Canvas, cell_grid
+from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_signature import selected_outputs
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError, check, check_shape, values_known
@@ -17,7 +17,23 @@ from semfov.errors import InputError, check, check_shape, values_known
 _FEW = 64  # cells
 
 
-def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candidates:
+def likely_rows(bound: Tensor, least: float) -> Tensor:
+    """Find the rows of a head that may have a confidence in some image of a batch.
+
+    Args:
+        bound: `(B, N)`, a score that the confidence of a row does not exceed.
+        least: the confidence.
+
+    Returns:
+        Numbers of the rows in their order, `(M,)`. NaN may stand for any score, so that its row is among them.
+
+    >>> likely_rows(torch.tensor([[0.1, 0.5, 0.0], [0.1, 0.0, 0.7]]), 0.2)
+    tensor([1, 2])
+    """
+    return (~(bound < least)).any(0).nonzero()[:, 0]
+
+
+def decode_yolox(raw: Tensor, grid: Tensor) -> Candidates:
     """Decode offsets from cells and logarithms of sizes (YOLOX, Ge et al. 2021).
 
     For the cell (i, j) of a level with stride s, centre and size of the box are
@@ -25,30 +41,30 @@ def decode_yolox(raw: Tensor, canvas: Canvas, strides: tuple[int, ...]) -> Candi
         c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
 
     Args:
-        raw: `(B, N, 5 + K)`: `t_x t_y t_w t_h`, objectness, class scores, for the cells of all levels.
-        canvas: `(width, height)` in pixels.
-        strides: strides s of the levels in pixels.
+        raw: `(B, N, 5 + K)`: `t_x t_y t_w t_h`, objectness, class scores of each cell.
+        grid: column i, row j and stride s in pixels of each cell, `(..., N, 3)`.
 
     Returns:
         The boxes, with objectness.
-
-    Raises:
-        InputError: there is not a row for each cell, or the rows hold decoded boxes.
     """
-    check_shape(raw, "raw", None, None, None)
-    # Exports with boxes as fractions of the canvas have the same shape.
-    expected = "offsets from cells and logarithms of sizes, some of them below 0"
-    got = "numbers from 0 to 1, as fractions of the canvas"
-    check(not _are_fractions(raw[..., :4]), "output of the head", expected, got)
-    grid = cell_grid(raw.shape[1], canvas, strides, 0.0, raw.dtype, raw.device)
-    cell = grid[:, :2]
-    stride = grid[:, 2:]
+    cell = grid[..., :2]
+    stride = grid[..., 2:]
     offset = raw[..., 0:2]
     log_size = raw[..., 2:4]
     centre = (offset + cell) * stride
     size = log_size.exp() * stride
     boxes = corners(torch.cat([centre, size], -1))
     return Candidates(boxes, classes=raw[..., 5:], objectness=raw[..., 4])
+
+
+def check_offsets(raw: Tensor) -> None:
+    """Raise `InputError` where rows `(B, N, 5 + K)` for `decode_yolox` hold boxes as fractions of the canvas instead.
+
+    They have the same shape. All rows of a pass tell, and not a few of them.
+    """
+    expected = "offsets from cells and logarithms of sizes, some of them below 0"
+    got = "numbers from 0 to 1, as fractions of the canvas"
+    check(not _are_fractions(raw[..., :4]), "output of the head", expected, got)
 
 
 def _are_fractions(boxes: Tensor) -> bool:
@@ -155,20 +171,15 @@ def decode_selected(outputs: Mapping[str, Tensor], classes: int | None) -> Candi
     return decode_end_to_end(rows, classes)
 
 
-def decode_distances(
-    scores: Tensor, distances: Tensor, canvas: Canvas, *, strides: tuple[int, ...], offset: float = 0.5
-) -> Candidates:
+def decode_distances(scores: Tensor, distances: Tensor, grid: Tensor) -> Candidates:
     r"""Decode boxes given as distributions over the distance to each side (distribution focal loss, Li et al. 2020).
 
-    The distance from the point `p = (cell + offset) s` to the left, upper, right or lower side is
-    `d = s Σ_b b softmax(t)_b`.
+    The distance from the point `p = s (i, j)` to the left, upper, right or lower side is `d = s Σ_b b softmax(t)_b`.
 
     Args:
-        scores: class scores `(B, N, K)` of the cells of all levels.
+        scores: class scores `(B, N, K)` of the cells.
         distances: `t`, `(B, N, 4 bins)`.
-        canvas: `(width, height)` in pixels.
-        strides: strides s of the levels in pixels.
-        offset: where a cell is anchored, in cells.
+        grid: column i, row j and stride s in pixels of the point of each cell, `(..., N, 3)`.
 
     Returns:
         The boxes, without objectness.
@@ -179,9 +190,8 @@ def decode_distances(
     bins, rest = divmod(shape[-1], 4)
     expected = "4 · bins channels, the same number of bins for each side"
     check(bins > 0 and rest == 0, "distances", expected, shape)
-    grid = cell_grid(distances.shape[1], canvas, strides, offset, distances.dtype, distances.device)
-    stride = grid[:, 2:]
-    point = grid[:, :2] * stride
+    stride = grid[..., 2:]
+    point = grid[..., :2] * stride
     chances = distances.unflatten(-1, (4, bins)).softmax(-1)
     bin_numbers = torch.arange(bins).to(distances)
     distance = chances @ bin_numbers * stride

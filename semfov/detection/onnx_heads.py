@@ -16,8 +16,9 @@ from torch import Tensor
 
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import SCORE_THRESHOLD
-from semfov.detection.onnx_cells import STRIDES, Canvas, box_counts, cell_count
+from semfov.detection.onnx_cells import STRIDES, Canvas, box_counts, cell_count, cell_grid
 from semfov.detection.onnx_decoding import (
+    check_offsets,
     decode_detr,
     decode_distances,
     decode_end_to_end,
@@ -26,6 +27,7 @@ from semfov.detection.onnx_decoding import (
     decode_yolov8,
     decode_yolox,
     fraction_corners,
+    likely_rows,
 )
 from semfov.detection.onnx_places import axes_exchanged, misplacement
 from semfov.detection.onnx_signature import Rows, Signature, query_logits
@@ -87,16 +89,17 @@ class Head(ABC):
         """
 
     @abstractmethod
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         """Make boxes and scores of outputs.
 
         Args:
             outputs: the outputs of a pass by name, in the layout of the class.
             canvas: `(width, height)` in pixels.
             classes: number of classes; None where it is unknown.
+            least: confidence from which on boxes are wanted; others may be left out.
 
         Returns:
-            All boxes, in canvas pixels, with all scores.
+            The boxes, in canvas pixels, with all scores.
 
         Raises:
             InputError: the outputs have another layout.
@@ -184,6 +187,35 @@ def explain_misplacement(boxes: Tensor, canvas: Canvas) -> str | None:
     return None if reason is None else f"{reason}; name the model's head with head=, one of {', '.join(sorted(HEADS))}"
 
 
+class _CellsHead(Head):
+    """Base of heads with a row for each of thousands of cells, few of which may show an object.
+
+    The other rows are left out before anything is computed of their boxes.
+    """
+
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
+        tables = self.tables(outputs, canvas)
+        if least > 0:
+            rows = likely_rows(self.bound(tables), least)
+            tables = tuple(table.index_select(1, rows) for table in tables)
+        return self.decode_rows(tables)
+
+    @abstractmethod
+    def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
+        """Find all that boxes are computed of: tables `(B, N, …)`, or `(1, N, …)`, with a row for each box."""
+
+    def bound(self, tables: tuple[Tensor, ...]) -> Tensor:
+        """Find a score that the confidence of a row does not exceed, `(B, N)`: objectness, as no class scores above 1.
+
+        Rows have it after their boxes in most layouts.
+        """
+        return tables[0][..., 4]
+
+    @abstractmethod
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        """Make a box with its scores of each row of the tables."""
+
+
 class _Candidates(Head):
     """Outputs of `semfov.detection.export`, as `Candidates` holds them.
 
@@ -196,7 +228,7 @@ class _Candidates(Head):
     def recognises(self, signature: Signature) -> bool:
         return signature.layout == "candidates"
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         scores = outputs["classes" if "classes" in outputs else "scores"]
         return Candidates(outputs["boxes"], scores, outputs.get("objectness"), outputs.get("background"))
 
@@ -220,7 +252,7 @@ class _RowsHead(Head):
         """
 
 
-class _Yolox(_RowsHead):
+class _Yolox(_CellsHead, _RowsHead):
     """YOLOX (Ge et al. 2021): one output `(B, N, 5 + K)`, for the cells of strides 8, 16 and 32.
 
     A row is `t_x t_y t_w t_h` (`decode_yolox`), objectness, K class scores.
@@ -232,11 +264,16 @@ class _Yolox(_RowsHead):
     def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
         return rows.cells.levels == 3 and rows.may_have_objectness
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
-        return decode_yolox(_single(outputs), canvas, STRIDES[:3])
+    def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
+        raw = _checked(_single(outputs))
+        check_offsets(raw)
+        return raw, _grid_of(raw, canvas, STRIDES[:3], 0.0)
+
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        return decode_yolox(*tables)
 
 
-class _YoloxDecoded(_RowsHead):
+class _YoloxDecoded(_CellsHead, _RowsHead):
     """YOLOX with boxes that the network has decoded: rows of `yolov5`, for an image in the corner of the canvas."""
 
     name = "yolox-decoded"
@@ -245,11 +282,14 @@ class _YoloxDecoded(_RowsHead):
     def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
         return rows.cells.levels == 3 and rows.may_have_objectness
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
-        return decode_yolov5(_single(outputs))
+    def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
+        return (_checked(_single(outputs)),)
+
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        return decode_yolov5(*tables)
 
 
-class _NanodetPlus(_RowsHead):
+class _NanodetPlus(_CellsHead, _RowsHead):
     """NanoDet-Plus: one output `(B, N, K + 32)`, for the corners of the cells of strides 8, 16, 32 and 64.
 
     A row has K class scores, then the distances of `decode_distances`, with 8 bins for each side.
@@ -267,14 +307,19 @@ class _NanodetPlus(_RowsHead):
         in_four_levels = rows.cells == (1, 4) and not rows.boxes_are_columns
         return in_four_levels and not rows.lack_objectness and rows.hold_scores_and(_DISTANCE_CHANNELS)
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
-        rows = _single(outputs)
-        scores = rows[..., :-_DISTANCE_CHANNELS]
-        distances = rows[..., -_DISTANCE_CHANNELS:]
-        return decode_distances(scores, distances, canvas, strides=STRIDES, offset=0.0)
+    def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
+        rows = _checked(_single(outputs))
+        grid = _grid_of(rows, canvas, STRIDES, 0.0)
+        return rows[..., :-_DISTANCE_CHANNELS], rows[..., -_DISTANCE_CHANNELS:], grid
+
+    def bound(self, tables: tuple[Tensor, ...]) -> Tensor:
+        return tables[0].amax(-1)
+
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        return decode_distances(*tables)
 
 
-class _Yolov5(_RowsHead):
+class _Yolov5(_CellsHead, _RowsHead):
     """YOLOv5 and other heads with objectness: one output `(B, N, 5 + K)`, or its transpose.
 
     A row is `c_x c_y w h` in canvas pixels, objectness, K class scores.
@@ -289,11 +334,14 @@ class _Yolov5(_RowsHead):
         named_by_yolox = (signature.image, signature.outputs[0][0]) == ("images", "output")
         return rows.may_have_objectness and not (rows.cells.levels == 3 and named_by_yolox)
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
-        return decode_yolov5(_rows(outputs, canvas))
+    def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
+        return (_rows(outputs, canvas),)
+
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        return decode_yolov5(*tables)
 
 
-class _Yolov8(_RowsHead):
+class _Yolov8(_CellsHead, _RowsHead):
     """YOLOv8 and other heads without objectness: one output `(B, 4 + K, N)`, or its transpose.
 
     A column is `c_x c_y w h` in canvas pixels, K class scores.
@@ -304,8 +352,14 @@ class _Yolov8(_RowsHead):
     def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
         return rows.lack_objectness
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
-        return decode_yolov8(_rows(outputs, canvas, prefer_columns=True).mT)
+    def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
+        return (_rows(outputs, canvas, prefer_columns=True),)
+
+    def bound(self, tables: tuple[Tensor, ...]) -> Tensor:
+        return tables[0][..., 4:].amax(-1)
+
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        return decode_yolov8(tables[0].mT)
 
 
 class _EndToEnd(_RowsHead):
@@ -323,7 +377,7 @@ class _EndToEnd(_RowsHead):
         # The rows of two classes are as long. Ultralytics' exports say which ones they are.
         return signature.classes != 2 or signature.selects or "end2end" not in signature.metadata
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         return decode_end_to_end(_single(outputs), classes)
 
 
@@ -337,7 +391,7 @@ class _EndToEndDetr(Head):
     def recognises(self, signature: Signature) -> bool:
         return signature.layout == "selection" and {*signature.shapes} == {"labels", "boxes", "scores"}
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         return decode_selected(outputs, classes)
 
 
@@ -350,11 +404,11 @@ class _EndToEndNms(Head):
     def recognises(self, signature: Signature) -> bool:
         return signature.layout == "selection" and {*signature.shapes} != {"labels", "boxes", "scores"}
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         return decode_selected(outputs, classes)
 
 
-class _DistanceMaps(Head):
+class _DistanceMaps(_CellsHead):
     """Base of heads with a class map `(B, N_s, K)` and a distance map `(B, N_s, 4 bins)` for each level of cells.
 
     The class map of a level comes before its distance map. Distances are those of `decode_distances`, from the middle
@@ -368,7 +422,7 @@ class _DistanceMaps(Head):
         cells = [cell_count(signature.canvas, [stride]) for stride in STRIDES[:levels]]
         return sorted(shape[1] for _, shape in signature.outputs) == sorted(cells * 2)
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
         strides = STRIDES[: len(outputs) // 2]
         # Some exports have all class maps first, others the two maps of a level together.
         shapes = [tuple(output.shape) for output in outputs.values()]
@@ -379,7 +433,14 @@ class _DistanceMaps(Head):
             check(len(maps) == 2, "outputs", f"a class and a distance map at each of strides {strides}", shapes)
             class_maps.append(maps[0])
             distance_maps.append(maps[1])
-        return decode_distances(torch.cat(class_maps, 1), torch.cat(distance_maps, 1), canvas, strides=strides)
+        scores = torch.cat(class_maps, 1)
+        return scores, torch.cat(distance_maps, 1), _grid_of(scores, canvas, strides, 0.5)
+
+    def bound(self, tables: tuple[Tensor, ...]) -> Tensor:
+        return tables[0].amax(-1)
+
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        return decode_distances(*tables)
 
 
 class _Picodet(_DistanceMaps):
@@ -422,7 +483,7 @@ class _Detr(Head):
         classes = 91 if signature.classes is None else signature.classes
         return query_logits(signature.shapes)[-1] == classes + 1
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         return decode_detr(query_logits(outputs), outputs["pred_boxes"], canvas)
 
 
@@ -433,7 +494,7 @@ class _SigmoidQueries(Head):
     Boxes are `c_x c_y w h` as fractions of the canvas.
     """
 
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None) -> Candidates:
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         boxes = outputs.get("pred_boxes", outputs.get("dets"))
         if boxes is not None:
             logits = query_logits(outputs)
@@ -480,6 +541,17 @@ def _made_by_paddle(signature: Signature) -> bool:
 def _single(outputs: _Outputs) -> Tensor:
     """Return the only output of a model."""
     return next(iter(outputs.values()))
+
+
+def _checked(rows: Tensor) -> Tensor:
+    """Return rows of boxes `(B, N, C)`; raises `InputError` for tensors of another shape."""
+    check_shape(rows, "outputs", None, None, None)
+    return rows
+
+
+def _grid_of(rows: Tensor, canvas: Canvas, strides: tuple[int, ...], offset: float) -> Tensor:
+    """List column, row and stride of the cells that rows `(B, N, C)` are of (`cell_grid`), `(1, N, 3)`."""
+    return cell_grid(rows.shape[1], canvas, strides, offset, rows.dtype, rows.device)[None]
 
 
 def _rows(outputs: _Outputs, canvas: Canvas, *, prefer_columns: bool = False) -> Tensor:

@@ -149,7 +149,9 @@ class WindowEye(nn.Module):
         """
         canvas, frames = self.resample(view, fixations, within) if resampled is None else resampled
         device = canvas.device
-        candidates = self._propose(canvas, meanwhile)
+        threshold = self.detector.selection.threshold
+        least = min(threshold, self.detector.faint) if hints else threshold
+        candidates = self._propose(canvas, least, meanwhile)
         selected = select(candidates, None, self.detector.selection, self.detector.background)
         border = _PHOTOGRAPH_BORDER if view.lattice.levels == 1 else BORDER
         place = _Placement(frames, view.picture.size, selected.boxes, border)
@@ -172,15 +174,17 @@ class WindowEye(nn.Module):
             hints.append(Hints(boxes.to(device), on_canvas.scores.to(device)))
         return tuple(hints)
 
-    def _propose(self, canvas: Tensor, meanwhile: Callable[[], object] | None) -> Candidates:
-        """Pass canvases `(F, 3, h, w)` through the detector, on its device, while a second thread works."""
+    def _propose(self, canvas: Tensor, least: float, meanwhile: Callable[[], object] | None) -> Candidates:
+        """Pass canvases `(F, 3, h, w)` through the detector, on its device, while a second thread works.
+
+        Boxes with less than the `least` confidence may be left out.
+        """
         device = canvas.device
         canvas = canvas.to(next(self.detector.parameters(), canvas).device)
         with beside(meanwhile, idle=canvas.device.type != "cpu"):
-            if canvas.dtype == torch.uint8:
-                proposals = self.detector.propose_bytes(canvas)
-            else:
-                proposals = self.detector.propose(canvas.to(torch.get_default_dtype()).contiguous() / 255)
+            if canvas.dtype != torch.uint8:
+                canvas = canvas.to(torch.get_default_dtype()).contiguous() / 255
+            proposals = self.detector.propose_likely(canvas, least)
             return proposals.precise().to(device)
 
     def glimpse(

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection import onnx_decoding as decoding
+from semfov.detection.onnx_cells import cell_grid
 from semfov.detection.onnx_heads import HEADS, Head, explain_misplacement, recognise
 from semfov.detection.onnx_signature import Signature
 from semfov.detection.scores import Candidates
@@ -83,7 +84,8 @@ def test_distance_distributions(dtype, canvas, bins, offset):
     strides = (8, 16, 32, 64)
     cells = cell_list(canvas, strides)
     classes, distances = noise(1, len(cells), 3, dtype=dtype), 2 * noise(1, len(cells), 4 * bins, dtype=dtype)
-    found = decoding.decode_distances(classes, distances, canvas, strides=strides, offset=offset)
+    grid = cell_grid(len(cells), canvas, strides, offset, dtype, torch.device("cpu"))
+    found = decoding.decode_distances(classes, distances, grid)
     close(found.boxes, [distance_boxes(distances[0], cells, offset)])
     assert torch.equal(found.classes, classes)
     assert found.objectness is None
@@ -101,7 +103,8 @@ def test_decoders_are_differentiable_and_compile():
     assert check(lambda x, y: numbers(decoding.decode_detr(x, y, (16, 8))), (raw, boxes))
     assert check(lambda x, y: numbers(decode("rtdetr", (16, 8), x, y)), (raw, boxes))
     distances = noise(1, 5, 12).requires_grad_()
-    assert check(lambda x, y: numbers(decoding.decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
+    grid = noise(5, 3)
+    assert check(lambda x, y: numbers(decoding.decode_distances(x, y, grid)), (raw, distances))
     raw = noise(1, 84, 8)
     compiled = torch.compile(lambda x: decode("yolox", (64, 64), x).boxes, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(raw), decode("yolox", (64, 64), raw).boxes)
@@ -217,7 +220,7 @@ def test_models_without_score_vectors_or_of_other_tasks_are_refused():
         with pytest.raises(InputError, match=f"task: expected a model that detects .*'{task}'"):
             recognise(signature((1, 116, 8400), classes=80, task=task))
     refused("84 rows, one for each cell of a 64 x 64 canvas", decode, "yolox", (64, 64), noise(1, 83, 8))
-    refused("bins", decoding.decode_distances, noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))
+    refused("bins", decoding.decode_distances, noise(1, 84, 3), noise(1, 84, 30), noise(84, 3))
     refused("boxes", decoding.decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
 
 
