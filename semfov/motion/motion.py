@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -53,9 +54,13 @@ class Motion:
         is_map = bool(np.isfinite(matrix).all()) and matrix[2, 2] != 0
         check(is_map, "motion", expected, matrix.tolist())
         # A matrix times any number is the same map, so areas are those of the matrix with 1 in its corner.
-        normal = matrix / matrix[2, 2]
-        check(abs(np.linalg.det(normal)) > _LEAST_AREA, "motion", expected, matrix.tolist())
-        object.__setattr__(self, "matrix", normal)
+        object.__setattr__(self, "matrix", matrix / matrix[2, 2])
+        check(bool(abs(self._determinant) > _LEAST_AREA), "motion", expected, matrix.tolist())
+
+    @cached_property
+    def _determinant(self) -> NDArray[np.float64]:
+        """Determinant of the matrix, `()`: many places are mapped by one motion."""
+        return np.asarray(np.linalg.det(self.matrix))
 
     @classmethod
     def still(cls) -> Self:
@@ -146,7 +151,7 @@ class Motion:
         >>> quarter.is_ahead(torch.tensor([[3.0, 0.0], [-3.0, 0.0]]))
         tensor([ True, False])
         """
-        return torch.from_numpy(_are_ahead(self.matrix, self._weights(points)))
+        return torch.from_numpy(_are_ahead(self.matrix, self._determinant, self._weights(points)))
 
     def shows(self, boxes: Tensor) -> Tensor:
         """Tell which boxes have their centres before the camera (`is_ahead`); no motion brings the others back.
@@ -172,7 +177,7 @@ class Motion:
         Returns:
             `(...)`, positive.
         """
-        return torch.from_numpy(_local_scales(self.matrix, self._weights(points))).to(points)
+        return torch.from_numpy(_local_scales(self._determinant, self._weights(points))).to(points)
 
     def _weights(self, points: Tensor) -> NDArray[np.float64]:
         """Compute the weights w of points `(..., 2)`, `(...)`."""
@@ -187,7 +192,8 @@ class Motion:
         Returns:
             `(..., 4)` in pixels of the second frame.
         """
-        return moved_boxes(torch.from_numpy(self.matrix), boxes)[0]
+        moved, _ = _moved_boxes(self.matrix, self._determinant, _values(boxes))
+        return torch.from_numpy(moved).to(boxes)
 
 
 def _values(tensor: Tensor) -> NDArray[np.float64]:
@@ -195,22 +201,23 @@ def _values(tensor: Tensor) -> NDArray[np.float64]:
     return np.asarray(tensor.detach().cpu().double().numpy())
 
 
-def _local_scales(matrices: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _local_scales(determinants: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute roots of the ratios of areas; the determinant of a map's derivative is det(M) / w³."""
-    return np.asarray(np.sqrt(np.abs(np.linalg.det(matrices)) / np.abs(weights) ** 3))
+    return np.asarray(np.sqrt(np.abs(determinants) / np.abs(weights) ** 3))
 
 
-def _are_ahead(matrices: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _are_ahead(
+    matrices: NDArray[np.float64], determinants: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Tell where the weights of maps have the sign of a place before the camera.
 
     A homography has no sign, but that of a camera that turns, or moves above a plane, has a positive determinant.
     Affine maps show all places.
     """
     is_affine = (matrices[..., 2, :2] == 0).all(-1)
-    return np.asarray(is_affine | (weights * np.sign(np.linalg.det(matrices)) > 0))
+    return np.asarray(is_affine | (weights * np.sign(determinants) > 0))
 
 
-@_with_horizon
 def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     r"""Map boxes, each by a motion of its own: their centres move, and their sides are scaled; they stay upright.
 
@@ -233,15 +240,22 @@ def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     (tensor([10.,  0., 18.,  4.]), tensor(2.))
     """
     maps = _values(matrices)
-    exact = _values(boxes)
-    low = exact[..., :2]
-    high = exact[..., 2:]
+    moved, scales = _moved_boxes(maps, np.linalg.det(maps), _values(boxes))
+    return torch.from_numpy(moved).to(boxes), torch.from_numpy(scales).to(boxes)
+
+
+@_with_horizon
+def _moved_boxes(
+    maps: NDArray[np.float64], determinants: NDArray[np.float64], boxes: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Map boxes `(..., 4)` by matrices with these determinants; moved boxes and scales, as of `moved_boxes`."""
+    low = boxes[..., :2]
+    high = boxes[..., 2:]
     centres = (low + high) / 2
     mapped = (maps[..., :2] @ centres[..., None])[..., 0] + maps[..., 2]
     weights = mapped[..., 2]
-    scales = _local_scales(maps, weights)
-    is_ahead = _are_ahead(maps, weights)[..., None]
+    scales = _local_scales(determinants, weights)
+    is_ahead = _are_ahead(maps, determinants, weights)[..., None]
     moved_centres = np.where(is_ahead, mapped[..., :2] / weights[..., None], _BEYOND)
     half_sizes = np.where(is_ahead, (high - low) / 2 * scales[..., None], 0.0)
-    moved = np.concatenate([moved_centres - half_sizes, moved_centres + half_sizes], -1)
-    return torch.from_numpy(moved).to(boxes), torch.from_numpy(scales).to(boxes)
+    return np.concatenate([moved_centres - half_sizes, moved_centres + half_sizes], -1), scales

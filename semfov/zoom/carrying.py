@@ -36,14 +36,17 @@ def carried(looks: Sequence[WindowLook], motions: Sequence[Motion], lattice: Lat
     """
     if not looks:
         return []
-    # The boxes of all looks are moved together: one at a time costs more than the detector saves.
+    # The windows and the boxes of all looks are moved together: one at a time costs more than the detector saves.
     regions = torch.tensor([look.window.region(lattice) for look in looks], dtype=torch.float64)
-    matrices = torch.from_numpy(np.stack([motion.matrix for motion in motions]))
-    moved_regions, scales = moved_boxes(matrices, regions)
-    counts = torch.tensor([look.detections.boxes.shape[1] for look in looks])
     boxes = torch.cat([look.detections.boxes[0] for look in looks])
-    moved, _ = moved_boxes(matrices.repeat_interleave(counts, 0), boxes)
-    places = zip(moved_regions.tolist(), scales.tolist(), moved.split(counts.tolist()), strict=True)
+    counts = [look.detections.boxes.shape[1] for look in looks]
+    look_of_box = np.repeat(np.arange(len(looks)), counts)
+    matrix_of_look = np.stack([motion.matrix for motion in motions])
+    matrices = torch.from_numpy(np.concatenate([matrix_of_look, matrix_of_look[look_of_box]]))
+    moved, scales = moved_boxes(matrices, torch.cat([regions, boxes.double()]))
+    moved_regions, moved_detections = moved.split([len(looks), len(boxes)])
+    boxes_of_looks = moved_detections.to(boxes.dtype).split(counts)
+    places = zip(moved_regions.tolist(), scales[: len(looks)].tolist(), boxes_of_looks, strict=True)
     carried_looks = []
     for look, motion, (region, scale, boxes_of_look) in zip(looks, motions, places, strict=True):
         window = _window_at(look.window, region, scale, lattice)
