@@ -40,11 +40,15 @@ def cheapest_pairs(costs: NDArray[np.float64]) -> NDArray[np.intp]:
 def _assigned(costs: NDArray[np.float64]) -> NDArray[np.intp]:
     """Assign a column to each row at the lowest sum of costs; `(R, C)` with R <= C → `(R,)`."""
     rows, columns = costs.shape
-    row_price = np.zeros(rows)
+    row_price = costs.min(1)
     column_price = np.zeros(columns)
     row_of = np.full(columns, -1)
     column_of = np.full(rows, -1)
-    for start in range(rows):
+    # The first row that wants a column has it, and few rows are left whose paths are searched.
+    wanted, first_rows = np.unique(costs.argmin(1), return_index=True)
+    row_of[wanted] = first_rows
+    column_of[first_rows] = wanted
+    for start in np.flatnonzero(column_of < 0).tolist():
         distance = np.full(columns, np.inf)
         before = np.full(columns, -1)  # the row from which each column is reached
         reached = np.zeros(columns, bool)

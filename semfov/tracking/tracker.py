@@ -210,6 +210,8 @@ class Tracker:
 
     def _begin(self, seen: Seen, noise: Floats, fresh: NDArray[np.bool_]) -> None:
         """Begin an object with each of the detections `(M,)` that show none that is known."""
+        if not fresh.any():
+            return
         boxes = seen.boxes[fresh]
         log_size = _log_size(boxes)
         count = len(boxes)

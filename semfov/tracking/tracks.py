@@ -1,6 +1,7 @@
 """The objects that a tracker knows of, as columns."""
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,7 @@ class Tracks:
             trail=no_trail(0),
         )
 
-    @property
+    @cached_property
     def standing(self) -> Floats:
         r"""Probabilities that they stand still, `(N,)`, beside the scene.
 
@@ -111,7 +112,8 @@ class Tracks:
     def corners(self) -> Floats:
         """Their boxes, `(N, 4)` as an array."""
         half = np.exp(self.log_size) / 2
-        return np.concatenate([self.place - half, self.place + half], -1)
+        place = self.place
+        return np.concatenate([place - half, place + half], -1)
 
     @property
     def boxes(self) -> Tensor:
@@ -160,7 +162,7 @@ class Tracks:
 
     def __getitem__(self, index: _Index) -> "Tracks":
         """Select some of the objects."""
-        return Tracks(*(getattr(self, column.name)[index] for column in fields(self)))
+        return Tracks(*(getattr(self, name)[index] for name in _COLUMNS))
 
     def joined(self, others: "Tracks") -> "Tracks":
         """Append other objects.
@@ -172,11 +174,11 @@ class Tracks:
             All of them.
         """
         columns: dict[str, Any] = {}
-        for column in fields(self):
-            mine = getattr(self, column.name)
-            theirs = getattr(others, column.name)
+        for name in _COLUMNS:
+            mine = getattr(self, name)
+            theirs = getattr(others, name)
             is_array = isinstance(mine, np.ndarray)
-            columns[column.name] = np.concatenate([mine, theirs]) if is_array else mine.joined(theirs)
+            columns[name] = np.concatenate([mine, theirs]) if is_array else mine.joined(theirs)
         return Tracks(**columns)
 
     def carried(self, motion: Motion) -> "Tracks":
@@ -245,6 +247,9 @@ class Tracks:
             torch.from_numpy(chosen.passes),
             track_ids=torch.from_numpy(chosen.track_ids),
         )
+
+
+_COLUMNS = tuple(column.name for column in fields(Tracks))
 
 
 def no_trail(count: int) -> Floats:
