@@ -94,6 +94,10 @@ class _Scored(NamedTuple):
     scores: Tensor
     in_view: Tensor
 
+    def of(self, chosen: Tensor) -> "_Scored":
+        """Select some of the boxes, `(M,)` boolean."""
+        return _Scored(self.boxes[chosen], self.scores[chosen], self.in_view[chosen])
+
 
 class CandidateBoxes(CandidatePlaces[SearchLook]):
     r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
@@ -148,7 +152,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
 
         It is asked for several times after each look, and computed anew after what may change it.
         """
-        boxes, scores = self._boxes()
+        boxes, scores = self._scored_boxes
         if self._examined:
             scores = scores.masked_fill(self._are_examined(boxes), 0)
         if not len(scores):
@@ -160,6 +164,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
     def _change(self) -> None:
         """Drop what was computed of the looks and the examined places, as these change."""
         self.__dict__.pop("_most_evident", None)
+        self.__dict__.pop("_scored_boxes", None)
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the path."""
@@ -188,10 +193,13 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         counts = [len(boxes) for boxes in parts]
         together = torch.cat(parts)
         moved = motion.boxes(together)
-        columns = [column.split(counts) for column in (moved, inside_frame(moved, size), motion.shows(together))]
+        is_ahead = motion.shows(together)
+        are_all_ahead = bool(is_ahead.all())  # mostly; selecting from each look takes longer than moving them
+        columns = [column.split(counts) for column in (moved, inside_frame(moved, size), is_ahead)]
         moved_looks = []
         for (time, scored), boxes, in_view, ahead in zip(self._looks, *columns, strict=True):
-            moved_looks.append((time, _Scored(boxes[ahead], scored.scores[ahead], in_view[ahead])))
+            moved_look = _Scored(boxes, scored.scores, in_view)
+            moved_looks.append((time, moved_look if are_all_ahead else moved_look.of(ahead)))
         self._looks = moved_looks
 
     def probability(self, look: CloseUp) -> float:
@@ -203,13 +211,14 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         Returns:
             The probability, by the detections that overlap the place.
         """
-        boxes, scores = self._boxes()
+        boxes, scores = self._scored_boxes
         if not len(scores):
             return self._chance(0.0)
         overlaps = box_iou(boxes, look.box[None])[:, 0] >= SAME
         return self._chance(float((scores * overlaps).max()))
 
-    def _boxes(self) -> tuple[Tensor, Tensor]:
+    @cached_property
+    def _scored_boxes(self) -> tuple[Tensor, Tensor]:
         """Boxes `(M, 4)` of the target in view that count, and their scores `(M,)`, faded."""
         if not self._looks:
             return torch.zeros(0, 4), torch.zeros(0)
