@@ -138,8 +138,10 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
 
 def check_tensor(value: object, argument: str) -> None:
     """Raise `InputError` unless a value is a tensor; the message has the call that converts it."""
+    if isinstance(value, Tensor):
+        return
     kind = "NumPy array" if type(value).__name__ == "ndarray" else type(value).__name__
-    check(isinstance(value, Tensor), argument, "a tensor", f"a {kind}; give torch.as_tensor({argument})")
+    check(False, argument, "a tensor", f"a {kind}; give torch.as_tensor({argument})")
 
 
 def check_whole(value: object, argument: str, low: int, high: int) -> None:
