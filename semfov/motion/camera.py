@@ -46,9 +46,8 @@ class CameraStep(NamedTuple):
         recovered: maps pixels of the last frame before a disturbance to those of this one, once the two fit.
         waits: whether frames before a disturbance may still be found again.
 
-    >>> first, second = CameraStep(Motion.similarity(shift=(3, 0))), CameraStep(Motion.similarity(shift=(0, 4)))
-    >>> first.then(second).motion.matrix[:2, 2].tolist()
-    [3.0, 4.0]
+    >>> CameraStep(Motion.similarity(shift=(3, 0))).is_still
+    False
     """
 
     motion: Motion | None
@@ -59,21 +58,6 @@ class CameraStep(NamedTuple):
     def is_still(self) -> bool:
         """Whether nothing has moved, and nothing was lost."""
         return self.motion is not None and self.recovered is None and self.motion.is_still
-
-    def then(self, later: "CameraStep") -> "CameraStep":
-        """Compose the steps of two successive frames.
-
-        Args:
-            later: the step after this one.
-
-        Returns:
-            The step from the frame before this one to the frame of the later one.
-        """
-        motion = None if self.motion is None or later.motion is None else self.motion.then(later.motion)
-        recovered = later.recovered
-        if recovered is None and self.recovered is not None and later.motion is not None:
-            recovered = self.recovered.then(later.motion)
-        return CameraStep(motion, recovered, later.waits)
 
 
 class KnownPoses:

@@ -175,15 +175,6 @@ def test_a_disturbance_that_lasts_ends_the_wait():
     ]
 
 
-def test_steps_of_two_frames_are_composed():
-    first, second = Motion.similarity(shift=(3, 0)), Motion.similarity(shift=(0, 4))
-    both = CameraStep(first).then(CameraStep(second))
-    assert both.motion.matrix[:2, 2].tolist() == [3, 4]
-    assert CameraStep(None, waits=True).then(CameraStep(second, recovered=first)) == CameraStep(None, recovered=first)
-    found = CameraStep(None, recovered=first).then(CameraStep(second))
-    assert found.recovered.matrix[:2, 2].tolist() == [3, 4]
-
-
 def blinds():
     return np.repeat(np.where(np.arange(HEIGHT) % 24 < 9, 90, 200), WIDTH).reshape(HEIGHT, WIDTH)
 
