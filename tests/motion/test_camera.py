@@ -280,3 +280,64 @@ def test_an_unsteady_hand_is_followed_behind_something_near():
         lost += motion is None
         assert motion is None or error(motion, views[number - 1][1], views[number][1]) < 1.5
     assert lost <= 4
+
+
+def soft():
+    """A scene without corners, such as clouds: it looks like itself after some pixels, but its slopes tell that."""
+    grey = cv2.GaussianBlur(np.random.default_rng(3).normal(0, 1, (HEIGHT, WIDTH)), (0, 0), 12)
+    return np.repeat(np.clip(128 + 40 * grey / grey.std(), 0, 255).astype(np.uint8)[..., None], 3, 2)
+
+
+def passing_before(background, height, width):
+    """Two frames of a scene that moves by 6 px and leaves a part of a background, above on the left, that stands."""
+    frames = [view(scene(), 700 + 6 * number, 700)[0] for number in range(2)]
+    for frame in frames:
+        frame[:height, :width] = background[:height, :width]
+    return frames
+
+
+# Blocks are compared in eight rows of ten.
+A_ROW, A_COLUMN = HEIGHT // 8, WIDTH // 10
+
+
+@pytest.mark.parametrize("darkness", [False, True], ids=["at once", "after darkness"])
+@pytest.mark.parametrize(("rows", "columns", "is_believed"), [(1, 2, True), (1, 5, True), (2, 10, False)])
+def test_a_row_of_blocks_that_are_off_is_the_most_that_a_first_motion_leaves_out(rows, columns, is_believed, darkness):
+    """The rest of the frame agrees with one motion, and nothing in the part that stands can be followed."""
+    first, second = passing_before(soft(), rows * A_ROW, columns * A_COLUMN)
+    camera = CameraMotion()
+    camera.step(first)
+    if darkness:
+        camera.step(np.zeros_like(first))
+    step = camera.step(second)
+    motion = step.recovered if darkness else step.motion
+    assert (motion is not None) == is_believed
+    if motion is not None:
+        np.testing.assert_allclose(motion.matrix[:2, 2], [-6, 0], atol=0.1)
+
+
+def bars():
+    """Bars of many widths, which have no corners."""
+    widths = np.random.default_rng(2).integers(6, 30, 100)
+    greys = np.random.default_rng(3).integers(40, 220, 100).astype(np.uint8)
+    return np.repeat(np.tile(np.repeat(greys, widths), (1600, 1))[..., None], 3, 2)
+
+
+@pytest.mark.parametrize(("columns", "is_believed"), [(1, True), (3, False), (6, False)])
+def test_blocks_that_go_on_as_before_are_the_scene_behind_what_comes(columns, is_believed):
+    """The camera moves by 8 px a frame; then something passes by before all but some blocks of one row.
+
+    One block may go on by chance.
+    """
+    camera = CameraMotion()
+    places = [(700, 700), (708, 700), (716, 700), (724, 700), (762, 720)]
+    for number, place in enumerate(places):
+        frame, _ = view(scene(), *place)
+        behind, _ = view(bars(), 700 + 8 * number, 700)
+        part = np.s_[2 * A_ROW : 3 * A_ROW, A_COLUMN : (1 + columns) * A_COLUMN]
+        frame[part] = behind[part]
+        motion = camera.step(frame).motion
+        assert number in (0, 4) or motion is not None
+    assert (motion is not None) == is_believed
+    if motion is not None:
+        np.testing.assert_allclose(motion.matrix[:2, 2], [724 - 762, 700 - 720], atol=0.5)
