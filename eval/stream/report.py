@@ -1,7 +1,11 @@
-"""Runs the study to its end, and writes its tables."""
+"""Runs the study to its end, and writes its tables and its figure."""
 
+from __future__ import annotations
+
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +20,10 @@ from semfov.agents.window_episode import LIKELY, LISTED
 from semfov.errors import check_data
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import plus_minus, table
+from semfov.viz.style import save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PROBABILITIES = 0.1, 0.3, 0.5, 0.7, 0.9, 1.0  # borders of the ranges of a table of reliability
 
@@ -23,15 +31,26 @@ _By = dict[str, dict[int, list[ResultRecord]]]
 """Records by way of looking and frame."""
 
 
+class PrecisionAtPasses(NamedTuple):
+    """AP50 of a way of looking that takes a number of passes a frame, with its standard error."""
+
+    passes: int
+    value: float
+    error: float
+
+
 def stream(config: StreamConfig) -> None:
-    """Look at all streams, and write the tables and the records."""
+    """Look at all streams, and write the tables, the records, and for several numbers of passes their figure."""
     outcomes = [*StreamRun(config).outcomes()]
     records = [record for outcome in outcomes for record in outcome.records]
     last = max((record["frame"] for record in records), default=0)
     what = f"a frame after frame {config.after} whose number is a multiple of {config.every}"
     check_data(last > config.after, "stream", what, "none; lower every and after")
     text = stream_summary(outcomes, config)
-    announce(text, write_summary(config.out, "stream", text, records))
+    written = write_summary(config.out, "stream", text, records)
+    if len(config.passes) > 1:
+        written.append(save_figure(plot_passes(outcomes, config.after), config.out / "passes.png"))
+    announce(text, written)
 
 
 def stream_summary(outcomes: Sequence[StreamOutcome], config: StreamConfig) -> str:
@@ -141,6 +160,48 @@ def precision_figures(by: _By, after: int) -> Callable[[Tensor], Tensor]:
         return torch.tensor([precision_of(group) for group in groups], dtype=torch.float64)
 
     return figures
+
+
+def precision_over_passes(outcomes: Sequence[StreamOutcome], after: int) -> dict[str, list[PrecisionAtPasses]]:
+    """Compute AP50 of the frames of a course after a number, by way of looking, in the order of passes a frame."""
+    by = by_way([record for outcome in outcomes for record in outcome.records])
+    figures = Bootstrap.of(precision_figures(by, after), range(len(outcomes)))
+    # One stream tells nothing of others.
+    errors = (figures.error if len(outcomes) > 1 else torch.zeros_like(figures.error)).tolist()
+    lines: dict[str, list[PrecisionAtPasses]] = defaultdict(list)
+    for way, value, error in zip(by, figures.value.tolist(), errors, strict=True):
+        passes = outcomes[0].costs[way].passes
+        lines[way.removesuffix(f", {passes} passes")].append(PrecisionAtPasses(passes, value, error))
+    return {way: sorted(line) for way, line in lines.items()}
+
+
+def plot_passes(outcomes: Sequence[StreamOutcome], after: int) -> Figure:
+    """Plot AP50 over passes a frame, of the frames after a number; each course has its axes.
+
+    Args:
+        outcomes: of all streams.
+        after: number of the last frame that is left out.
+
+    Returns:
+        The figure, with standard errors over streams.
+    """
+    from matplotlib.figure import Figure
+
+    courses = dict.fromkeys(outcome.course for outcome in outcomes)
+    figure = Figure(figsize=(4.2 * len(courses), 4), layout="constrained")
+    all_axes = figure.subplots(1, len(courses), sharey=True, squeeze=False)[0]
+    for axes, course in zip(all_axes, courses, strict=True):
+        lines = precision_over_passes([outcome for outcome in outcomes if outcome.course == course], after)
+        for way, line in lines.items():
+            axes.errorbar(*zip(*line, strict=True), marker="o", capsize=2, label=way)
+        counts = sorted({point.passes for line in lines.values() for point in line})
+        axes.set_xscale("log")
+        axes.set_xticks(counts, [str(count) for count in counts])
+        axes.minorticks_off()
+        axes.set(xlabel="passes a frame", title=course, ylim=(0, 1))
+    all_axes[0].set_ylabel("AP50")
+    all_axes[0].legend(fontsize="small")
+    return figure
 
 
 def listed_cell(records: Sequence[ResultRecord]) -> str:

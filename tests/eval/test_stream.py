@@ -11,8 +11,15 @@ from eval.stream import main
 from eval.stream.drift import Drift
 from eval.stream.flights import COURSES, Course, Frame, flight, mot_film, poses
 from eval.stream.plain import PlainRule
-from eval.stream.report import by_way, listed_cell, precision_figures, reliability_cells
-from eval.stream.run import judged_objects
+from eval.stream.report import (
+    by_way,
+    listed_cell,
+    plot_passes,
+    precision_figures,
+    precision_over_passes,
+    reliability_cells,
+)
+from eval.stream.run import Cost, StreamOutcome, judged_objects
 from eval.stream.ways import AllSlices, Oracle, RoundRobin, WholeFrame, whole_and_slices
 from semfov import WindowEye
 from semfov.data.scene import Annotation, Scene
@@ -187,6 +194,33 @@ def test_average_precision_of_all_frames_leaves_out_the_first_ones():
     assert precision_figures(by, 0)(torch.tensor([0, 1])).item() == pytest.approx(0.5 * 51 / 101, abs=1e-9)
 
 
+def outcome(course, right, ways):
+    """A stream with one object, in frame 16; some ways are right. The passes of each are given."""
+    records = [
+        {"way": way, "frame": 16, "objects": 1, "scores": [0.9 if way in right else 0.4], "right": [way in right]}
+        for way in ways
+    ]
+    return StreamOutcome(course, records, {way: Cost(passes, 1.0) for way, passes in ways.items()}, Drift(), {})
+
+
+def test_precision_is_told_by_way_in_the_order_of_passes():
+    """The better of two streams has the object by one pass, and both by two; AP50 of one of two right is half."""
+    ways = {"live, 2 passes": 2, "live": 1, "all slices": 19}
+    outcomes = [outcome("still", {"live", "live, 2 passes"}, ways), outcome("still", {"live, 2 passes"}, ways)]
+    lines = precision_over_passes(outcomes, after=8)
+    assert {way: [(point.passes, round(point.value, 2)) for point in line] for way, line in lines.items()} == {
+        "live": [(1, 0.5), (2, 1.0)],
+        "all slices": [(19, 0.0)],
+    }
+    assert lines["live"][0].error > 0 == lines["live"][1].error
+    assert precision_over_passes(outcomes[:1], after=8)["live"][0].error == 0
+    figure = plot_passes([*outcomes, outcome("fast", {"live"}, {"live": 1})], after=8)
+    assert [axes.get_title() for axes in figure.axes] == ["still", "fast"]
+    drawn = figure.axes[0].containers[0].lines[0]
+    assert [*drawn.get_xdata()] == [1, 2]
+    assert [*drawn.get_ydata()] == pytest.approx([0.5, 1], abs=0.01)
+
+
 def test_a_small_run_writes_its_tables(tmp_path, capsys):
     """As a user runs it: on an embedded photograph, with the real detector."""
     small = ["--width", "416", "--height", "320", "--frames", "4", "--every", "2", "--after", "0"]
@@ -198,6 +232,7 @@ def test_a_small_run_writes_its_tables(tmp_path, capsys):
         assert f"| {row}" in text
     assert "nan" not in text
     assert len((tmp_path / "records.jsonl").read_text().splitlines()) == 2 * 9
+    assert cv2.imread(str(tmp_path / "passes.png")) is not None
 
 
 def test_a_film_that_ends_before_a_judged_frame_is_refused(tmp_path, capsys):
