@@ -21,12 +21,13 @@ from semfov.motion.agreement import agreement, blocks_of_rival, largest_change
 from semfov.motion.flow import LEAST_CORNERS, corners_stay, flow_between, rival_between
 from semfov.motion.frames import GreyFrame
 from semfov.motion.motion import Motion
-from semfov.motion.residual import coarse_shift, share_off
+from semfov.motion.residual import coarse_shift, share_off, whole_shift
 
 _STILL = np.eye(3)
 _STILL_SHIFT = 0.3  # pixels of the frame: a camera that moves less stands still
 _LEAST_IN_VIEW = 0.6  # share of a key frame in view below which there is a new one
 
+_NO_SHIFT = 0.03  # reduced pixels by which a whole frame moves at most where a camera begins to stand before a pattern
 _SAME = 6.0  # largest mean change of a block, in grey values, of a frame that has not changed
 _EQUAL = 2  # largest change of a pixel, in grey values, of a frame that has not changed though it has no texture
 _CLEAR = 0.93  # correlation of the blocks from which on the fine detail alone is enough
@@ -122,7 +123,8 @@ class CameraMotion:
     A motion is believed if enough corners agree with it, if it is no leap of scale or turn, and if the key frame, moved
     by it, correlates with the present one in most blocks that have texture. It is doubted
 
-    - if the key frame correlates nearly as well a period away, as bricks and rows of windows do, unless nothing moved;
+    - if the key frame correlates nearly as well a period away, as bricks and rows of windows do, unless all of it is
+      where it was to some hundredths of a pixel, or the camera has stood before it;
     - if a part of the frame moves otherwise, until the motion goes on nearly as before: that may be a lorry before the
       camera, or all that is left of the scene behind one. A part is a motion that corners have in common, blocks
       that move as the frames before did, or a row of blocks that are off;
@@ -212,10 +214,13 @@ class CameraMotion:
         unmoved = key if np.array_equal(self._key_to_last, _STILL) else None
         if self._stands_still and unmoved is not None and self._stays(unmoved, last, present):
             return Motion.still()
+        has_stood = self._stands_still
         self._stands_still = False
         key, fit = self._fit_to_key_or_last(key, last, present)
         if unmoved is not None and self._shows_no_drift(unmoved, present, fit):
-            return Motion.still()
+            self._stands_still = has_stood or self._is_exactly_there(unmoved, present)
+            if self._stands_still:
+                return Motion.still()
         if fit is None:
             self._begin_at(present)
             return Motion.still() if self._is_same(last, present) else None
@@ -227,6 +232,7 @@ class CameraMotion:
         if fit.is_repeated:
             # Edges of the blocks of a broken film stay, too, but the blocks change.
             is_believed = is_believed and is_still and largest_change(self._cv2, last.grey, present.grey) < _SAME
+            is_believed = is_believed and (has_stood or self._is_exactly_there(last, present))
         if not is_believed:
             self._begin_at(present)
             if self._course is None:
@@ -254,6 +260,13 @@ class CameraMotion:
             return False
         least = _CLEAR if fit is None else max(_CLEAR, fit.median - _AS_GOOD)
         return self._is_unchanged(unmoved, present, least)
+
+    def _is_exactly_there(self, first: GreyFrame, present: GreyFrame) -> bool:
+        """Tell whether a pattern is where it was to a few hundredths of a pixel, as after a motion by a period rarely.
+
+        A camera that has stood before the pattern may sway by more.
+        """
+        return whole_shift(self._cv2, first, present) < _NO_SHIFT
 
     def _is_believed(
         self, since_last: _Fit, key: GreyFrame, present: GreyFrame, key_to_present: NDArray[np.float64]

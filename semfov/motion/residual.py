@@ -23,6 +23,7 @@ _LEAST_SLOPE = 1e-3  # least sum of squared slopes in the direction with the few
 
 _LEAST_IN_VIEW = 0.5  # least share of a block in view
 _LEAST_MEAN_SLOPE = 0.1  # least mean of the squared slopes of a block in the direction with the fewest
+_LEAST_DIRECTION = 0.01  # least sum of squared slopes in a direction that tells, as a share of that with the most
 _OFF = 0.8  # reduced pixels from which on a block is off
 _EXPLAINED = 0.6  # least share of the squared differences of a block that its shift explains
 
@@ -66,6 +67,33 @@ def share_off(cv2: ModuleType, first: GreyFrame, second: GreyFrame, similarity: 
     tells = (parts.seen >= _LEAST_IN_VIEW * parts.pixels) & (parts.slope >= _LEAST_MEAN_SLOPE * parts.seen)
     is_off = tells & (parts.shift >= _OFF) & (parts.explained >= _EXPLAINED)
     return float(is_off.sum() / max(tells.sum(), 1))
+
+
+def whole_shift(cv2: ModuleType, first: GreyFrame, second: GreyFrame) -> float:
+    """Estimate how far a frame has moved as a whole, by far less than a pixel: noise of single blocks averages out.
+
+    Args:
+        cv2: OpenCV.
+        first: the frame before.
+        second: the frame after it, of the same size.
+
+    Returns:
+        The shift in reduced pixels along the directions in which the frames have slopes, as stripes have in one alone;
+        0 where they have none.
+    """
+    height, width = second.grey.shape
+    size = max(1, width // _FINE), max(1, height // _FINE)
+    if min(size) < 2:
+        return 0.0
+    a, b = (_flattened(cv2, frame.grey, size) for frame in (first, second))
+    down, across = np.gradient((a + b) / 2)
+    slopes = np.stack([across.ravel(), down.ravel()]).astype(np.float64)
+    along, directions = np.linalg.eigh(slopes @ slopes.T)
+    tells = along >= _LEAST_DIRECTION * along[-1]
+    if along[-1] <= 0:
+        return 0.0
+    shifts = directions.T @ slopes @ (a - b).ravel() / along.clip(min=np.finfo(np.float64).tiny)
+    return _FINE * float(np.linalg.norm(shifts[tells]))
 
 
 class _Parts(NamedTuple):

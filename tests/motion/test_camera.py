@@ -8,7 +8,7 @@ import torch
 from semfov.motion import CameraMotion, CameraStep, Motion
 from semfov.motion.agreement import blocks_of_rival
 from semfov.motion.frames import GreyFrame
-from semfov.motion.residual import coarse_shift, share_off
+from semfov.motion.residual import coarse_shift, share_off, whole_shift
 
 WIDTH, HEIGHT = 640, 360
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
@@ -249,6 +249,7 @@ def test_frames_of_some_pixels_across_have_no_slopes_that_tell(size):
     frame = GreyFrame(cv2, np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8))
     assert coarse_shift(cv2, frame, frame, np.eye(3)[:2]) == np.inf
     assert share_off(cv2, frame, frame, np.eye(3)[:2]) == 0
+    assert whole_shift(cv2, frame, frame) == 0
 
 
 def test_blocks_that_move_otherwise_are_counted():
@@ -341,3 +342,44 @@ def test_blocks_that_go_on_as_before_are_the_scene_behind_what_comes(columns, is
     assert (motion is not None) == is_believed
     if motion is not None:
         np.testing.assert_allclose(motion.matrix[:2, 2], [724 - 762, 700 - 720], atol=0.5)
+
+
+def waves(shift=(0.0, 0.0), noise=0.0, seed=0):
+    """A pattern with periods of 24 and 30 px, by its formula, so that it is anywhere; the sensor is noisy."""
+    x, y = np.arange(WIDTH) - shift[0], np.arange(HEIGHT)[:, None] - shift[1]
+    grey = 128 + 50 * np.cos(2 * np.pi * x / 24) * np.cos(2 * np.pi * y / 30)
+    noisy = grey + np.random.default_rng(seed).normal(0, noise, grey.shape)
+    return np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, 2)
+
+
+@pytest.mark.parametrize("shift", [(24.2, 0), (-23.8, 0), (0, 30.2), (24.1, 29.9)])
+@pytest.mark.parametrize("noise", [0, 3])
+def test_a_pattern_that_moved_by_about_a_period_is_not_taken_to_stand(shift, noise):
+    """What is a quarter of a pixel away may be a period away as well."""
+    camera = CameraMotion()
+    camera.step(waves((0, 0), noise, 1))
+    assert camera.step(waves(shift, noise, 2)).motion is None
+
+
+def test_a_camera_that_has_stood_before_a_pattern_may_sway_by_some_tenths_of_a_pixel():
+    camera = CameraMotion()
+    camera.step(waves((0, 0), 3, 1))
+    for number, sway in enumerate((0, 0.15, -0.15, 0.2, 0.1)):
+        assert camera.step(waves((sway, 0), 3, 2 + number)).is_still
+
+
+@pytest.mark.parametrize("noise", [2, 5])
+@pytest.mark.parametrize("shift", [(0, 0), (0.2, 0), (0, -0.3), (0.3, 0.4)])
+def test_the_shift_of_a_whole_frame_is_that_of_its_pattern(shift, noise):
+    """In reduced pixels, of which the frame has half as many. Without noise all periods are rounded alike."""
+    first, second = (GreyFrame(cv2, waves(place, noise, number)) for number, place in enumerate([(0, 0), shift]))
+    assert whole_shift(cv2, first, second) == pytest.approx(np.hypot(*shift) / 2, rel=0.3, abs=0.006)
+
+
+def test_stripes_tell_the_shift_across_them_and_a_wall_tells_none():
+    rows = 128 + 50 * np.cos(2 * np.pi * (np.arange(HEIGHT)[:, None] - np.array([0, 0.4])) / 24)
+    striped = [np.repeat(np.rint(row)[:, None, None], WIDTH, 1).repeat(3, 2).astype(np.uint8) for row in rows.T]
+    first, second = (GreyFrame(cv2, frame) for frame in striped)
+    assert whole_shift(cv2, first, second) == pytest.approx(0.2, rel=0.25)
+    wall = GreyFrame(cv2, np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    assert whole_shift(cv2, wall, wall) == 0
