@@ -407,7 +407,8 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
     # in which a cell that was never seen has exactly the threshold.
     best_unseen = probability.masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
     outcome = int(settle(belief.presence(target).double(), located, best_unseen, thresholds))
-    decision = conclude(outcome, belief, [step.detections], views.view_grid, target, cell_of_view)
+    looks = [step.detections]
+    decision = conclude(outcome, belief, looks, views.view_grid, target, cell_of_view, thresholds.confirm)
     if decision.outcome != "found":
         return decision
     box = None if decision.box is None else views.world.boxes(decision.box[None], views.poses[pose])[0]

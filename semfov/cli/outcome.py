@@ -39,7 +39,7 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
         looks += f" on this machine, {record[-1].seconds:.1f} s of eye and head"
     decision = record.decision
     headline = record.words.objects if decision is None else _decision_text(record, decision)
-    reason = "" if limit else record.why_it_ended()
+    reason = record.words.lack() if limit else record.words.ended
     lines = [f"{name}, {width} × {height} px: {headline}", f"  {reason} {looks}.".replace("   ", "  ")]
     assumption = record.words.assumption()
     if assumption:
@@ -243,7 +243,7 @@ def _result_row(record: Record, source: PictureSource, seconds: float, form: Res
     Returns:
         JSON values: the `picture`, and what the format adds.
     """
-    values = {**record.to_dict(), "picture": source.name, "seconds": round(seconds, 3), "ended": record.why_it_ended()}
+    values = {**record.to_dict(), "picture": source.name, "seconds": round(seconds, 3), "ended": record.words.ended}
     picture = {name: value for name, value in values.items() if name not in ("looks", "summary")}
     return {"picture": picture, **({} if form is None else form.added(record, source.name, source.file))}
 

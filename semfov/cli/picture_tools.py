@@ -278,7 +278,7 @@ def _answer(record: Record) -> Answer:
     further = {name: max(number - listed[name], 0.0) for name, number in expected.items()}
     return Answer(
         result=record.describe(),
-        ended=record.why_it_ended(),
+        ended=record.words.ended,
         probability=None if record.decision is None else round(record.decision.probability, 4),
         objects=_rows(record.objects, record.classes),
         expected=_known_numbers(expected),

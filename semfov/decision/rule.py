@@ -36,6 +36,8 @@ class Decision(OtherWords):
         cell: cell of the found target, where places are cells.
         box: box `(4,)` of the found target, if a detection shows it.
         place: probability that the target is there; None where only its presence was judged.
+        confirm: what `found` takes: least probability of one place where closer looks decide, otherwise of the picture,
+            or in windows without learned evidence the least score; None where it is not known.
     """
 
     outcome: Outcome
@@ -43,6 +45,7 @@ class Decision(OtherWords):
     cell: int | None = None
     box: Tensor | None = None
     place: float | None = None
+    confirm: float | None = None
 
     _other_words = DECISION
 
@@ -138,7 +141,13 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
 
 
 def conclude(
-    outcome: int, belief: Belief, looks: Sequence[Detections], grid: Grid, target: int, cell: int | None = None
+    outcome: int,
+    belief: Belief,
+    looks: Sequence[Detections],
+    grid: Grid,
+    target: int,
+    cell: int | None = None,
+    confirm: float | None = None,
 ) -> Decision:
     r"""Make the decision of one search of a fovea without closer looks.
 
@@ -155,19 +164,20 @@ def conclude(
         grid: the cells.
         target: class 1..K.
         cell: the cell of the target; None takes the one with the strongest evidence.
+        confirm: what `found` takes (`Decision`).
 
     Returns:
         The decision. Its box is that of the detection with the strongest evidence in the cell, if there is one.
     """
     presence = float(belief.presence(target))
     if OUTCOMES[outcome] != "found":
-        return Decision(OUTCOMES[outcome], presence)
+        return Decision(OUTCOMES[outcome], presence, confirm=confirm)
     probability = belief.probability(target)[0]
     evidence = [_evidence_of_cells(look, grid, target) for look in looks]
     if cell is None:
         cell = _strongest_cell(probability, evidence)
     box = _most_evident_box(looks, evidence, cell)
-    return Decision("found", presence, cell, box, float(probability[cell]))
+    return Decision("found", presence, cell, box, float(probability[cell]), confirm)
 
 
 def _strongest_cell(probability: Tensor, evidence: Sequence[Tensor]) -> int:

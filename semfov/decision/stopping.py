@@ -78,6 +78,8 @@ class _ByBelief(StoppingCriterion):
     In a stream, the detections of the looks count of which at least half of the evidence is left.
     """
 
+    _confirm: float | None = None  # least presence for `found`
+
     def __init__(self, grid: Grid, target: int, forgetting: Forgetting | None = None) -> None:
         self.grid = grid
         self.target = target
@@ -109,7 +111,7 @@ class _ByBelief(StoppingCriterion):
         looks = [detections for _, detections in self._recent]
         belief = self._step.belief
         target = class_meant(belief, self.target)
-        return conclude(self.outcome, belief, looks, self.grid, target, self._cell(self._step))
+        return conclude(self.outcome, belief, looks, self.grid, target, self._cell(self._step), self._confirm)
 
     def wait(self, passed: float = FRAME) -> None:
         self._now += passed
@@ -123,6 +125,7 @@ class ByPresence(_ByBelief):
     def __init__(self, grid: Grid, target: int, thresholds: Thresholds, forgetting: Forgetting | None = None) -> None:
         super().__init__(grid, target, forgetting)
         self.thresholds = thresholds
+        self._confirm = thresholds.confirm
         self.criterion = f"p is {thresholds.confirm:g} and the gaze was at the place"
 
     def _judge(self, step: Step) -> int:

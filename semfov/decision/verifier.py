@@ -235,9 +235,10 @@ class Verifier(Generic[LookType]):
         presence = self.presence
         outcome = OUTCOMES[self._final_outcome()]
         if outcome != "found":
-            return Decision(outcome if is_over else "undecided", presence)
+            return Decision(outcome if is_over else "undecided", presence, confirm=self.thresholds.confirm)
         best, place = max(self._judged_places, key=_probability)
-        return Decision("found", max(presence, place), best.look.cell, best.look.box, place)
+        probability = max(presence, place)
+        return Decision("found", probability, best.look.cell, best.look.box, place, self.thresholds.confirm)
 
     def _final_outcome(self) -> int:
         """Decide as if the search were over."""

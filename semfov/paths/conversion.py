@@ -161,6 +161,7 @@ class Conversion(Outcome, OtherWords):
         return {
             "outcome": decision.outcome,
             "probability": digits(decision.probability),
+            "confirm": digits(decision.confirm),
             "prior": self.prior,
             "assumed": None if self.assumed is None else round(self.assumed, 6),
             **self._decided_place(decision),

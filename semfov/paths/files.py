@@ -32,6 +32,7 @@ CHANCE = Number(0, 1)
 _SHARE = Number(above=0, high=nextafter(1, 0))
 
 _DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell": Maybe(WHOLE), "place": Maybe(CHANCE)}
+_DECISION_SINCE = {"confirm": Maybe(Number())}  # what files of earlier versions lack
 _CLOSER = {
     "fixation": Maybe(WHOLE),
     "number": Maybe(WHOLE),
@@ -67,7 +68,7 @@ _SHARED = {
     "shown": Maybe(Object({"white": Json(), "bands": Json()})),
     "detector": Maybe(Text()),
     "ending": Maybe(Text(get_args(Ending))),
-    "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
+    "decision": Maybe(Object({**_DECISION, **_DECISION_SINCE}, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
 _PLAIN = ("target", "found", "prior", "assumed", "score_threshold", "source", "shown", "detector", "ending")
@@ -169,7 +170,7 @@ class Format:
             "lengths": [look.mask.shape[-1] for look in outcome.detections],
             **{name: getattr(outcome, name) for name in _PLAIN},
             "targets": list(outcome.targets),
-            "decision": None if decision is None else {name: getattr(decision, name) for name in _DECISION},
+            "decision": None if decision is None else _decision_values(decision),
             "closer": [{name: getattr(look, name) for name in _CLOSER} for look in outcome.closer],
             **record,
         }
@@ -196,6 +197,11 @@ class Format:
         self.schema.check(tensors, record)
         _check_shared(tensors, record)
         return tensors, record, _shared_fields(tensors, record)
+
+
+def _decision_values(decision: Decision) -> dict[str, Any]:
+    """Make the JSON values of a decision, whose box is a tensor of the file."""
+    return {name: getattr(decision, name) for name in (*_DECISION, *_DECISION_SINCE)}
 
 
 def _shared_fields(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> SharedFields:

@@ -86,7 +86,7 @@ class WindowWords(Words):
         "first found": "The first look shows the target closely enough.",
         "closer found": "A closer look confirmed the target.",
         "closer absent": "No closer look was sure enough, and the target is probably absent.",
-        "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
+        "closer undecided": "The target is too probable to call it absent.",
     }
 
     @property

@@ -38,7 +38,7 @@ class Words(ABC):
         "absent": "No remaining cell is worth a look, and the target is probably absent.",
         "undecided": "No remaining cell is worth a look, but the target is too probable to call it absent.",
         "closer found": "A closer look confirmed the target.",
-        "closer undecided": "No closer look was sure enough, but the target is too probable to call it absent.",
+        "closer undecided": "The target is too probable to call it absent.",
     }
     """Why it ended, by the ending, or by the outcome of the decision that ended the search."""
 
@@ -209,16 +209,39 @@ class Words(ABC):
         share = f"{min(100 * record.assumed, 99.9):.3g} % of your {self._pictures} hold it"
         return f"This assumes that {share}; if half of them did, it would be {at_half:.2f} after these looks."
 
+    def lack(self) -> str:
+        """Say what an undecided search lacked: what `found` takes, and that no place has it.
+
+        Returns:
+            The sentence; empty for other decisions, and where it is not known what `found` takes.
+        """
+        record = self.record
+        decision = record.decision
+        if decision is None or decision.outcome != "undecided" or decision.confirm is None:
+            return ""
+        if record.closer:
+            return f"No place reached probability {decision.confirm:.3g} ({len(record.closer)} looked at closely)."
+        return f"To call it found takes {self.decided_by} {decision.confirm:.3g}, and a look that shows it."
+
+    @property
+    def ended(self) -> str:
+        """Why it ended, and what an undecided search lacked; empty if neither is known."""
+        return " ".join(filter(None, [self.why_it_ended(), self.lack()]))
+
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences of doubt: what the search lacked, where its target is most likely, and what is assumed."""
+        place = self.best_place.capitalize()
+        sentences = [self.lack(), f"{place}." if place else "", self.assumption()]
+        return [sentence for sentence in sentences if sentence]
+
     def summary(self) -> str:
-        """Describe the outcome, explain why it ended, name the best place of doubt, and say what is assumed.
+        """Describe the outcome, explain why it ended, and say what is in doubt.
 
         Returns:
             The sentences.
         """
-        text = self.describe() + self._ending
-        place = self.best_place.capitalize()
-        sentences = [text, f"{place}." if place else "", self.assumption()]
-        return " ".join(sentence for sentence in sentences if sentence)
+        return " ".join([self.describe() + self._ending, *self.remarks])
 
     @property
     def _ending(self) -> str:

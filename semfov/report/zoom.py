@@ -83,9 +83,7 @@ def _outcome_in_words(path: Record) -> str:
         measure = "probability that the picture holds it" if by_probability else "best score"
         verdict = path.words.verdict(f"“{path.target_name}”")
         result = f"{verdict[0].upper()}{verdict[1:]}, {measure}: {path.decision.probability:.2f}."
-    place = path.words.best_place.capitalize()
-    sentences = [result, path.why_it_ended(), f"{place}." if place else "", path.words.assumption()]
-    return " ".join(sentence for sentence in sentences if sentence)
+    return " ".join(filter(None, [result, path.why_it_ended(), *path.words.remarks]))
 
 
 def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Data:

@@ -197,10 +197,10 @@ class DecisionsByScore(WindowDecisions):
         score, box = self._best(step.looks)
         if score >= self._confirm:
             self.outcome = FOUND
-            self._decision = Decision("found", score, None, box)
+            self._decision = Decision("found", score, None, box, confirm=self._confirm)
         else:
             self.outcome = GO_ON
-            self._decision = Decision("undecided", score)
+            self._decision = Decision("undecided", score, confirm=self._confirm)
 
     @property
     def decision(self) -> Decision | None:
@@ -229,6 +229,7 @@ class DecisionsByPresence(WindowDecisions):
         self.thresholds = thresholds
         self.prior = prior
         self.criterion = f"p is {thresholds.confirm:g} and a detection shows the target"
+        self._confirm = thresholds.confirm  # what `found` takes
         self._facts = SearchFacts(belief)
         self._is_large = belief.photograph is None
         self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
@@ -263,7 +264,7 @@ class DecisionsByPresence(WindowDecisions):
             return None
         outcome = OUTCOMES[self.outcome]
         box = self._facts.box if outcome == "found" else None
-        return Decision(outcome, self.prior(self._fitted_presence()), None, box)
+        return Decision(outcome, self.prior(self._fitted_presence()), None, box, confirm=self._confirm)
 
     def follow(self, motion: Motion | None) -> None:
         looks = () if motion is None or self._step is None else self._step.looks
@@ -294,6 +295,7 @@ class DecisionsByCloserLooks(DecisionsByPresence):
         self.frame = belief.lattice.size
         self.verifier = verifier
         self.criterion = verifier.criterion
+        self._confirm = verifier.thresholds.confirm
 
     def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""

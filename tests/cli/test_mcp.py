@@ -97,7 +97,7 @@ def test_a_search_answers_as_the_agent_does(tools, agent):
     told = call(tools, "search", picture="sub/beach.png", target="boat", prior=0.2).structured_content
     record = agent.search(tools.folder / "sub" / "beach.png", "boat", passes=16, prior=0.2)
     assert told["result"] == record.describe()
-    assert told["ended"] == record.why_it_ended()
+    assert told["ended"] == record.words.ended
     assert told["probability"] == pytest.approx(record.decision.probability, abs=1e-4)
     assert told["passes"] == record.passes
     assert told["size"] == [640, 499]

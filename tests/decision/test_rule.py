@@ -243,14 +243,14 @@ def test_search_gives_up_and_describes_the_outcome(image, presence, outcome, wor
     scanpath = agent(Scripted(*script)).search(image, "red", start=0)
     assert scanpath.cells.tolist() == [0, 5]
     assert not scanpath.found
-    assert scanpath.decision == Decision(outcome, pytest.approx(presence))
+    assert scanpath.decision == Decision(outcome, pytest.approx(presence), confirm=AT.confirm)
     assert scanpath.describe() == f"“red” {words} after 1 gaze shift (probability {presence:.2f})"
 
 
 def test_searches_decide_when_no_shifts_or_no_cells_are_left(image):
     scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=4)
     assert scanpath.shifts == 4
-    assert scanpath.decision == Decision("undecided", pytest.approx(0.1))
+    assert scanpath.decision == Decision("undecided", pytest.approx(0.1), confirm=AT.confirm)
     assert scanpath.describe() == "“red” undecided after 4 gaze shifts (probability 0.10)"
     # After every cell was visited, no cell is left to look at.
     scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=40)

@@ -202,7 +202,35 @@ def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
     doubt = dataclasses.replace(first, decision=Decision("undecided", 0.5))
     assert doubt.why_it_ended().endswith(" is worth a pass, but the target is too probable to call it absent.")
     both = dataclasses.replace(doubt, closer=(whole, *path.closer))
-    assert both.why_it_ended() == "No closer look was sure enough, but the target is too probable to call it absent."
+    assert both.why_it_ended() == "The target is too probable to call it absent."
+
+
+def test_an_undecided_search_says_what_found_takes():
+    """Of a place where closer looks decide, otherwise of the picture; also where a limit ended it."""
+    path = replace(zoom_path(), decision=Decision("undecided", 0.61, confirm=0.7402), ending="passes")
+    assert path.summary().startswith(
+        "cup: undecided (there with probability 0.61) in 3 looks (the limit). "
+        "No place reached probability 0.74 (1 looked at closely). Best place: box "
+    )
+    assert path.words.ended == "All 3 passes were used. No place reached probability 0.74 (1 looked at closely)."
+    by_presence = replace(path, closer=(), ending="decision")
+    assert by_presence.words.lack() == "To call it found takes probability 0.74, and a look that shows it."
+    by_score = replace(path, closer=(), unseen=None)
+    assert by_score.words.lack() == "To call it found takes score 0.74, and a look that shows it."
+    assert path.to_dict()["confirm"] == 0.7402
+    for known in ({"decision": None}, {"decision": Decision("absent", 0.3, confirm=0.74)},
+                  {"decision": Decision("undecided", 0.61)}):  # fmt: skip
+        assert replace(path, **known).words.lack() == ""
+
+
+def test_a_file_keeps_what_found_takes_and_earlier_files_do_without(tmp_path, monkeypatch):
+    path = replace(zoom_path(), decision=Decision("undecided", 0.61, confirm=0.74))
+    path.save(tmp_path / "now.safetensors")
+    assert type(path).load(tmp_path / "now.safetensors").decision.confirm == 0.74
+    monkeypatch.setattr("semfov.paths.files._DECISION_SINCE", {})
+    path.save(tmp_path / "before.safetensors")
+    again = type(path).load(tmp_path / "before.safetensors").decision
+    assert (again.probability, again.confirm) == (0.61, None)
 
 
 def seen(record, score, place):
