@@ -167,10 +167,18 @@ def object_data(record: Record) -> Data:
         "passes": str(record.passes),
         "objects": objects,
         "count": len(rows),
+        "verdict": _verdict(record),
         "confirmable": record.confirmable,
         "turns": record.kind.turns,
         "best": None if record.best_place is None else record.best_place[0].tolist(),
     }
+
+
+def _verdict(record: Record) -> str:
+    """Tell how a search ended; without a decision something was found, or nothing, which is absent."""
+    if record.decision is not None:
+        return record.decision.outcome
+    return "found" if record.found or len(record.objects) else "absent"
 
 
 def _about_data(scanpath: Scanpath, settings: Settings | None) -> Data:

@@ -105,6 +105,7 @@ function choose(number) {
   picture = data.pictures[number];
   find("image").src = picture.image;
   find("image").alt = picture.name;
+  find("image").parentElement.style.setProperty("--aspect", picture.size[0] / picture.size[1]);
   find("lead").textContent = picture.lead;
   find("areas").closest("label").hidden = !picture.areas.length;
   data.pictures.forEach((_, each) => (find(`facts-${each}`).hidden = each !== number));

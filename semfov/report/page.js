@@ -248,6 +248,16 @@
   find("episode-choice").hidden = report.episodes.length < 2;
   find("episode").replaceChildren(...report.episodes.map((each, index) => html("option", { value: index }, `${each.name}: ${each.summary}`)));
   find("episode").addEventListener("change", (event) => { control.stop(); open(Number(event.target.value)); });
+  // A link of the overview leads to a picture, and so does an address of the page that names one.
+  function follow() {
+    const number = report.episodes.findIndex((each) => `#${each.article}` === location.hash);
+    if (number < 0) return;
+    control.stop();
+    find("episode").value = number;
+    open(number);
+    find("viewer").scrollIntoView();
+  }
+  window.addEventListener("hashchange", follow);
   find("class").addEventListener("change", (event) => { chosenClass = Number(event.target.value); show(); });
   // The list of objects: a row shows its object and the look that brought it, and a head sorts by its column.
   function pick(row) {
@@ -273,4 +283,5 @@
     if (chosen) control.go(Number(chosen.dataset.look));
   });
   open(0);
+  follow();
 })();

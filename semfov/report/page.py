@@ -11,6 +11,7 @@ from pathlib import Path
 
 from semfov.paths.look import CONFIDENT
 from semfov.report.episode import Data
+from semfov.report.overview import overview_html
 from semfov.report.parts import ABOUT, EpisodePart, part_of
 from semfov.report.template import colour_steps, filled, write_html
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
@@ -47,7 +48,8 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     Args:
         title: plain text.
         episodes: data of the episodes, from `episode_data` and `zoom_data`, in any order.
-        sections: HTML to insert above the episodes, with special characters already escaped.
+        sections: HTML to insert above the episodes, with special characters already escaped. Without it, several
+            episodes have an overview (`semfov.report.overview`).
 
     Returns:
         The HTML of the page.
@@ -71,11 +73,12 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         },
     }
     script_draws = not episodes or any(isinstance(part, EpisodePart) for part in parts)
-    # A single episode begins with its outcome; the facts about one of several stand where it is chosen.
+    # A single episode begins with its outcome, and one of several has it where it is chosen.
     is_single = not sections and len(episodes) == 1
+    overview = overview_html(episodes, [part.article for part in parts]) if len(parts) > 1 and not sections else ""
     contents = {
         "title": escape(title),
-        "sections": sections,
+        "sections": sections or overview,
         "looks": "".join(part.looks_html(is_named=not is_single) for part in parts),
         "objects": "".join(part.section_html for part in parts),
         "least": f"{CONFIDENT:g}",
@@ -96,8 +99,12 @@ def _of_single(episode: Data) -> dict[str, str]:
 
 
 def _of_several(episodes: Sequence[Data]) -> dict[str, str]:
-    """Fill them for several episodes, of which one is chosen."""
-    return {"outcome": "", "heading": "", "of_episode": _about_html(episodes), "details": ""}
+    """Fill them for several episodes, of which one is chosen; the script tells each place of that one."""
+    if not episodes:
+        return {"outcome": "", "heading": "", "of_episode": "", "details": ""}
+    facts = [fact for fact in ABOUT if fact != "decision"]
+    details = f"<h3>Details</h3>{_facts_html(episodes, facts)}\n"
+    return {"outcome": "", "heading": "", "of_episode": _outcome_html(episodes[0]), "details": details}
 
 
 def _outcome_html(episode: Data) -> str:
@@ -115,13 +122,8 @@ def _details_html(episode: Data) -> str:
     return f"<h3>Details</h3>{_facts_html([episode], facts)}\n"
 
 
-def _about_html(episodes: Sequence[Data]) -> str:
-    """List facts about the first episode, which the script updates for other episodes; empty without episodes."""
-    return _facts_html(episodes, ABOUT) if episodes else ""
-
-
 def _facts_html(episodes: Sequence[Data], facts: Iterable[str]) -> str:
-    """List facts about the first episode; those that only others have are hidden until one of these is chosen."""
+    """List facts about the first episode, which the script updates; those that only others have are hidden."""
     rows = []
     for key in facts:
         if any(key in episode for episode in episodes):

@@ -63,6 +63,11 @@ class Part(ABC):
         """Start of the ids of its pictures."""
 
     @property
+    def article(self) -> str:
+        """Id of what the page has of it in the markup."""
+        return self.place
+
+    @property
     def pictures(self) -> list[str]:
         """Pictures that the script draws, as data URIs."""
         return []
@@ -160,6 +165,11 @@ class EpisodePart(Part):
         return "episode"
 
     @property
+    def article(self) -> str:
+        """Id of its section with objects."""
+        return f"objects-{self.number}"
+
+    @property
     def pictures(self) -> list[str]:
         """The photograph and the foveated views that there are."""
         views = (fixation["view"] for fixation in self.data["fixations"])
@@ -168,7 +178,7 @@ class EpisodePart(Part):
     @property
     def section_html(self) -> str:
         """Its section with objects, which the script shows with its episode."""
-        name = f"objects-{self.number}"
+        name = self.article
         return (
             f'<section class="found-objects of-episode" id="{name}" aria-labelledby="{name}-title">'
             f'<h3 id="{name}-title">Objects in {escape(self.data["name"])}</h3>{self.objects_html()}</section>'
@@ -179,7 +189,7 @@ class EpisodePart(Part):
         data = {name: value for name, value in self.data.items() if name != "objects"}
         data["image"] = numbers.get(self.data["image"])
         data["fixations"] = [{**fixation, "view": numbers.get(fixation["view"])} for fixation in self.data["fixations"]]
-        data["article"] = f"objects-{self.number}"
+        data["article"] = self.article
         return data
 
     def crop_source(self, found: Data) -> tuple[str, float, float]:
@@ -211,7 +221,7 @@ class LooksPart(Part):
     def script_data(self, numbers: Mapping[str, int]) -> Data:
         """Make what the script reads: facts and words about the looks."""
         looks = [{"box": look["box"], "status": look["status"]} for look in self.data["looks"]]
-        return {**{name: self.data[name] for name in (*ABOUT, "summary")}, "article": self.place, "looks": looks}
+        return {**{name: self.data[name] for name in (*ABOUT, "summary")}, "article": self.article, "looks": looks}
 
     def crop_source(self, found: Data) -> tuple[str, float, float]:
         """Find the picture of the look that shows an object most sharply."""

@@ -11,7 +11,10 @@ from dataclasses import replace
 from itertools import combinations
 
 import pytest
+import torch
 
+from semfov import ActivePerception
+from semfov.decision import Decision
 from semfov.report import write_page
 from semfov.report.episode import episode_data
 from semfov.report.zoom import zoom_data
@@ -317,6 +320,45 @@ def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, ima
                 row.click()
                 assert page.locator("#number").inner_text() == f"{int(row.get_attribute('data-look')) + 1} of 3"
                 assert page.locator("tr.picked:visible").count() == 1
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1366, 768)])
+def test_an_overview_is_on_the_first_screen_and_leads_to_each_picture(
+    chromium, zoom_path, large_picture, tmp_path, size
+):
+    found = replace(zoom_path, classes=("background", "cat", "dog", "cup"))
+    nothing = replace(found, decision=Decision("absent", 0.2))
+    data = [zoom_data(nothing, large_picture, name=f"nothing-{number}.jpg") for number in range(30)]
+    data.append(zoom_data(found, large_picture, name="cup.jpg"))
+    path = write_page(tmp_path / "many.html", "many", data)
+    with watched(chromium, path) as page:
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        rows = page.locator("#overview tbody tr")
+        assert rows.count() == 31
+        assert rows.nth(3).bounding_box()["y"] < size[1]
+        assert rows.first.locator("svg").bounding_box()["height"] > 40
+        assert page.locator("#viewer").bounding_box()["y"] < size[1]
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        for row, chosen in ((0, "cup.jpg"), (1, "nothing-0.jpg")):
+            rows.nth(row).locator("a").click()
+            page.wait_for_function(f"document.querySelector('.large:not([hidden]) h3').textContent === '{chosen}'")
+            assert page.locator("#viewer").bounding_box()["y"] == pytest.approx(0, abs=2)
+            assert page.locator("#episode option:checked").inner_text().startswith(f"{chosen}: ")
+        page.go_back()
+        page.wait_for_function("document.querySelector('.large:not([hidden]) h3').textContent === 'cup.jpg'")
+    with watched(chromium, path.parent / path.name) as page:
+        page.goto(f"{path.as_uri()}#large-30")
+        assert page.locator(".large:visible h3").first.inner_text() == "cup.jpg"
+
+
+def test_a_portrait_picture_is_no_higher_than_the_screen(chromium, tmp_path):
+    portrait = torch.rand(3, 900, 300, generator=torch.Generator().manual_seed(0))
+    prediction = ActivePerception.recommended().gaze(portrait)
+    with watched(chromium, prediction.report(tmp_path / "gaze.html")) as page:
+        picture = page.locator("#image").bounding_box()
+        assert picture["height"] <= 0.81 * 900
+        assert picture["height"] / picture["width"] == pytest.approx(3, rel=0.02)
+        assert page.locator("#map").bounding_box() == picture
 
 
 def test_without_javascript_all_looks_are_shown(chromium, zoom_page):

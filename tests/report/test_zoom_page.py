@@ -1,6 +1,7 @@
 """The page of a large picture: complete without a script, and names are never interpreted as markup."""
 
 import base64
+import html
 import io
 import re
 from dataclasses import replace
@@ -14,6 +15,7 @@ from semfov import InputError, Objects
 from semfov.decision import CloseUp, Decision
 from semfov.report import page_html
 from semfov.report.episode import episode_data
+from semfov.report.overview import overview_html
 from semfov.report.parts import part_of
 from semfov.report.zoom import _MOST_DETECTIONS, zoom_data
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
@@ -261,3 +263,42 @@ def test_an_object_that_no_look_of_the_record_shows_is_cut_out_of_the_picture(zo
     rows = part_of(data, 3).objects_html().split("<tr ")[1:]
     assert 'href="#large-3-picture"' in rows[0]
     assert re.search(r'href="#large-3-look-\d-view"', rows[1])
+
+
+def test_a_page_of_several_pictures_begins_with_an_overview_those_with_a_find_first(
+    zoom_path, scanpath, large_picture, image, hostile
+):
+    """Each row has a small picture, what came of it, and a link to its part; a page of one has none."""
+    nothing = zoom_path.candidates.above(1)
+    outcomes = [("absent", 0.1), ("undecided", 0.6), ("found", 0.9)]
+    records = [
+        replace(zoom_path, decision=Decision(outcome, chance), candidates=nothing) for outcome, chance in outcomes
+    ]
+    explored = replace(zoom_path, target=None, decision=None)
+    data = [zoom_data(record, large_picture, name=f"{hostile}{order}") for order, record in enumerate(records)]
+    data.append(episode_data(scanpath, image, [image] * 3, name="fovea"))
+    data.append(zoom_data(explored, large_picture, name="explored"))
+    data.append(zoom_data(replace(explored, candidates=nothing), large_picture, name="nothing"))
+    page = page_html("all", data)
+    names_are_text(page, hostile)
+    elements = Elements(page)
+    links = [attributes["href"] for tag, attributes in elements.found if tag == "a"]
+    assert links == ["#large-2", "#objects-3", "#large-4", "#large-1", "#large-0", "#large-5"]
+    ids = {attributes.get("id") for _, attributes in elements.found}
+    assert {link[1:] for link in links} <= ids
+    assert "Found in 3 of 6 pictures, 1 undecided" in elements.texts
+    assert page.index("Found in 3 of 6") < page.index('id="viewer"')
+    overview = page[page.index('id="overview"') : page.index("</section>")]
+    assert overview.count('<svg class="small"') == len(data)
+    assert [each["summary"] in html.unescape(overview) for each in data] == [True] * len(data)
+    sizes = {pixels(uri).shape for uri in re.findall(r'<image href="([^"]+)"', overview)}
+    assert sizes == {(120, 160, 3), (60, 80, 3)}  # that of the fovea was smaller
+    assert 'id="overview"' not in page_html("one", data[:1])
+    assert 'id="overview"' not in page_html("study", data, sections="<section><h2>Curves</h2></section>")
+
+
+def test_a_picture_that_was_not_kept_has_a_row_without_it(scanpath):
+    data = episode_data(scanpath, None, None, name="fovea")
+    overview = overview_html([data, data], ["objects-0", "objects-1"])
+    assert "<svg" not in overview
+    assert overview.count("<tr ") == 2
