@@ -368,6 +368,7 @@ usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
   --detector.classes LIST  names of the detector's classes, "[cat,dog]", where its file does not hold them
   --out FOLDER             folder for the models (default mymodels)
   --holdout N              hold out one in N photographs, on which each part is compared with raw scores
+  --columns N, --rows N    cells of the fovea's grid (default 10 × 10); searches with these models have them
   --gaze.fixations FILES   what people fixated, in formats that semfov check reads; without photographs, nothing else is
                            fitted. --gaze.pictures FOLDERS: the folder of the pictures of each file
   --windows false          no evidence for large pictures (it takes about 50 photographs, of which mosaics are made)

@@ -7,11 +7,14 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from contextvars import ContextVar
+from time import monotonic
 from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 _Item = TypeVar("_Item")
+
+_TRUST = 0.02  # share of the work for which the pace that was expected counts beside the pace so far
 
 _open_bar: ContextVar[WholeBar | None] = ContextVar("open bar", default=None)
 
@@ -19,8 +22,8 @@ _open_bar: ContextVar[WholeBar | None] = ContextVar("open bar", default=None)
 class WholeBar:
     """One bar for several stages of different duration, each of which consists of tasks.
 
-    The bar shows `_position` of `_total` seconds, and never moves back. `_tasks` holds the tasks of the present stage
-    that have not begun.
+    The bar shows `_position` of `_total` seconds, and never moves back. Of these, `_worked` seconds were work, and not
+    stages that were done before. `_tasks` holds the tasks of the present stage that have not begun.
 
     Args:
         title: title of the bar.
@@ -32,9 +35,11 @@ class WholeBar:
         self.stages = stages
         self._total = sum(sum(tasks.values()) for tasks in stages.values()) or 1.0
         self._position = 0.0
+        self._worked = 0.0
+        self._began = monotonic()
         self._tasks = dict[str, float]()
-        form = "{desc} {percentage:3.0f} % |{bar}| {elapsed} < {remaining}{postfix}"
-        self._bar = tqdm(total=1.0, desc=title, bar_format=form, dynamic_ncols=True)
+        form = "{desc} {percentage:3.0f} % |{bar}| {elapsed} < {left}{postfix}"
+        self._bar = _Bar(self, total=1.0, desc=title, bar_format=form, dynamic_ncols=True)
         self._closed = threading.Event()
         threading.Thread(target=self._tick, daemon=True).start()
 
@@ -42,6 +47,16 @@ class WholeBar:
     def done(self) -> float:
         """The share of the work that is done."""
         return self._position / self._total
+
+    @property
+    def seconds_left(self) -> float:
+        """Estimate the seconds that are left: those expected, at the pace of all work so far.
+
+        The pace of a single task would be that of its own estimate, which may be wrong by a factor.
+        """
+        at_first = _TRUST * self._total  # at the pace that was expected, so that the first item tells little
+        pace = (monotonic() - self._began + at_first) / (self._worked + at_first)
+        return max(self._total - self._position, 0.0) * pace
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -70,6 +85,11 @@ class WholeBar:
         self._position = max(self._position, to)
         self._bar.update(min(self.done, 1.0) - self._bar.n)
 
+    def _work(self, seconds: float) -> None:
+        """Count work that was expected to take so many seconds."""
+        self._worked += seconds
+        self._move(self._position + seconds)
+
     def __enter__(self) -> WholeBar:
         self._token = _open_bar.set(self)
         return self
@@ -78,6 +98,19 @@ class WholeBar:
         _open_bar.reset(self._token)
         self._closed.set()
         self._bar.close()
+
+
+class _Bar(tqdm):  # type: ignore[type-arg]
+    """The bar of a `WholeBar`, which knows the time that is left."""
+
+    def __init__(self, whole: WholeBar, **options: Any) -> None:
+        self._whole = whole
+        super().__init__(**options)
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        """What the format of the bar may name."""
+        return {**super().format_dict, "left": self.format_interval(self._whole.seconds_left)}
 
 
 class _Task(tqdm):  # type: ignore[type-arg]
@@ -90,7 +123,7 @@ class _Task(tqdm):  # type: ignore[type-arg]
 
     def update(self, n: float | None = 1) -> None:
         """Move the bar by so many items."""
-        self._whole._move(self._whole._position + (n or 0) * self._step)
+        self._whole._work((n or 0) * self._step)
 
 
 def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> tqdm[Any]:

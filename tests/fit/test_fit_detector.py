@@ -537,6 +537,29 @@ def test_one_progress_bar_covers_all_stages(capsys):
     assert "alone" in capsys.readouterr().err
 
 
+def test_the_time_left_is_that_of_all_work_and_not_of_one_task(monkeypatch, capsys):
+    """Half of the work has taken three times as long as expected; what was done before has taken none."""
+    now = [0.0]
+    monkeypatch.setattr("semfov.runs.progress.monotonic", lambda: now[0])
+    with WholeBar("all", {"done before": {"x": 1e6}, "slow": {"a": 100}, "quick": {"b": 100}}) as whole:
+        assert whole.seconds_left == 1_000_200
+        with whole.stage("done before"):
+            pass
+        assert whole.seconds_left == pytest.approx(200)
+    with WholeBar("all", {"slow": {"a": 1000}, "quick": {"b": 1000, "c": 1000}}) as whole:
+        with whole.stage("slow"):
+            for _ in track(range(10), "a", "unit"):
+                now[0] += 500
+        assert whole.seconds_left == pytest.approx(2000 * 5, rel=0.06)
+        with whole.stage("quick"):
+            for _ in track(range(10), "b", "unit"):
+                now[0] += 10
+            # 5,100 seconds for what was expected to take 2,000.
+            assert whole.seconds_left == pytest.approx(1000 * 2.55, rel=0.06)
+    assert whole.seconds_left == 0
+    assert "< 00:00" in capsys.readouterr().err
+
+
 def test_all_work_of_a_fit_moves_its_bar(home):
     assert json.loads((home / "foreign.json").read_text()) == []
 
