@@ -17,7 +17,7 @@ from semfov.zoom.episode import KeptLook
 from semfov.zoom.eye import BORDER
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import WindowLook
-from semfov.zoom.objects import detected_boxes, merge, probable_objects
+from semfov.zoom.objects import detected_boxes, merge, probable_objects, without_parts
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class MergedLooks:
     def _merge(self, looks: Sequence[WindowLook]) -> tuple[Objects, tuple[float, float] | None]:
         """Merge by the scores, or by the certainty where one was fitted."""
         if self.certainty is None:
-            return merge(looks, self.sought), None
+            return without_parts(merge(looks, self.sought), looks, self.sought), None
         return probable_objects(
             looks,
             self.lattice,

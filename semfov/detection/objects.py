@@ -343,8 +343,7 @@ def unlike(
     is_part = (share_of_worse >= np.float32(inside)) & is_cut[worse]
     is_same |= is_part & (look[better] != look[worse])
 
-    survivors = _survivors(len(corners), better[is_same], worse[is_same])
-    index = order[torch.from_numpy(survivors)]
+    index = order[torch.from_numpy(survivors(len(corners), better[is_same], worse[is_same]))]
     return index[scores[index].argsort(descending=True, stable=True)]
 
 
@@ -435,7 +434,7 @@ def intersection(x1: _Column, y1: _Column, x2: _Column, y2: _Column, first: _Ind
     return np.maximum(width, 0) * np.maximum(height, 0)
 
 
-def _survivors(count: int, better: _Index, worse: _Index) -> _Index:
+def survivors(count: int, better: _Index, worse: _Index) -> _Index:
     """Find the boxes that stay when each, best first, removes the worse boxes that it is paired with.
 
     Args:

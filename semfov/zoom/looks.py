@@ -60,6 +60,11 @@ class Window:
     def overview(lattice: Lattice) -> "Window":
         return Window.on(lattice, (0, 0, 0))
 
+    @property
+    def is_overview(self) -> bool:
+        """Whether it is the window of the lattice that shows the whole picture."""
+        return self.level == 0 and self.within is None
+
     @staticmethod
     def around(lattice: Lattice, box: tuple[float, float, float, float]) -> "Window":
         """Make the window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.detection.objects import FAINTEST, Objects, merge_looks, unlike
+from semfov.detection.objects import FAINTEST, Objects, merge_looks, survivors, unlike
+from semfov.observation.matching import box_iou
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import WindowLook
@@ -56,6 +57,43 @@ def merge(
     objects = merge_looks(*detected, score=score, iou=iou, inside=inside)
     highest = _highest_scores(objects, detected, iou)
     return replace(objects, scores=highest)[highest.argsort(descending=True, stable=True)]
+
+
+def without_parts(
+    objects: Objects,
+    looks: Sequence[WindowLook],
+    target: int | Sequence[int] | None = None,
+    *,
+    iou: float = 0.5,
+    inside: float = 0.8,
+) -> Objects:
+    """Leave out objects of enlarged looks that lie in a more confident object of their class, or around one.
+
+    In an enlarged window a detector takes parts of an object, and several objects together, for one of its class. A
+    certainty that was fitted knows that; scores do not. What a look at the whole picture shows stays, so that all
+    objects are listed that the bare detector shows.
+
+    Args:
+        objects: the objects, most confident first (`merge`).
+        looks: the looks that show them.
+        target: class 1..K, or several, as for `merge`.
+        iou: intersection over union from which on a look at the whole picture shows an object.
+        inside: share of the smaller of two boxes from which on it lies in the other.
+
+    Returns:
+        The objects that are left.
+    """
+    labels = objects.labels
+    at_whole = merge([look for look in looks if look.window.is_overview], target)
+    is_shown = (box_iou(objects.boxes, at_whole.boxes) >= iou) & (labels[:, None] == at_whole.labels)
+    stays = is_shown.any(-1).numpy()
+    overlaps = Overlaps.among(objects.boxes.float().numpy())
+    better = overlaps.first
+    worse = overlaps.second
+    smaller = np.minimum(overlaps.area[better], overlaps.area[worse])
+    is_part = (overlaps.shared >= inside * smaller) & (better < worse) & ~stays[worse]
+    is_part &= labels.numpy()[better] == labels.numpy()[worse]
+    return objects[torch.from_numpy(survivors(len(objects), better[is_part], worse[is_part]))]
 
 
 def _highest_scores(objects: Objects, detected: DetectedBoxes, iou: float) -> Tensor:

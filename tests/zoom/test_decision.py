@@ -35,7 +35,7 @@ from semfov.zoom.hint_maps import features
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from semfov.zoom.object_facts import DetectedBoxes, object_facts
-from semfov.zoom.objects import merge, merge_with_facts
+from semfov.zoom.objects import merge, merge_with_facts, without_parts
 from tests.refusals import refused
 from tests.small import Tiles, area, iou, shared
 
@@ -285,6 +285,41 @@ def test_objects_have_the_facts_of_their_looks():
     assert told["shown"] == pytest.approx(math.log(3))
     assert told["missed"] == pytest.approx(math.log(2))  # a box of so low a score is none
     assert merge_with_facts([], lattice)[1].shape == (0, len(FACTS))
+
+
+def random_look(window, count, seed):
+    """A look with boxes of two classes that overlap in many ways."""
+    generator = torch.Generator().manual_seed(seed)
+    corner = 40 + torch.rand(count, 2, generator=generator) * 60
+    boxes = torch.cat([corner, corner + 6 + torch.rand(count, 2, generator=generator) * 80], -1)
+    scores = torch.rand(count, 3, generator=generator).softmax(-1)
+    seen = Detections(boxes[None], scores[None], torch.ones(1, count, dtype=torch.bool))
+    return WindowLook(window, seen, torch.zeros(count, dtype=torch.bool), torch.zeros(2), None)
+
+
+def test_parts_of_surer_objects_are_left_out_unless_the_whole_picture_shows_them():
+    """Against a loop over pairs; without what the whole picture shows only the sure ones are left."""
+    lattice = Lattice.over((300, 200), (160, 160))
+    whole = random_look(Window.overview(lattice), 12, 0)
+    closer = [random_look(Window.around(lattice, (0.0, 0, 180, 200)), 40, seed) for seed in (1, 2)]
+    for looks in ([whole, *closer], closer):
+        merged = merge(looks)
+        kept = without_parts(merged, looks)
+        at_whole = merge([look for look in looks if look is whole])
+        boxes, labels = merged.boxes.tolist(), merged.labels.tolist()
+        shown = list(zip(at_whole.boxes.tolist(), at_whole.labels.tolist(), strict=True))
+        left = []
+        for worse in range(len(merged)):
+            box, label = boxes[worse], labels[worse]
+            rivals = [boxes[better] for better in left if labels[better] == label]
+            is_part = any(shared(box, rival) >= 0.8 * min(area(box), area(rival)) for rival in rivals)
+            is_shown = any(same == label and iou(box, seen) >= 0.5 for seen, same in shown)
+            if is_shown or not is_part:
+                left.append(worse)
+        assert kept.boxes.tolist() == merged.boxes[left].tolist()
+        assert 5 < len(left) < len(merged) - 5
+    assert len(without_parts(merge([]), [])) == 0
+    assert len(without_parts(merge([whole]), [whole])) == len(merge([whole]))
 
 
 @pytest.mark.parametrize(("x", "count"), [(60.0, 1), (30.0, 2)])
