@@ -97,9 +97,8 @@ class CocoScenes(Scenes):
 
         criteria = _Criteria(min_instances, max_target_area, coverage)
         targets_by_row = self._select(criteria, self._rows_of(ids), limit)
-        wanted = f"at least {min_instances} boxes and a class that covers at most {max_target_area} of them"
         got = f"none among {len(self._packed.ids)}; relax min_instances or max_target_area"
-        check_data(bool(targets_by_row), self._name, f"images with {wanted}", got)
+        check_data(bool(targets_by_row), self._name, f"images with {criteria.words}", got)
         self._rows = list(targets_by_row)
         self._targets = list(targets_by_row.values())
         self.ids = [self._packed.ids[row] for row in self._rows]
@@ -197,6 +196,11 @@ class _Criteria:
     max_target_area: float | None
     coverage: Coverage
 
+    @property
+    def words(self) -> str:
+        """What an image must have, in words."""
+        return f"at least {self.min_instances} boxes and a class that covers at most {self.max_target_area} of them"
+
 
 def _in_words(repairs: Counter[str]) -> str:
     """Name the most frequent repairs with their numbers, and the sum of the others."""
@@ -243,43 +247,46 @@ class _Packed:
         self.sizes = [_size_of(file, image, path) for image in self.ids]
         self.repairs: Counter[str] = Counter()
 
+        # The N entries of all images, row after row.
         entries: list[Entry] = []
-        rows_of_entries: list[int] = []
-        for row, image in enumerate(self.ids):
-            objects = file.objects[image]
-            entries += objects
-            rows_of_entries += [row] * len(objects)
-        rows = torch.tensor(rows_of_entries, dtype=torch.int64)
-        label = torch.tensor([labels[entry["category_id"]] for entry in entries], dtype=torch.int64)
+        counts: list[int] = []
+        for image in self.ids:
+            entries_of_image = file.objects[image]
+            entries.extend(entries_of_image)
+            counts.append(len(entries_of_image))
+        rows = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts, dtype=torch.int64))
+        categories = [entry["category_id"] for entry in entries]
+        label = torch.tensor([labels[category] for category in categories], dtype=torch.int64)
         crowd = torch.tensor([bool(entry["iscrowd"]) for entry in entries], dtype=torch.bool)
-        sides = torch.tensor(self.sizes, dtype=torch.float64).reshape(-1, 2)[rows]
-        limits = torch.cat([sides, sides], -1)
 
         bboxes = _bboxes_of(entries)
+        limits = _limits_of(self.sizes, rows)
         warn_of_form(bboxes, limits, path, stacklevel=5)
         boxes, is_cut = _cut_to_image(bboxes, limits)
+
         has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
         is_dropped_crowd = has_area & crowd & drop_crowds
-        valid = has_area & ~is_dropped_crowd
-        labelled = valid & (label > 0)
-        self._count("boxes without area in the image, dropped", ~has_area)
-        self._count("boxes of crowds, dropped", is_dropped_crowd)
-        self._count("boxes cut to the image", valid & is_cut)
-        for number in (valid & ~labelled).nonzero()[:, 0].tolist():
-            name = file.categories[entries[number]["category_id"]]["name"]
+        is_valid = has_area & ~is_dropped_crowd
+        is_known = label > 0
+        self._note("boxes without area in the image, dropped", ~has_area)
+        self._note("boxes of crowds, dropped", is_dropped_crowd)
+        self._note("boxes cut to the image", is_valid & is_cut)
+        for number in (is_valid & ~is_known).nonzero()[:, 0].tolist():
+            name = file.categories[categories[number]]["name"]
             self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
 
-        # Boxes of all categories count for the number of boxes of an image; those of the detector's are its objects.
-        self.instances: list[int] = _counts_by_row(rows[valid], len(self.ids)).tolist()
-        self._boxes = boxes[labelled]
-        self._labels = label[labelled]
-        self._crowd = crowd[labelled]
-        self._ends: list[int] = _counts_by_row(rows[labelled], len(self.ids)).cumsum(0).tolist()
+        # Boxes of all categories count for `min_instances`; those of the detector's classes are objects.
+        is_object = is_valid & is_known
+        self.instances: list[int] = _counts_by_row(rows[is_valid], len(self.ids)).tolist()
+        self._boxes = boxes[is_object]
+        self._labels = label[is_object]
+        self._crowd = crowd[is_object]
+        self._ends: list[int] = _counts_by_row(rows[is_object], len(self.ids)).cumsum(0).tolist()
 
-    def _count(self, repair: str, which: Tensor) -> None:
-        """Note a repair of some boxes, `(N,)` boolean."""
-        if which.any():
-            self.repairs[repair] = int(which.sum())
+    def _note(self, repair: str, is_repaired: Tensor) -> None:
+        """Note how many of all boxes got a repair, `(N,)` boolean, if any did."""
+        if is_repaired.any():
+            self.repairs[repair] = int(is_repaired.sum())
 
     def annotation(self, row: int) -> Annotation:
         """Return the objects of an image, of the detector's classes."""
@@ -296,6 +303,12 @@ def _bboxes_of(entries: Sequence[Entry]) -> Tensor:
     # In float64, in which a box that ends at the border of its image is not beyond it.
     numbers = [list(map(float, entry["bbox"])) for entry in entries]
     return torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)
+
+
+def _limits_of(sizes: Sequence[tuple[int, int]], rows: Tensor) -> Tensor:
+    """Repeat the size of the image of each box, from its row `(N,)`, for both of its corners, `(N, 4)`."""
+    sides = torch.tensor(sizes, dtype=torch.float64).reshape(-1, 2)[rows]
+    return torch.cat([sides, sides], -1)
 
 
 def _counts_by_row(rows: Tensor, count: int) -> Tensor:

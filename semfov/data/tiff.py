@@ -128,24 +128,30 @@ class TiffPicture(LargePicture):
             weakref.finalize(self, self.file.close)
             self.page = _first_page(self.file)
             layers, pictures = _layers_of(self.file, self.page)
-            self.size = int(self.page.imagewidth), int(self.page.imagelength)
+            self.size = _size_of(self.page)
             _check_kind(self.page, self.path, has_white=white is not None)
             check_size(self.size, self.path.stat().st_size, self.path)
             self._tiles = _Tiles(self.path, self.file, self.page, layers)
         if pictures > 1:
             remedy = "save the others as files of their own"
             warnings.warn(f"image {path}: the first of {pictures} pictures in it is shown; {remedy}", stacklevel=2)
+
         description = _describe(self.path, self.page, layers)
-        self._channels = [band - 1 for band in description.shown_bands(bands)]
-        self._colours = len(self._channels)
-        if description.alpha is not None:
-            self._channels.append(description.alpha - 1)
+        colours = [band - 1 for band in description.shown_bands(bands)]
+        alphas = [] if description.alpha is None else [description.alpha - 1]
+        self._channels = colours + alphas
+        self._colours = len(colours)
         self._nodata = _nodata_of(self.page)
-        if self.page.compression not in _WITH_DECODER:
-            with opening(self.path, "decoded"):
-                self._values((0, 0, 1, 1))  # a decoder that is listed may not be there
+        self._check_decoder()
+        # The tone of some values is chosen by the values in the file, which are read here.
         self._display = description.display(white, self._colour_values, self._nodata)
         self.nothing = self._colour_of_nothing()
+
+    def _check_decoder(self) -> None:
+        """Decode one pixel; raises `DataError` where the decoder of the compression is listed but not installed."""
+        if self.page.compression not in _WITH_DECODER:
+            with opening(self.path, "decoded"):
+                self._values((0, 0, 1, 1))
 
     def pixels(self, box: Box) -> NDArray[np.uint8]:
         with opening(self.path, "decoded"):
@@ -240,8 +246,8 @@ class _Tiles:
         self._layers = layers
         self._lock = Lock()
         self._decoded: dict[tuple[int, int], Values] = {}
-        self._size = int(page.imagewidth), int(page.imagelength)
-        self._is_one_strip = not page.is_tiled and page.rowsperstrip >= self._size[1]
+        width, height = self._size = _size_of(page)
+        self._is_one_strip = not page.is_tiled and page.rowsperstrip >= height
         # What is not packed has its rows at known places.
         is_plain = page.compression == 1 and page.predictor == 1 and page.fillorder == 1
         self._has_plain_rows = self._is_one_strip and is_plain and all(page.databytecounts)
@@ -249,11 +255,12 @@ class _Tiles:
             self.width = page.tilewidth
             self.height = page.tilelength
         else:
-            self.width = self._size[0]
-            self.height = min(_ROWS, self._size[1]) if self._has_plain_rows else page.rowsperstrip
-        self.columns = -(-self._size[0] // self.width)
-        self.rows = -(-self._size[1] // self.height)
-        self.separate = self.has_layers or (page.planarconfig == PLANES and page.samplesperpixel > 1)
+            self.width = width
+            self.height = min(_ROWS, height) if self._has_plain_rows else page.rowsperstrip
+        self.columns = len(_tiles_along(0, width, self.width))
+        self.rows = len(_tiles_along(0, height, self.height))
+        has_planes = page.planarconfig == PLANES and page.samplesperpixel > 1
+        self.separate = self.has_layers or has_planes
 
     @property
     def has_layers(self) -> bool:
@@ -272,9 +279,9 @@ class _Tiles:
     def holds(self, box: Box) -> bool:
         """Tell whether a tile of a window is stored in the file."""
         x1, y1, x2, y2 = box
-        rows = slice(y1 // self.height, -(-y2 // self.height))
-        columns = slice(x1 // self.width, -(-x2 // self.width))
-        return bool(self._is_stored[rows, columns].any())
+        rows = _tiles_along(y1, y2, self.height)
+        columns = _tiles_along(x1, x2, self.width)
+        return bool(self._is_stored[rows.start : rows.stop, columns.start : columns.stop].any())
 
     def parts(self, box: Box, channel: int = 0) -> Iterator[tuple[slice, slice, Values]]:
         """Read the parts of a window that are stored, tile by tile.
@@ -287,8 +294,8 @@ class _Tiles:
             Rows and columns in the window, and their values `(h, w, samples)`.
         """
         x1, y1, x2, y2 = box
-        tile_rows = range(y1 // self.height, -(-y2 // self.height))
-        tile_columns = range(x1 // self.width, -(-x2 // self.width))
+        tile_rows = _tiles_along(y1, y2, self.height)
+        tile_columns = _tiles_along(x1, x2, self.width)
         for row, column in product(tile_rows, tile_columns):
             tile = self._tile(row, column, channel)
             if tile is None:
@@ -355,6 +362,11 @@ class _Tiles:
             return bytes(self._file.filehandle.read(count))
 
 
+def _tiles_along(start: int, stop: int, length: int) -> range:
+    """Find the numbers of the tiles of a length that show pixels from `start` to before `stop`, along one side."""
+    return range(start // length, -(-stop // length))
+
+
 def _overlap(place: int, length: int, start: int, stop: int) -> tuple[slice, slice]:
     """Find what a window shows of a tile, along one side.
 
@@ -381,6 +393,11 @@ def _first_page(file: "TiffFile") -> _Page:
     return pages[0]
 
 
+def _size_of(page: _Page) -> tuple[int, int]:
+    """Read `(width, height)` of a page."""
+    return int(page.imagewidth), int(page.imagelength)
+
+
 def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
     """List the pages that are the channels of one picture (OME, ImageJ's composites), else the page alone.
 
@@ -397,7 +414,7 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
         return [page], 1
     series = file.series[0]
     pages = cast(Sequence[_Layer | None], series.pages)
-    # Each page has rows (Y) and columns (X), and perhaps samples (S).
+    # A page has rows (Y) and columns (X), and perhaps samples (S); the axes before these number the pages.
     axes = series.axes.removesuffix("S").removesuffix("YX")
     lengths = series.shape[: len(axes)]
     is_of_stack = page.index == series.keyframe.index and math.prod(lengths) == len(pages)
@@ -405,20 +422,31 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
         return [page], 1
     channels = lengths[axes.index("C")] if "C" in axes else 1
     pictures = len(pages) // channels
-    if page.samplesperpixel > 1 or not 2 <= channels <= _MOST_LAYERS:
+    # A page of several samples has its channels in itself.
+    are_channels = page.samplesperpixel == 1 and 2 <= channels <= _MOST_LAYERS
+    if not are_channels:
         return [page], pictures
 
-    # The pages of the first picture: all places along the axis of channels, the first one along all others.
-    numbers = np.arange(len(pages)).reshape(lengths)
-    first_picture = tuple(slice(None) if axis == "C" else 0 for axis in axes)
     layers = []
-    for number in numbers[first_picture].tolist():
+    for number in _first_picture(axes, lengths):
         layer = pages[number]
-        if layer is not None and layer.shape == page.shape:
-            layers.append(layer)
-    if len(layers) < channels:  # one of them is not there, or has another size
-        return [page], pictures
+        if layer is None or layer.shape != page.shape:  # it is not in the file, or of another size
+            return [page], pictures
+        layers.append(layer)
     return layers, pictures
+
+
+def _first_picture(axes: str, lengths: tuple[int, ...]) -> list[int]:
+    """List the pages of the first picture of a stack: all along the axis of channels, the first along all others.
+
+    >>> _first_picture("TC", (5, 3))
+    [0, 1, 2]
+    >>> _first_picture("CZ", (3, 5))
+    [0, 5, 10]
+    """
+    numbers = np.arange(math.prod(lengths)).reshape(lengths)
+    picture = tuple(slice(None) if axis == "C" else 0 for axis in axes)
+    return numbers[picture].tolist()
 
 
 def _check_kind(page: _Page, path: Path, *, has_white: bool) -> None:
@@ -443,28 +471,28 @@ def _is_image(page: _Page) -> bool:
 
 
 def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
-    """Describe the values of a page by its tags."""
+    """Describe the values of a page by its tags; bands are numbered from 1."""
     has_layers = len(layers) > 1
     count = len(layers) if has_layers else int(page.samplesperpixel)
-    extra = [int(kind) for kind in page.extrasamples]
-    first_extra = count - len(extra) + 1
+    # The further channels, such as alphas, follow those that the kind of picture has.
+    kinds = [int(kind) for kind in page.extrasamples]
+    first_extra = count - len(kinds) + 1
+    extra = dict(enumerate(kinds, first_extra))
     numbers = _named_bands(page)
     colours = named_colours(numbers)
     if colours is None and first_extra == 4 and (page.photometric == RGB or has_layers):
         colours = 1, 2, 3
-    # The first of the further channels that is an alpha, unless GDAL names that band otherwise.
-    alphas = [first_extra + place for place, kind in enumerate(extra) if kind in (PREMULTIPLIED, UNASSOCIATED)]
-    alpha = alphas[0] if alphas else None
+    alpha = next((band for band, kind in extra.items() if kind in (PREMULTIPLIED, UNASSOCIATED)), None)
     is_named_otherwise = alpha in numbers.values() and "alpha" not in numbers
-    if is_named_otherwise:
+    if is_named_otherwise:  # by GDAL
         alpha = None
     return Description(
         path=path,
-        size=(int(page.imagewidth), int(page.imagelength)),
+        size=_size_of(page),
         count=count,
         colours=colours,
         alpha=alpha,
-        premultiplied=alpha is not None and extra[alpha - first_extra] == PREMULTIPLIED,
+        premultiplied=alpha is not None and extra[alpha] == PREMULTIPLIED,
         white_is_zero=page.photometric == WHITE_IS_ZERO,
         bits=8 * page.dtype.itemsize if page.dtype in (np.uint8, np.uint16) else None,
     )

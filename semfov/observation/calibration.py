@@ -85,20 +85,11 @@ def fit_discriminative(
     evidence = floor(scores.detach(), model.epsilon).log() - lowest
     level = model.level(distance)
     groups = [(evidence[level == n], labels[level == n]) for n in range(levels)]
-
-    # The variables are u, v, and the common part and the parts by level of c. They are scaled by the curvature of the
-    # objective, with which L-BFGS converges faster.
     unit = torch.eye(components).to(scores)
-    start = unit.log1p()[:, None]
     common_precision = torch.where(unit[:, None] > 0, bias_decay, decay)
-    level_precision = scores.new_tensor(level_decay)
-    bias_precision = scores.new_tensor(bias_decay)
-    precisions = [common_precision, level_precision, bias_precision, bias_precision]
-    curvatures = _curvatures(groups, start.exp())
-    scales = [(c + p).rsqrt() for c, p in zip(curvatures, precisions, strict=True)]
-    variables = [torch.zeros_like(scale, requires_grad=True) for scale in scales]
+    posterior = _Posterior(groups, unit, common_precision, level_decay, bias_decay)
     optimiser = torch.optim.LBFGS(
-        variables,
+        posterior.variables,
         max_iter=iterations,
         history_size=10,
         tolerance_grad=0.0,
@@ -106,33 +97,18 @@ def fit_discriminative(
         line_search_fn="strong_wolfe",
     )
 
-    def current() -> list[Tensor]:
-        """Scale the variables back."""
-        return [v * scale for v, scale in zip(variables, scales, strict=True)]
-
-    def parameters(values: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Compute α and c from the variables."""
-        u, v, common_bias, level_bias = values
-        return (start + u + v).exp(), common_bias + level_bias
-
-    def loss() -> Tensor:
-        """Compute the negative log posterior for each sample, and its gradient."""
+    def closure() -> Tensor:
+        """Compute the mean loss of the samples, and its gradient."""
         optimiser.zero_grad()
-        values = current()
-        alpha, constant = parameters(values)
-        penalties = [(p * v.square()).sum() for p, v in zip(precisions, values, strict=True)]
-        total = torch.stack(penalties).sum() / 2  # -log of the normal priors, without their constants
-        for n, (rows, truth) in enumerate(groups):
-            logits = F.linear(rows, alpha[:, n] - 1, constant[:, n])
-            total = total + F.cross_entropy(logits, truth, reduction="sum")
-        mean = total / samples
+        mean = posterior.loss() / samples
         mean.backward()
         return mean
 
     with torch.enable_grad():
-        optimiser.step(loss)
+        optimiser.step(closure)
+    with torch.no_grad():
+        alpha, constant = posterior.parameters()
 
-    alpha, constant = parameters([value.detach() for value in current()])
     # c = ln π - (log normaliser of Dir(α)) + (shift by the floor); solve for ln π.
     shift = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest
     trained = {"decay": decay, "level_decay": level_decay, "bias_decay": bias_decay, "iterations": iterations}
@@ -146,6 +122,65 @@ def fit_discriminative(
         miss_rate=model.miss_rate,
         metadata={**model.metadata, "method": "discriminative", "discriminative": trained},
     )
+
+
+class _Posterior:
+    """The negative log posterior of α and c, as a function of variables that L-BFGS can move freely.
+
+    The variables are u, v, and the common part and the parts by level of c. They are scaled by the curvature of the
+    objective at the start, with which L-BFGS converges faster.
+
+    Args:
+        groups: by level, log scores above the floor `(M, K+1)` and labels `(M,)`.
+        unit: the identity, `(K+1, K+1)`.
+        common_precision: of the prior of u, `(K+1, 1, K+1)`.
+        level_decay: precision of the prior of v.
+        bias_decay: precision of the priors of both parts of c.
+
+    Attributes:
+        variables: scaled u, v, and both parts of c, all 0 at the start, where α is 1 + e_k and c is 0.
+    """
+
+    def __init__(
+        self,
+        groups: list[tuple[Tensor, Tensor]],
+        unit: Tensor,
+        common_precision: Tensor,
+        level_decay: float,
+        bias_decay: float,
+    ) -> None:
+        self._groups = groups
+        self._start = unit.log1p()[:, None]  # ln(1 + e_k)
+        level_precision = unit.new_tensor(level_decay)
+        bias_precision = unit.new_tensor(bias_decay)
+        self._precisions = [common_precision, level_precision, bias_precision, bias_precision]
+        curvatures = _curvatures(groups, self._start.exp())
+        self._scales = [(c + p).rsqrt() for c, p in zip(curvatures, self._precisions, strict=True)]
+        self.variables = [torch.zeros_like(scale, requires_grad=True) for scale in self._scales]
+
+    def _unscaled(self) -> list[Tensor]:
+        """Scale the variables back to u, v, and both parts of c."""
+        return [variable * scale for variable, scale in zip(self.variables, self._scales, strict=True)]
+
+    def parameters(self) -> tuple[Tensor, Tensor]:
+        """Compute α `(K+1, N, K+1)` and c `(K+1, N)` from the variables."""
+        return self._parameters_of(self._unscaled())
+
+    def _parameters_of(self, values: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Compute α and c from u, v, and both parts of c."""
+        u, v, common_bias, level_bias = values
+        return (self._start + u + v).exp(), common_bias + level_bias
+
+    def loss(self) -> Tensor:
+        """Compute the negative log posterior of all samples, without the constants of the priors."""
+        values = self._unscaled()
+        alpha, constant = self._parameters_of(values)
+        penalties = [(p * v.square()).sum() for p, v in zip(self._precisions, values, strict=True)]
+        total = torch.stack(penalties).sum() / 2
+        for n, (evidence, labels) in enumerate(self._groups):
+            logits = F.linear(evidence, alpha[:, n] - 1, constant[:, n])
+            total = total + F.cross_entropy(logits, labels, reduction="sum")
+        return total
 
 
 def _curvatures(groups: list[tuple[Tensor, Tensor]], alpha: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

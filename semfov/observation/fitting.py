@@ -47,30 +47,26 @@ def fit_tables(
         α `(K+1, N, K+1)`, ln π `(K+1, N)`, expected scores `(K+1, N, K+1)`, and JSON values that record the fit.
     """
     check(len(statistics.shape) == 2, "statistics", "a table (K+1, N)", statistics.shape)
+    check(enough is None or enough >= 2, "enough", "2 or more", enough)
     objects = statistics.count[1:].sum(0).tolist()
     pools = [_pool(objects, level, minimum) for level in range(len(objects))]
-    pooled = _pooled(statistics, pools)
     widened = {level: pool for level, pool in enumerate(pools) if len(pool) > 1}
     if widened:
         text = ", ".join(f"level {level} from levels {pool[0]} to {pool[-1]}" for level, pool in widened.items())
         # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
         warnings.warn(f"levels with fewer than {minimum} objects are fitted with neighbours: {text}", stacklevel=4)
+    cells = _pooled(statistics, pools)
     classes = statistics.sum(1)
 
-    uniform_mean_log = vacuous(statistics.components).to(statistics.count.device)
-    class_mean_log = shrink(classes.mean_log, classes.count, uniform_mean_log, _UNIFORM)
-    mean_log = shrink(pooled.mean_log, pooled.count, class_mean_log[:, None], shrinkage)
+    mean_log = _shrunk_mean_log(cells, classes, shrinkage)
     if enough is not None:
-        check(enough >= 2, "enough", "2 or more", enough)
-        has_enough = (pooled.count >= enough)[..., None]
-        mean_log = torch.where(has_enough, pooled.mean_log, mean_log)
+        has_enough = (cells.count >= enough)[..., None]
+        mean_log = torch.where(has_enough, cells.mean_log, mean_log)
     alpha = mle(mean_log, method=method, max_precision=_MAX_PRECISION)
+    log_prior = _estimate_prior(statistics.count, shrinkage)
+    expected = _expected_scores(cells, classes, shrinkage)
 
-    uniform_mean = torch.full_like(classes.mean[0], 1 / statistics.components)
-    class_mean = shrink(classes.mean, classes.count, uniform_mean, _UNIFORM)
-    expected = shrink(pooled.mean, pooled.count, class_mean[:, None], shrinkage)
-    expected = expected / expected.sum(-1, keepdim=True)
-    record = {
+    record: JsonObject = {
         "counts": statistics.count.tolist(),
         "pooled": {str(level): list(pool) for level, pool in widened.items()},
         "method": method,
@@ -78,7 +74,28 @@ def fit_tables(
         "minimum": minimum,
         "enough": enough,
     }
-    return alpha, _estimate_prior(statistics.count, shrinkage), expected, record
+    return alpha, log_prior, expected, record
+
+
+def _shrunk_mean_log(cells: DirichletStatistics, classes: DirichletStatistics, shrinkage: float) -> Tensor:
+    """Shrink the mean log scores of cells to those of their class, and these to Dir(1, …, 1); → `(K+1, N, K+1)`.
+
+    Args:
+        cells: sums by class and level, `(K+1, N)`.
+        classes: sums by class, `(K+1,)`.
+        shrinkage: w, pseudo-counts.
+    """
+    uniform = vacuous(classes.components).to(classes.count.device)
+    of_class = shrink(classes.mean_log, classes.count, uniform, _UNIFORM)
+    return shrink(cells.mean_log, cells.count, of_class[:, None], shrinkage)
+
+
+def _expected_scores(cells: DirichletStatistics, classes: DirichletStatistics, shrinkage: float) -> Tensor:
+    """Estimate the mean scores of cells, with sum 1, shrunk as their mean logarithms are; → `(K+1, N, K+1)`."""
+    uniform = torch.full_like(classes.mean[0], 1 / classes.components)
+    of_class = shrink(classes.mean, classes.count, uniform, _UNIFORM)
+    expected = shrink(cells.mean, cells.count, of_class[:, None], shrinkage)
+    return expected / expected.sum(-1, keepdim=True)
 
 
 def _pool(objects: Sequence[int], level: int, minimum: int) -> range:
