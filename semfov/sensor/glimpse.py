@@ -164,15 +164,32 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
         part = part - value
     is_recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
     can_fill = image.device.type == "cpu" and part.numel() > 0 and not is_recorded and values_known(image, box)
-    if can_fill:
-        x1, y1, x2, y2 = box.tolist()
-        between = part.new_empty(len(part), size[1], part.shape[-1])
-        canvas = part.new_empty(len(part), size[1], size[0])
-        _fill(between, rows, part, y1 - top, y2 - top)
-        _fill(canvas.mT, columns, between.mT, x1 - left, x2 - left)
-    else:
-        canvas = rows @ part @ columns.mT
+    canvas = _product_in_bands(rows, part, columns, box.tolist(), (left, top)) if can_fill else rows @ part @ columns.mT
     return canvas + value if value else canvas
+
+
+def _product_in_bands(rows: Tensor, part: Tensor, columns: Tensor, box: list[float], corner: tuple[int, int]) -> Tensor:
+    """Compute `rows @ part @ columns.mT`, without most of the zeros in the weights.
+
+    Args:
+        rows: weights of the rows, `(height, h)`.
+        part: what the window shows of the image, `(C, h, w)`.
+        columns: weights of the columns, `(width, w)`.
+        box: the window, edges between pixels of the image.
+        corner: first pixel `(x, y)` of the part in the image.
+
+    Returns:
+        The canvas, `(C, height, width)`.
+    """
+    x1, y1, x2, y2 = box
+    left, top = corner
+    height = len(rows)
+    width = len(columns)
+    between = part.new_empty(len(part), height, part.shape[-1])
+    canvas = part.new_empty(len(part), height, width)
+    _fill(between, rows, part, y1 - top, y2 - top)
+    _fill(canvas.mT, columns, between.mT, x1 - left, x2 - left)
+    return canvas
 
 
 def _fill(result: Tensor, weight: Tensor, part: Tensor, start: float, end: float) -> None:

@@ -65,6 +65,43 @@ class _Product(NamedTuple):
     target: _Part
 
 
+class _Offset(NamedTuple):
+    """A distance in the memory that is read, and the one in the memory that is written meanwhile."""
+
+    read: int
+    written: int
+
+
+class _Memory(NamedTuple):
+    """Where planes lie that a filter reads and writes; strides are those of planes, rows and columns.
+
+    Attributes:
+        width: number of columns of a plane.
+        source: strides in the memory that is read.
+        target: strides in the memory that is written.
+    """
+
+    width: int
+    source: tuple[int, int, int]
+    target: tuple[int, int, int]
+
+    @property
+    def plane(self) -> _Offset:
+        """From one plane to the next."""
+        return _Offset(self.source[0], self.target[0])
+
+    def rows(self, read: int, written: int) -> _Offset:
+        """Find the offset of a number of rows that are read, and of rows that are written."""
+        return _Offset(read * self.source[1], written * self.target[1])
+
+    def product(self, matrix: Tensor, step: _Offset, begin: _Offset) -> _Product:
+        """Make a stack of products `(stack, height, window)`, each a step after the one before, from an offset on."""
+        stack, height, window = matrix.shape
+        read = _Part((stack, window, self.width), (step.read, *self.source[1:]), begin.read)
+        written = _Part((stack, height, self.width), (step.written, *self.target[1:]), begin.written)
+        return _Product(matrix, read, written)
+
+
 @dataclass(frozen=True)
 class Taps:
     """A linear filter of a line: each output pixel is a weighted sum of input pixels `(length, taps)`."""
@@ -306,49 +343,45 @@ def _products(
     Returns:
         The products, in the order in which they must be computed.
     """
-    products: list[_Product] = []
-
-    def offsets(read: int, written: int) -> tuple[int, int]:
-        """Turn a number of rows that are read, and of rows that are written, into offsets in memory."""
-        return read * source[1], written * target[1]
-
-    def multiply(matrix: Tensor, apart: tuple[int, int], begin: tuple[int, int]) -> None:
-        """Add a stack of products; the offsets are those from one to the next, and of the first."""
-        stack, height, window = matrix.shape
-        read = _Part((stack, window, width), (apart[0], *source[1:]), begin[0])
-        written = _Part((stack, height, width), (apart[1], *target[1:]), begin[1])
-        products.append(_Product(matrix, read, written))
-
-    planes = source[0], target[0]
+    memory = _Memory(width, source, target)
     if lines.dense is not None:
-        multiply(lines.dense.expand(number, -1, -1), planes, (0, 0))
-        return products
+        return [memory.product(lines.dense.expand(number, -1, -1), memory.plane, _Offset(0, 0))]
+    # The ends come last: some write over what tiles have written.
+    return [*_products_of_tiles(lines, number, memory), *_products_of_ends(lines, number, memory)]
 
+
+def _products_of_tiles(lines: Lines, number: int, memory: _Memory) -> list[_Product]:
+    """List the products of the tiles of a number of planes."""
     tiles, tile, _ = lines.middle.shape
-    step = offsets(lines.shift, tile)
-    first = offsets(lines.start, lines.rows)
+    step = memory.rows(lines.shift, tile)
+    first = memory.rows(lines.start, lines.rows)
     tiles_of_plane = lines.count // lines.shift
     divides = (lines.count, lines.length) == (tiles_of_plane * lines.shift, tiles_of_plane * tile)
-    one_tile = lines.middle.stride(0) == 0
-    follow_each_other = planes == offsets(lines.count, lines.length)
-    if number > 1 and one_tile and divides and follow_each_other:
+    is_one_tile = lines.middle.stride(0) == 0
+    follow_each_other = memory.plane == memory.rows(lines.count, lines.length)
+    if number > 1 and is_one_tile and divides and follow_each_other:
         # Tiles of all planes at once. Those that lie across two planes are written over by the ends.
         tiles_of_all = tiles + (number - 1) * tiles_of_plane
-        multiply(lines.middle[:1].expand(tiles_of_all, -1, -1), step, first)
-    else:
-        for n in range(number):
-            begin = first[0] + n * planes[0], first[1] + n * planes[1]
-            multiply(lines.middle, step, begin)
-
-    edge, span = lines.ends.shape[1:]
-    last = offsets(lines.count - span, lines.length - edge)
-    if number == 1:
-        multiply(lines.ends, last, (0, 0))
-        return products
-    head, tail = lines.ends
-    multiply(head.expand(number, -1, -1), planes, (0, 0))
-    multiply(tail.expand(number, -1, -1), planes, last)
+        return [memory.product(lines.middle[:1].expand(tiles_of_all, -1, -1), step, first)]
+    products = []
+    for plane in range(number):
+        begin = _Offset(first.read + plane * memory.plane.read, first.written + plane * memory.plane.written)
+        products.append(memory.product(lines.middle, step, begin))
     return products
+
+
+def _products_of_ends(lines: Lines, number: int, memory: _Memory) -> list[_Product]:
+    """List the products of both ends of a number of planes."""
+    edge, span = lines.ends.shape[1:]
+    top = _Offset(0, 0)
+    bottom = memory.rows(lines.count - span, lines.length - edge)
+    if number == 1:
+        return [memory.product(lines.ends, bottom, top)]
+    head, tail = lines.ends
+    return [
+        memory.product(head.expand(number, -1, -1), memory.plane, top),
+        memory.product(tail.expand(number, -1, -1), memory.plane, bottom),
+    ]
 
 
 def _dense(index: Tensor, weight: Tensor, count: int) -> Tensor:
