@@ -54,9 +54,7 @@ def compare(options: CompareOptions) -> int:
         print("error: no picture could be looked at, so there is nothing to compare or write", file=sys.stderr)
         return 1
     points = scores.points()
-    judge = "all slices are taken as the truth" if truth is None else f"the truth is {options.annotations}"
-    pictures = f"{scores.pictures} picture{'s' if scores.pictures != 1 else ''}"
-    about = f"{pictures}, {', '.join(targets or ['all classes'])}; {judge}"
+    about = _about(options, scores.pictures, targets)
     sentences = [
         *conclusion(points, is_truth=truth is not None),
         f"All slices are the whole picture and squares of {side} px that overlap by {options.overlap:g}, cut as SAHI "
@@ -131,24 +129,38 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
     last = ours[-1]
     if slices is None:
         return [f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s."]
-    share = last.seconds / slices.seconds
     if not is_truth:
-        found = f"{last.right} of the {last.reference} objects that all slices list"
-        number = last.listed - last.right
-        others = f"{number} other{'s' if number != 1 else ''}"
-        return [
-            f"After {_passes(last)} semfov lists {found} and {others}, in {share:.2f} of their time.",
-            "All slices miss and invent objects, too: AP50 says how well semfov agrees with them. To judge both by "
-            "your own boxes, give --annotations FILE.",
-        ]
-    sentence = (
+        return _agreement(last, slices)
+    sentences = [
         f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "
         f"{_precision(slices)} in {slices.seconds:.2f} s ({_passes(slices)})."
-    )
+    ]
+    # The passes, counted back from the last one, after which semfov is at least as good.
     level = [*takewhile(lambda point: (point.ap50 or 0) >= (slices.ap50 or 0) > 0, reversed(ours))]
-    if not level:
-        return [sentence]
-    return [sentence, f"It is level with them from {_passes(level[-1])} and {level[-1].seconds:.2f} s on."]
+    if level:
+        sentences.append(f"It is level with them from {_passes(level[-1])} and {level[-1].seconds:.2f} s on.")
+    return sentences
+
+
+def _agreement(last: Point, slices: Point) -> list[str]:
+    """Say what semfov lists after its last pass of what all slices list, which stand for the truth."""
+    found = f"{last.right} of the {last.reference} objects that all slices list"
+    number = last.listed - last.right
+    others = f"{number} other{'s' if number != 1 else ''}"
+    share = last.seconds / slices.seconds
+    return [
+        f"After {_passes(last)} semfov lists {found} and {others}, in {share:.2f} of their time.",
+        "All slices miss and invent objects, too: AP50 says how well semfov agrees with them. To judge both by "
+        "your own boxes, give --annotations FILE.",
+    ]
+
+
+def _about(options: CompareOptions, pictures: int, targets: Sequence[str] | None) -> str:
+    """Say what was compared: how many pictures, which classes, and what is taken as the truth."""
+    counted = f"{pictures} picture{'s' if pictures != 1 else ''}"
+    has_truth = options.annotations is not None
+    judge = f"the truth is {options.annotations}" if has_truth else "all slices are taken as the truth"
+    return f"{counted}, {', '.join(targets or ['all classes'])}; {judge}"
 
 
 def _passes(point: Point) -> str:

@@ -17,6 +17,7 @@ from semfov.cli.results import held_outputs, tell_written, unfinished
 from semfov.cli.sources import example_source, picture_sources
 from semfov.data.examples import EXAMPLES
 from semfov.data.fixations import Fixations
+from semfov.detection import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
@@ -96,14 +97,7 @@ class _GazeJob:
             self.report = _COMPARED  # a comparison is always written somewhere
         if self.report is not None:
             check_writable(page_path(self.report))
-        check_detector(options.detector)
-        check_onnx_options(options, options.detector)
-        loading = detector_options(options)
-        # A model that cannot be read is reported before the detector is loaded.
-        stated_model = None if options.model is None else FixationDensity.from_pretrained(options.model)
-        self.detector = load_detector(options.detector, **loading)
-        remember(options, options.detector)
-        self.model = FixationDensity.for_detector(self.detector) if stated_model is None else stated_model
+        self.detector, self.model = _load(options)
         if not self.sources:
             self.sources = [example_source(EXAMPLES[0])]
             print(f"no picture was given: looking at {self.sources[0].name}, which comes with semfov")
@@ -186,9 +180,9 @@ class _GazeJob:
         if drafts is not None:
             print(drafts.describe(self.areas))
             written += self._figure_of(drafts)
-        # Of two drafts of which one cannot be read, an earlier comparison is not replaced.
-        is_whole = drafts is not None or not self.options.compare
-        if self.report is not None and outcomes and is_whole:
+        # Where one of two drafts cannot be read, an earlier comparison is not replaced by half of one.
+        lacks_draft = self.options.compare and drafts is None
+        if self.report is not None and outcomes and not lacks_draft:
             written.append(self._write_page(self.report, outcomes, drafts))
         progress = None if complete else f"{len(outcomes)} of {len(self.sources)}"
         tell_written(written, self.finished, progress)
@@ -201,7 +195,8 @@ class _GazeJob:
         paths = [path for number, outcome in outcomes.items() for path in _fixations(names[number], outcome)]
         write_table(table, paths)
         pictures = table.with_name(f"{table.stem}-{_PICTURES}" if self.kind else _PICTURES)
-        write_text(pictures, _table_of_pictures({names[number]: each["facts"] for number, each in outcomes.items()}))
+        facts = {names[number]: outcome["facts"] for number, outcome in outcomes.items()}
+        write_text(pictures, _table_of_pictures(facts))
         return [table, pictures]
 
     def _write_page(self, report: Path, outcomes: Mapping[int, _Outcome], drafts: Drafts | None) -> Path:
@@ -227,9 +222,20 @@ class _GazeJob:
         """Name the pictures as in their folder, or as they were named where two would have the same."""
         names = [Path(source.name).name for source in self.sources]
         count = Counter(name.lower() for name in names)
-        return [
-            name if count[name.lower()] == 1 else source.name for name, source in zip(names, self.sources, strict=True)
-        ]
+        pairs = zip(names, self.sources, strict=True)
+        return [name if count[name.lower()] == 1 else source.name for name, source in pairs]
+
+
+def _load(options: GazeOptions) -> tuple[Detector, FixationDensity]:
+    """Load the detector, and the model of fixations: the stated one, or the one that is shipped for the detector."""
+    check_detector(options.detector)
+    check_onnx_options(options, options.detector)
+    loading = detector_options(options)
+    # A model that cannot be read is reported before the detector is loaded.
+    stated_model = None if options.model is None else FixationDensity.from_pretrained(options.model)
+    detector = load_detector(options.detector, **loading)
+    remember(options, options.detector)
+    return detector, FixationDensity.for_detector(detector) if stated_model is None else stated_model
 
 
 def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], shares: Mapping[str, float]) -> str:

@@ -40,26 +40,20 @@ def look_live(options: LiveOptions) -> int:
     """
     source = _source_of(options)
     check(options.target is None or options.find is None, "find", "a target or classes to find, not both", options.find)
-    out = options.out
-    is_video = out is None or out.is_dir() or out.suffix.lower() in ("", *VIDEO_CODECS)
-    check(is_video, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", out)
-    tracks = options.tracks
-    check(tracks is None or tracks.suffix.lower() == ".txt", "tracks", "a file that ends in .txt", tracks)
+    _check_outputs(options)
     # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
     _sought(options, detector_classes(options))
-    if tracks is not None:
-        check_writable(tracks)
+    if options.tracks is not None:
+        check_writable(options.tracks)
     stream = open_stream(source, options.frames, white_of(options.white))
     agent = make_agent(options)
     settings = {setting.name: getattr(options, setting.name) for setting in fields(StreamSettings)}
     live = agent.live(_sought(options, agent.classes[1:]), **settings)
-    path = out
-    if out is not None and (out.is_dir() or not out.suffix):
-        path = out / f"live{video_suffix()}"
+    path = _video_path(options.out)
     check_apart(path, "out", [Path(source)] if isinstance(source, str) else [])
     with held_outputs(options):
-        _watch(live, stream, path, tracks)
-    written = [str(file) for file in (path, tracks) if file is not None]
+        _watch(live, stream, path, options.tracks)
+    written = [str(file) for file in (path, options.tracks) if file is not None]
     if written:
         print("\n  ".join(["written:", *written]))
     return int("skipped" in stream.gaps)
@@ -74,6 +68,22 @@ def _source_of(options: LiveOptions) -> str | int:
         raise InputError("source: expected a video, an address or --camera 0, got none")
     is_number = options.source.isdecimal() and not Path(options.source).exists()
     return int(options.source) if is_number else options.source
+
+
+def _check_outputs(options: LiveOptions) -> None:
+    """Raise `InputError` for files of another kind than a video and a text of tracks."""
+    out = options.out
+    is_video = out is None or out.is_dir() or out.suffix.lower() in ("", *VIDEO_CODECS)
+    check(is_video, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", out)
+    tracks = options.tracks
+    check(tracks is None or tracks.suffix.lower() == ".txt", "tracks", "a file that ends in .txt", tracks)
+
+
+def _video_path(out: Path | None) -> Path | None:
+    """Name the video that is written: the file that is given, or one in the folder; None for none."""
+    if out is None or (out.suffix and not out.is_dir()):
+        return out
+    return out / f"live{video_suffix()}"
 
 
 def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[str] | None:
@@ -94,7 +104,7 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
 def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path | None) -> None:
     """Look at every frame until Ctrl-C, print detections and belief, and write the video and the tracks, if wanted."""
     speed = _Speed()
-    lines: list[str] = []
+    mot_lines: list[str] = []
     size = None
     print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add_frame:
@@ -105,7 +115,7 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
                 moment = live.step(picture.image, picture.passed)
                 speed.count_frame()
                 if tracks is not None:
-                    lines.append(_mot_lines(moment))
+                    mot_lines.append(_mot_lines(moment))
                 if speed.frames == 1:
                     print("\n".join(_legend(live, moment)))
                 rate = speed.recent()
@@ -115,12 +125,18 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
         except KeyboardInterrupt:
             print("  stopped")
     if tracks is not None:
-        write_text(tracks, "".join(lines))
-    frames = f"{speed.frames} frame{'' if speed.frames == 1 else 's'}"
-    gaps = [f"{number} {kind}" for kind, number in stream.gaps.items() if number]
+        write_text(tracks, "".join(mot_lines))
+    print(_totals(stream, speed))
+
+
+def _totals(stream: Stream, speed: "_Speed") -> str:
+    """Say how many frames were looked at, how many were not, and how fast it was."""
+    totals = [f"{speed.frames} frame{'' if speed.frames == 1 else 's'}"]
+    totals += [f"{number} {kind}" for kind, number in stream.gaps.items() if number]
     mean = speed.mean()
-    rates = [f"{mean} after the first {_WARM_UP}"] if mean else []
-    print(", ".join([frames, *gaps, *rates]))
+    if mean:
+        totals.append(f"{mean} after the first {_WARM_UP}")
+    return ", ".join(totals)
 
 
 def _mot_lines(moment: Moment) -> str:

@@ -139,15 +139,20 @@ def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
     script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
     if script is None:
         return "usage: semfov completion bash|zsh|fish, for example: semfov completion bash >> ~/.bashrc\n"
-    cases = []  # of the script of bash
-    lines = []  # of that of fish
+    bash_cases = []
+    fish_lines = []
     for command, names in options.items():
         words = [dashed(name) for name in names]
         completions = " ".join(f"--{word}" for word in words)
-        cases.append(f'    {command}) words="{completions}";;')
-        lines += [f'complete -c semfov -n "__fish_seen_subcommand_from {command}" -l {word}' for word in words]
-    start = "autoload -Uz compinit bashcompinit && compinit && bashcompinit\n" if shell == "zsh" else ""
-    return start + script.format(cases="\n".join(cases), commands=" ".join(options), lines="\n".join(lines))
+        bash_cases.append(f'    {command}) words="{completions}";;')
+        fish_start = f'complete -c semfov -n "__fish_seen_subcommand_from {command}" -l'
+        fish_lines += [f"{fish_start} {word}" for word in words]
+    cases = "\n".join(bash_cases)
+    lines = "\n".join(fish_lines)
+    filled = script.format(cases=cases, commands=" ".join(options), lines=lines)
+    if shell == "zsh":  # which reads scripts of bash once it is told to
+        return f"autoload -Uz compinit bashcompinit && compinit && bashcompinit\n{filled}"
+    return filled
 
 
 def _unknown(name: str) -> str:
@@ -206,28 +211,34 @@ def _of_others(command: str, words: Sequence[str]) -> str | None:
 
 def _refusal(command: str, option: str) -> str | None:
     """Say what is wrong with one option of a subcommand; None where the parser says it, or nothing is wrong."""
-    names = {name: set(_option_names(name)) for name in (*_LOOKING, command)}
-    is_unknown = bool(option) and option not in names[command]
     positional = SUBCOMMANDS[command].positional
     if positional is None:
         return None
-    singular = positional.removesuffix("s")
-    meanings = {option, option.removesuffix("s"), *OPTIONS.get(option, "").split()}
+    is_unknown = bool(option) and option not in _option_names(command)
     # The parts of the detector are options of `semfov fit`: detector.name and others.
     is_whole_detector = (command, option) == ("fit", "detector")
-    if is_whole_detector or (is_unknown and meanings & {positional, singular}):
+    if is_whole_detector or (is_unknown and _means_positional(option, positional)):
+        singular = positional.removesuffix("s")
         usage = f"semfov {command} {singular.upper()}"
         return f"unknown option --{option}; the {singular} has no option before it: {usage}"
-    if command not in (*_LOOKING, "gaze") or not is_unknown:
-        return None
-    written = dashed(option)
-    meant = next(iter(meant_options(option, names[command])), None)
-    if meant is not None:
-        return f"unknown option --{written}; did you mean --{dashed(meant)}?"
-    having = [name for name in _LOOKING if option in names[name]]
-    if having:
-        return f"unknown option --{written}; it is one of `semfov {'` and `semfov '.join(having)}`"
-    return None
+    looks = command in (*_LOOKING, "gaze")
+    return _meant_instead(command, option) if is_unknown and looks else None
+
+
+def _means_positional(option: str, positional: str) -> bool:
+    """Tell whether an option is how other programs ask for what a subcommand takes without one."""
+    meanings = {option, option.removesuffix("s"), *OPTIONS.get(option, "").split()}
+    return not meanings.isdisjoint({positional, positional.removesuffix("s")})
+
+
+def _meant_instead(command: str, option: str) -> str | None:
+    """Say which option is meant by an unknown one, or which subcommands have it; None where neither is known."""
+    unknown = f"unknown option --{dashed(option)}"
+    meant = meant_options(option, _option_names(command))
+    if meant:
+        return f"{unknown}; did you mean --{dashed(meant[0])}?"
+    having = [f"`semfov {name}`" for name in _LOOKING if option in _option_names(name)]
+    return f"{unknown}; it is one of {' and '.join(having)}" if having else None
 
 
 _RENAME = "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too)"

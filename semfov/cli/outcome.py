@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,7 @@ from semfov.report.episode import Data, jpeg
 from semfov.viz import save_figure
 
 _OBJECTS_LISTED = 20  # largest number of objects that are listed
+_CROP_QUALITY = 92  # of the JPEGs of crops
 
 
 def _outcome_text(record: Record, name: str, seconds: float) -> str:
@@ -69,11 +71,7 @@ def _decision_text(record: Record, decision: Decision) -> str:
 def _objects_lines(record: Record) -> list[str]:
     """Write a line for each of the most confident objects."""
     rows = record.object_rows()
-    lines = [
-        f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), "
-        f"box {box_text((row['x1'], row['y1'], row['x2'], row['y2']))}{', confirmed' * row['confirmed']}"
-        for row in rows[:_OBJECTS_LISTED]
-    ]
+    lines = [_object_line(row) for row in rows[:_OBJECTS_LISTED]]
     if len(rows) > _OBJECTS_LISTED:
         lines.append(f"  and {len(rows) - _OBJECTS_LISTED} more (--out FILE.json writes all)")
     if record.target is None and not record.targets and len(rows) > 1:
@@ -81,37 +79,53 @@ def _objects_lines(record: Record) -> list[str]:
     return lines
 
 
+def _object_line(row: Values) -> str:
+    """Write the line of an object, a row of `Record.object_rows`."""
+    corners = row["x1"], row["y1"], row["x2"], row["y2"]
+    line = f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), box {box_text(corners)}"
+    return f"{line}, confirmed" if row["confirmed"] else line
+
+
 def _regions_lines(record: Record) -> list[str]:
     """Write a line for each class that was looked for and that the final map names, with its most probable cell."""
-    by_class: dict[str, list[Region]] = {}
+    cells: Counter[str] = Counter()
+    best: dict[str, Region] = {}
     for region in record.regions():
         is_sought = not record.targets or record.classes.index(region.name) in record.targets
-        if is_sought:
-            by_class.setdefault(region.name, []).append(region)
-    counts = {name: sum(len(region.cells) for region in regions) for name, regions in by_class.items()}
-    largest_first = sorted(counts, key=lambda name: -counts[name])
+        if not is_sought:
+            continue
+        cells[region.name] += len(region.cells)
+        if region.name not in best or region.probability > best[region.name].probability:
+            best[region.name] = region
+
     lines = []
-    for name in largest_first:
-        best = max(by_class[name], key=lambda region: region.probability)
-        x, y = best.place
-        cells = f"{counts[name]} cell{'s' if counts[name] != 1 else ''}"
-        lines.append(f"  map: {name} in {cells}, p up to {best.probability:.2f} around ({x:.0f}, {y:.0f})")
+    for name, count in cells.most_common():
+        x, y = best[name].place
+        extent = "1 cell" if count == 1 else f"{count} cells"
+        lines.append(f"  map: {name} in {extent}, p up to {best[name].probability:.2f} around ({x:.0f}, {y:.0f})")
     return lines
 
 
 def _looks_text(record: Record) -> str:
     """Write the looks as a table: where, which part of the picture, what was detected, and when it ended."""
     headings = ["look", "at (x, y)", "shows", f"detections from score {CONFIDENT:g} on", "value", "s"]
-    lines = [f"  {line}" for line in table_lines([headings, *(_look_row(record, look) for look in record)])]
+    rows = [_look_row(record, look) for look in record]
+    lines = [f"  {line}" for line in table_lines([headings, *rows])]
     if any(look.value is not None for look in record):
         lines.append(f"  value: {record.words.value}")
-    for number, close_up in enumerate(record.closer, 1):
-        decided = record.decision is not None and close_up.presence == record.decision.probability
-        chance = f"p {close_up.place:.3f} there, {close_up.presence:.3f} in the picture{', as decided' * decided}"
-        lines.append(f"  closer look {number} at {box_text(close_up.box.tolist())}: {chance}")
     if record.closer:
+        lines += [_closer_line(record, number) for number in range(len(record.closer))]
         lines.append("  in the picture: by all looks so far, so also where that closer look shows nothing of it")
     return "\n".join(lines)
+
+
+def _closer_line(record: Record, number: int) -> str:
+    """Write a line of a closer look, by its number from 0: where it looked, and what is probable after it."""
+    close_up = record.closer[number]
+    line = f"  closer look {number + 1} at {box_text(close_up.box.tolist())}: p {close_up.place:.3f} there"
+    line += f", {close_up.presence:.3f} in the picture"
+    is_decision = record.decision is not None and close_up.presence == record.decision.probability
+    return f"{line}, as decided" if is_decision else line
 
 
 def _look_row(record: Record, look: RecordedLook) -> list[str]:
@@ -218,16 +232,19 @@ def _crops(record: Record, source: PictureSource, options: PictureOptions) -> di
     """Cut out what the box of each object shows, or of a search the best place; returns the files by their paths."""
     if options.crops is None:
         return {}
-    files = {}
+    names = [record.classes[label] for label in record.objects.labels.tolist()]
     crops = record.crops(source.picture())
-    for number, (crop, label) in enumerate(zip(crops, record.objects.labels.tolist(), strict=True)):
-        folder = options.crops / plain_name(record.classes[label]) / source.place.parent
-        files[str(folder / f"{source.place.stem}-{number:03d}.jpg")] = jpeg(crop, 92)
-    if not files and record.best_place is not None:
+    endings = [f"{number:03d}" for number in range(len(crops))]
+    if not crops and record.best_place is not None:
         box, _ = record.best_place
-        (crop,) = record.crops(source.picture(), boxes=box[None])
-        folder = options.crops / plain_name(str(record.target_name)) / source.place.parent
-        files[str(folder / f"{source.place.stem}-best.jpg")] = jpeg(crop, 92)
+        names = [str(record.target_name)]
+        crops = record.crops(source.picture(), boxes=box[None])
+        endings = ["best"]
+
+    files = {}
+    for name, crop, ending in zip(names, crops, endings, strict=True):
+        folder = options.crops / plain_name(name) / source.place.parent
+        files[str(folder / f"{source.place.stem}-{ending}.jpg")] = jpeg(crop, _CROP_QUALITY)
     return files
 
 
@@ -253,10 +270,13 @@ def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawi
     if not drawings:
         return {}
     figures = record.figures(boxes)
-    # The belief of an exploration is the map of what is where.
-    names = ["map" if name == "belief" and "map" in figures else name for name in drawings]
+    drawn = []
     with tempfile.TemporaryDirectory() as folder:
-        drawn = [save_figure(figures[name](), Path(folder) / f"{name}.png") for name in names if name in figures]
+        for drawing in drawings:
+            # The belief of an exploration is the map of what is where.
+            name = "map" if drawing == "belief" and "map" in figures else drawing
+            if name in figures:
+                drawn.append(save_figure(figures[name](), Path(folder) / f"{name}.png"))
         if "animation" in drawings:
             film: Any = record.animate(boxes=boxes)
             drawn += film.save(Path(folder) / "animation.gif")

@@ -132,22 +132,43 @@ def _object_shapes(data: Data, unit: float, obstacles: Sequence[LabelBox]) -> li
     """
     width, height = data["size"]
     objects = data["objects"]
-    names = [f"{found['label']} {found['score']:.2f}" for found in objects]
+    names = [_object_name(found) for found in objects]
+    # Room for letters of 11 pixels of the screen.
     sizes = [(unit * (6.3 * len(name) + 4), unit * 13) for name in names]
     candidates = [_corner_places(found["box"], size) for found, size in zip(objects, sizes, strict=True)]
     labels = place_within(candidates, sizes, (width, height), obstacles)
-    shapes = []
-    for order, (found, name, label) in enumerate(zip(objects, names, labels, strict=True), 1):
-        left, top, _, bottom = label
-        x = left + 2 * unit
-        y = (top + bottom) / 2
-        text = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{escape(name)}</text>'
-        kind = "object confirmed" if found["confirmed"] else "object"
-        confirmed = ", confirmed" if found["confirmed"] else ""
-        title = f"<title>{escape(name)}{confirmed}, look {found['look']}</title>"
-        content = f"{title}{framed(found['box'])}{text}"
-        shapes.append(f'<g class="{kind}" data-look="{found["look"] - 1}" data-object="{order}">{content}</g>')
-    return shapes
+    pairs = zip(objects, labels, strict=True)
+    return [_object_shape(found, label, order, unit) for order, (found, label) in enumerate(pairs, 1)]
+
+
+def _object_name(found: Data) -> str:
+    return f"{found['label']} {found['score']:.2f}"
+
+
+def _object_shape(found: Data, label: LabelBox, order: int, unit: float) -> str:
+    """Draw the box of an object, with its name in the rectangle of its label.
+
+    Args:
+        found: data of the object.
+        label: the rectangle.
+        order: number of the object, from 1.
+        unit: length in pixels of the picture of about a pixel of the screen.
+
+    Returns:
+        SVG.
+    """
+    left, top, _, bottom = label
+    x = left + 2 * unit
+    y = (top + bottom) / 2
+    name = escape(_object_name(found))
+    text = f'<text class="name" x="{x:.1f}" y="{y:.1f}" font-size="{11 * unit:.1f}">{name}</text>'
+    css_class = "object"
+    title = name
+    if found["confirmed"]:
+        css_class += " confirmed"
+        title += ", confirmed"
+    content = f"<title>{title}, look {found['look']}</title>{framed(found['box'])}{text}"
+    return f'<g class="{css_class}" data-look="{found["look"] - 1}" data-object="{order}">{content}</g>'
 
 
 def _corner_places(box: Sequence[float], size: tuple[float, float]) -> list[tuple[float, float]]:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDTH = 5.0  # of a draft in inches
+_TITLE_WIDTH = 64  # letters in a line above a draft
 _DIVERGING = "PuOr_r"  # fewer fixations are purple, more are orange
 
 
@@ -37,20 +38,26 @@ def plot_drafts(drafts: Drafts, *, areas: AreasLike | None = None) -> Figure:
     """
     predictions = drafts.first, drafts.second
     panels = 2 if drafts.difference is None else 3
-    height = max(_WIDTH * each.size[1] / each.size[0] for each in predictions) + 0.9
+    heights = [_WIDTH * prediction.size[1] / prediction.size[0] for prediction in predictions]
+    height = max(heights) + 0.9  # with the titles
     figure, axes = make_figure(1, panels, width=_WIDTH * panels, height=height, layout="compressed")
-    boxes = (None, None) if areas is None else drafts.areas(areas)
-    for ax, prediction, name, these in zip(axes[:2], predictions, drafts.names, boxes, strict=True):
+    areas_of_drafts = (None, None) if areas is None else drafts.areas(areas)
+    for ax, prediction, name, areas_of_draft in zip(axes[:2], predictions, drafts.names, areas_of_drafts, strict=True):
         draw_gaze(ax, prediction, prediction.cells)
-        if these is not None:
-            draw_areas(ax, prediction, these)
+        if areas_of_draft is not None:
+            draw_areas(ax, prediction, areas_of_draft)
         draw_first_fixations(ax, prediction)
-        caution = "" if prediction.caution is None else f"\nCaution: {prediction.caution}"
-        ax.set_title("\n".join(fill(line, 64) for line in (name + caution).split("\n")), parse_math=False)
-    if panels == 3:
+        ax.set_title(_title(name, prediction.caution), parse_math=False)
+    if drafts.difference is not None:
         plot_difference(drafts, ax=axes[2])
     figure.suptitle(f"Where people look: {BORDERS}; 1 to 3: the first fixations", fontsize=9)
     return figure
+
+
+def _title(name: str, caution: str | None) -> str:
+    """Break the name of a draft and what speaks against its prediction into lines."""
+    title = name if caution is None else f"{name}\nCaution: {caution}"
+    return "\n".join(fill(line, _TITLE_WIDTH) for line in title.split("\n"))
 
 
 @styled
@@ -93,7 +100,7 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
         first, second = drafts.names
         colours = f"purple has more in {first}, orange in {second}; grey: both drafts"
         words = f"{percent(moved)} of the fixations move: {colours}"
-        axes.set_title(fill(words, 64), parse_math=False)
+        axes.set_title(fill(words, _TITLE_WIDTH), parse_math=False)
     return figure
 
 
