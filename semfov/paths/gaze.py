@@ -125,21 +125,18 @@ class GazePrediction(OtherWords):
         check(is_wide or not panorama, "panorama", "a picture that is at least 1.5 times as wide as high", size)
         suits = image.dtype == fitted.read.dtype and image.device == fitted.read.device
         converted = fitted if suits else deepcopy(fitted).to(image)
-        number = None
-        with torch.no_grad():
-            if seen is None:
+        if seen is None:
+            fixations = None
+            with torch.no_grad():
                 terms, unlikeness = picture_terms(detector, image, converted, quality=quality, panorama=panorama)
-            elif isinstance(looking, Eye):
-                check(not panorama, "seen", "None for a panorama, which a fovea does not show", "fixations")
-                is_quick = quality != "best"
-                check(is_quick, "seen", "None for quality='best', which a fovea does not show", "fixations")
-                fixations = fixations_of(seen, "seen", size, source)
-                number = len(fixations)
-                terms = converted.terms(_foveal_features(looking, image, fixations, fitted), size[::-1])
-                # What a fovea has shown is unlike a sharp picture, whatever the picture is.
-                unlikeness = None
-            else:
-                raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
+        else:
+            eye = _fovea_of(looking, quality, panorama)
+            fixations = fixations_of(seen, "seen", size, source)
+            with torch.no_grad():
+                terms = converted.terms(_foveal_features(eye, image, fixations, fitted), size[::-1])
+            # What a fovea has shown is unlike a sharp picture, whatever the picture is.
+            unlikeness = None
+
         on_processor = {name: term.cpu() for name, term in terms.items()}
         photograph = reduced_copy(image)
         if _is_blank(photograph):
@@ -151,7 +148,7 @@ class GazePrediction(OtherWords):
             size,
             photograph,
             source,
-            number,
+            None if fixations is None else len(fixations),
             is_shipped=model is None,
             unlikeness=unlikeness,
             panorama=panorama,
@@ -591,6 +588,15 @@ def _is_blank(photograph: Tensor) -> bool:
     """Tell whether a picture `(3, h, w)` in bytes has one colour."""
     lowest, highest = photograph.flatten(1).aminmax(dim=1)
     return int((highest.int() - lowest.int()).max()) <= _BLANK
+
+
+def _fovea_of(looking: Detector | Eye, quality: Quality, panorama: bool) -> Eye:
+    """Return the eye that has looked at the fixations of `seen`; raises `InputError` where a fovea cannot show it."""
+    if not isinstance(looking, Eye):
+        raise InputError(f"looking: expected an eye, for what it has seen, got {type(looking).__name__}")
+    check(not panorama, "seen", "None for a panorama, which a fovea does not show", "fixations")
+    check(quality != "best", "seen", "None for quality='best', which a fovea does not show", "fixations")
+    return looking
 
 
 def _foveal_features(eye: Eye, image: Tensor, fixations: Fixations, model: FixationDensity) -> FeatureMaps:

@@ -307,26 +307,37 @@ def _of_durations(records: Sequence[Fixations]) -> list[str]:
     if not durations:
         return []
     values = np.concatenate(durations)
+    other_unit = _other_unit_of(values)
+    if other_unit is not None:
+        return [other_unit]
+    lines = []
     median = float(np.median(values))
     least = values.min()
     most = values.max()
-    have_fractions = bool((values % 1 != 0).any())
-    if median < 2 and most < 20 and have_fractions:
-        return [f"durations from {least:g} to {most:g} look like seconds (multiply them by 1000)"]
-    if median > 20_000:
-        return [f"durations of {median:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"]
-    lines = []
-    short = (values < _SHORT).mean()
+    share_short = (values < _SHORT).mean()
     if len(values) >= _MANY and least == most:
         lines.append(f"all durations are {least:g} ms (are these samples of the tracker?)")
     elif median < _SHORT:
         lines.append(f"durations of {median:g} ms in the median are those of samples, not of fixations")
-    elif short > _MOST_SHORT:
-        lines.append(f"{100 * short:.0f} % of the fixations take less than {_SHORT:g} ms")
-    long = int((values > _LONG).sum())
-    if long:
-        lines.append(f"{long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most:g} ms")
+    elif share_short > _MOST_SHORT:
+        lines.append(f"{100 * share_short:.0f} % of the fixations take less than {_SHORT:g} ms")
+    count_long = int((values > _LONG).sum())
+    if count_long:
+        lines.append(f"{count_long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most:g} ms")
     return lines
+
+
+def _other_unit_of(durations: _Array) -> str | None:
+    """Say which unit durations look like that are no milliseconds; None where they look like these."""
+    median = float(np.median(durations))
+    least = durations.min()
+    most = durations.max()
+    have_fractions = bool((durations % 1 != 0).any())
+    if median < 2 and most < 20 and have_fractions:
+        return f"durations from {least:g} to {most:g} look like seconds (multiply them by 1000)"
+    if median > 20_000:
+        return f"durations of {median:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"
+    return None
 
 
 def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], picture: str | None = None) -> None:
