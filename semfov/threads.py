@@ -62,8 +62,9 @@ def beside(work: Callable[[], object] | None, *, idle: bool) -> Iterator[None]:
 
     It is left out where processes of one command share the cores, and what fails in it is left to who needs its result.
     """
-    shared = multiprocessing.parent_process() is not None
-    if work is None or shared or not (idle or torch.get_num_threads() < available_cores()):
+    are_shared = multiprocessing.parent_process() is not None
+    has_core = idle or torch.get_num_threads() < available_cores()
+    if work is None or are_shared or not has_core:
         yield
         return
 

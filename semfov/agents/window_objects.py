@@ -129,7 +129,7 @@ def without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[Wind
     ends = np.cumsum(counts)
     boxes = torch.cat([look.detections.boxes[0] for look in looks])
     low, high = _surroundings(boxes, lattice.size)
-    remain = torch.cat([look.detections.mask[0] for look in looks]).numpy()
+    is_kept = torch.cat([look.detections.mask[0] for look in looks]).numpy()
     magnifications = np.array([look.window.fixation[2] for look in looks])
     magnification_of_box = np.repeat(magnifications, counts)
     for number in range(1, len(looks)):
@@ -137,9 +137,9 @@ def without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[Wind
         region = np.array(looks[number].window.region(lattice), dtype=low.dtype)
         is_shown = _lie_inside(low[:, earlier], high[:, earlier], region)
         is_as_close = magnifications[number] >= magnification_of_box[earlier]
-        remain[earlier] &= ~(is_shown & is_as_close)
-    remain_of_look = torch.from_numpy(remain).split(counts)
-    return [_taken(look, remain) for look, remain in zip(looks, remain_of_look, strict=True)]
+        is_kept[earlier] &= ~(is_shown & is_as_close)
+    masks = torch.from_numpy(is_kept).split(counts)
+    return [_taken(look, mask) for look, mask in zip(looks, masks, strict=True)]
 
 
 def _lie_inside(low: np.ndarray, high: np.ndarray, region: np.ndarray) -> np.ndarray:

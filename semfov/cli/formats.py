@@ -123,9 +123,13 @@ class Csv(ResultsFormat):
             columns = ["picture", *DECISION_COLUMNS, "seconds", "error"]
             return _table(columns, pictures)
         columns = ["picture", "width", "height", *COLUMNS, *_EXPECTED, "error"]
-        lines = [line for picture in pictures for line in _object_lines(picture)]
+        lines: list[Values] = []
+        for picture in pictures:
+            lines += _object_lines(picture)
         # Objects of a head have directions, too, which come last.
-        return _table(list(dict.fromkeys([*columns, *(name for line in lines for name in line)])), lines)
+        for line in lines:
+            columns += [name for name in line if name not in columns]
+        return _table(columns, lines)
 
 
 _EXPECTED = ("expected", "expected_error")
@@ -297,9 +301,8 @@ def suffixes() -> list[str]:
 
 def suffixes_in_words() -> str:
     """List the suffixes of all formats for the help, with what is to say of them."""
-    return ", ".join(
-        suffix + (f" ({described.note})" if described.note else "") for suffix, described in FORMATS.items()
-    )
+    notes = [f"{suffix} ({described.note})" if described.note else suffix for suffix, described in FORMATS.items()]
+    return ", ".join(notes)
 
 
 def _looked_at(rows: Iterable[Row]) -> list[Row]:
@@ -324,4 +327,5 @@ def _json(values: Values) -> str:
 
 def _table(columns: Sequence[str], lines: Iterable[Values]) -> str:
     """Write lines as CSV with these columns; what a line has not stays empty."""
-    return csv_text([columns, *([line.get(name) for name in columns] for line in lines)])
+    rows = [[line.get(name) for name in columns] for line in lines]
+    return csv_text([columns, *rows])

@@ -281,7 +281,9 @@ def _table_of_pictures(facts: Mapping[str, Mapping[str, object]]) -> str:
     """Write the table of pictures as CSV: a line for each, with its first fixations and shares of areas."""
     columns = [*next(iter(facts.values()))]
     rows: list[Sequence[object]] = [["picture", *columns]]
-    rows += [[name, *(of_picture[column] for column in columns)] for name, of_picture in facts.items()]
+    for name, facts_of_picture in facts.items():
+        cells = [facts_of_picture[column] for column in columns]
+        rows.append([name, *cells])
     return csv_text(rows)
 
 

@@ -300,11 +300,10 @@ class Scores:
                 numbers = numbers[-1:]
             else:
                 numbers = [number for number in numbers if number in _AFTER or number == numbers[-1]]
-            # A picture in which a way ended before has the objects that it had then.
-            points += [
-                self._point(way, {image: _after(number, of_picture) for image, of_picture in found.items()}, reference)
-                for number in numbers
-            ]
+            for number in numbers:
+                # A picture in which a way ended before has the objects that it had then.
+                found_by_then = {image: _after(number, of_picture) for image, of_picture in found.items()}
+                points.append(self._point(way, found_by_then, reference))
         return points
 
     def _point(self, way: str, found: Mapping[Id, Finding], reference: Annotations) -> Point:
@@ -314,9 +313,8 @@ class Scores:
         right = 0
         for image, finding in found.items():
             objects = _of_classes(finding.objects, self._ids)
-            results += [
-                dict(row) for row in coco_results(image, objects.boxes, objects.labels, objects.scores, self._ids)
-            ]
+            rows = coco_results(image, objects.boxes, objects.labels, objects.scores, self._ids)
+            results += [dict(row) for row in rows]
             verdicts = right_boxes(objects.above(finding.threshold), self._annotations[image])
             listed += int((verdicts >= 0).sum())
             right += int((verdicts > 0).sum())

@@ -230,8 +230,12 @@ def _found_in_all(files: PictureFiles) -> str:
     """Count the objects of each class in all pictures of a find; empty for other tasks, and where none was found."""
     if not files.job.every:
         return ""
-    counts = Counter(line["class"] for row in files.rows.values() for line in row.get("objects", ()))
-    return f"{', '.join(counted(number, name) for name, number in counts.most_common())} found" if counts else ""
+    counts = Counter[str]()
+    for row in files.rows.values():
+        counts.update(line["class"] for line in row.get("objects", ()))
+    if not counts:
+        return ""
+    return f"{', '.join(counted(number, name) for name, number in counts.most_common())} found"
 
 
 def _assumed_in_all(files: PictureFiles) -> str:

@@ -267,7 +267,11 @@ class _Evidence:
     def fits_in_pictures(self) -> _Array:
         """Compute the fit of the fixations of picture i, as they are read, in picture j, `(N, N)`."""
         places = self._places(self.records, _PRESENT_READING)
-        return np.array([[self._fit(places[name], picture) for picture in self.names] for name in self.names])
+        return np.array([self._fit_in_all(places[name]) for name in self.names])
+
+    def _fit_in_all(self, places: _Array) -> list[float]:
+        """Compute the fit of the fixations of one picture, `(n, 2)`, in each picture."""
+        return [self._fit(places, picture) for picture in self.names]
 
     def best_shift(self, records: Sequence[Fixations]) -> _BestShift:
         """Find the shift with which some records fit best, all of them moved alike."""
@@ -402,9 +406,11 @@ def _shifts_of_some(evidence: _Evidence) -> list[str]:
         ]
     if not any(findings):
         # A tracker drifts while a person looks at one picture after the other.
-        later = [record for records in by_person.values() for record in records[len(records) // 2 :]]
+        second_halves: list[Fixations] = []
+        for records in by_person.values():
+            second_halves += records[len(records) // 2 :]
         label = "fixations in the second half of each person's pictures"
-        findings = [_shift_of(evidence, later, label, _LEAST_SHIFT_OF_SOME)]
+        findings = [_shift_of(evidence, second_halves, label, _LEAST_SHIFT_OF_SOME)]
     return [finding.line for finding in findings if finding is not None]
 
 

@@ -339,9 +339,8 @@ def read_json(
         DataError: it cannot be read, is larger, or is no JSON, or a name stands twice where it may not.
     """
     try:
-        return json.loads(
-            read_bytes(path, most=most, name=name), object_pairs_hook=_with_unique_names if unique else None
-        )
+        content = read_bytes(path, most=most, name=name)
+        return json.loads(content, object_pairs_hook=_with_unique_names if unique else None)
     except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
         reason = " ".join(str(error).split())
         raise DataError(f"{name or path}: cannot be read as JSON ({reason}); correct or replace the file") from None
@@ -351,7 +350,8 @@ def _with_unique_names(pairs: list[tuple[str, object]]) -> dict[str, object]:
     """Make an object of JSON from its names and values; raises `ValueError` for a name that stands twice."""
     values = dict(pairs)
     if len(values) < len(pairs):
-        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        counts = Counter(name for name, _ in pairs)
+        twice = next(name for name, count in counts.items() if count > 1)
         raise ValueError(f"{twice!r} stands in it twice")
     return values
 

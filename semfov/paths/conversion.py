@@ -238,7 +238,8 @@ class Conversion(Outcome, OtherWords):
             agent.find_all("harbour.tif", "person").to_csv("people.csv", "objects")
         """
         rows, columns = self._table(table)
-        return _written(csv_text([columns, *([row.get(name) for name in columns] for row in rows)]), path)
+        lines = [[row.get(name) for name in columns] for row in rows]
+        return _written(csv_text([columns, *lines]), path)
 
     def to_json(self, path: str | PathLike[str] | None = None) -> str:
         """Convert the record to JSON, the values of `to_dict`.
@@ -260,7 +261,10 @@ class Conversion(Outcome, OtherWords):
         if table == "objects":
             return self.object_rows(), list(self._columns)
         rows = self.rows()
-        return rows, list(dict.fromkeys(name for row in rows for name in row))
+        columns: dict[str, None] = {}  # in the order in which rows first have them
+        for row in rows:
+            columns |= dict.fromkeys(row)
+        return rows, list(columns)
 
     def to_supervision(self) -> supervision.Detections:
         """Convert the objects to `supervision.Detections`, for its annotators, trackers and metrics.
@@ -431,17 +435,16 @@ class Conversion(Outcome, OtherWords):
         collection: Values = {
             "type": "FeatureCollection",
             "coordinates": in_pixels if place is None else "longitude and latitude, WGS 84",
-            "features": [
-                {
-                    "type": "Feature",
-                    "properties": {name: row[name] for name in COLUMNS if name not in _PLACE},
-                    "geometry": _geometry(row, place),
-                }
-                for row in self.object_rows()
-            ],
+            "features": [_feature(row, place) for row in self.object_rows()],
         }
         _written(json.dumps(collection, allow_nan=False), path)
         return collection
+
+
+def _feature(row: Values, place: PlaceOnEarth | None) -> Values:
+    """Make the GeoJSON feature of an object, on earth or in pixels."""
+    properties = {name: row[name] for name in COLUMNS if name not in _PLACE}
+    return {"type": "Feature", "properties": properties, "geometry": _geometry(row, place)}
 
 
 def _geometry(row: Values, place: PlaceOnEarth | None) -> Geometry:

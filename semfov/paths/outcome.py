@@ -221,7 +221,12 @@ class Outcome(ABC):
     def refuted(self) -> list[CloseUp]:
         """The closer looks that did not confirm that the target is there."""
         boxes = [place.box for place in self._confirmed_places]
-        return [look for look in self.closer if not any(look.box.equal(box) for box in boxes)]
+        refuted = []
+        for look in self.closer:
+            is_confirmed = any(look.box.equal(box) for box in boxes)
+            if not is_confirmed:
+                refuted.append(look)
+        return refuted
 
     @property
     def expected(self) -> dict[str, float]:
@@ -297,7 +302,9 @@ class Outcome(ABC):
     def _found_place(self) -> _ConfirmedPlace | None:
         """The place where the decision found the target; None if it did not, or shows no box."""
         decision = self.decision
-        if decision is None or decision.outcome != "found" or decision.box is None or self.target is None:
+        if decision is None or decision.outcome != "found":
+            return None
+        if decision.box is None or self.target is None:
             return None
         probability = decision.probability if decision.place is None else decision.place
         looks = [look.of_look for look in self.closer if look.box.equal(decision.box)]

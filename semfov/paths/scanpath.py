@@ -378,14 +378,16 @@ def _looks_of_file(
     check(have_regions, "closer_regions", f"{len(close_ups)} regions", len(regions))
     points = tensors["fixations"].tolist()
     fovea = FoveaLooks(grid)
+    fixation = 0  # number of fixations so far, and of closer looks
+    closer = 0
     for number, (seen, stages) in enumerate(zip(detections, seconds, strict=True)):
-        closer = sum(earlier < number for earlier in close_ups)  # closer looks before this one
-        fixation = number - closer
         if number in close_ups:
             fovea.look_closely(close_ups[number].cell or 0, regions[closer], seen, stages, chances[closer])
+            closer += 1
         else:
             belief = _belief_of_file(tensors, fixation)
             fovea.fixate(cells[fixation], points[fixation], seen, stages, *belief)
+            fixation += 1
     return tuple(fovea.looks)
 
 

@@ -45,21 +45,25 @@ class Stimulus:
     @classmethod
     def restored(cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Self | None:
         """Make the stimulus from the content of a file, and check that its parts fit each other."""
-        settings = record.get("settings")
-        placement_values = record.get("placement")
-        stimulus_parts = (tensors.get("canvas"), placement_values, settings)
-        if all(part is None for part in stimulus_parts):
+        # A record without the stimulus may have the photograph.
+        parts = {
+            "photograph": tensors.get("photograph"),
+            "canvas": tensors.get("canvas"),
+            "placement": record.get("placement"),
+            "settings": record.get("settings"),
+        }
+        found = [name for name, part in parts.items() if part is not None]
+        if found in ([], ["photograph"]):
             return None
-        if "photograph" not in tensors or "canvas" not in tensors or placement_values is None or settings is None:
-            got = sum(part is not None for part in (tensors.get("photograph"), *stimulus_parts))
+        if len(found) < len(parts):
             expected = "photograph, canvas, placement and settings together"
-            raise InputError(f"photograph: expected {expected}, got {got} of these 4")
-        placement = Placement(**{name: tuple(pair) for name, pair in placement_values.items()})
+            raise InputError(f"photograph: expected {expected}, got {len(found)} of these 4")
+        placement = Placement(**{name: tuple(pair) for name, pair in record["placement"].items()})
         canvas = tensors["canvas"]
         height, width = canvas.shape[1:]
         _check_on_canvas(placement, 0, width)
         _check_on_canvas(placement, 1, height)
-        return cls(canvas, placement, settings)
+        return cls(canvas, placement, record["settings"])
 
     def views(self, fixations: Tensor) -> list[Tensor]:
         """Make the foveated views of fixations, those of `Eye.pictures` up to the rounding to bytes.

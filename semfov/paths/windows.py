@@ -111,7 +111,8 @@ class WindowWords(Words):
         """Tell whether a search of a photograph decided although no look shows a place that may hold the target."""
         record = self.record
         is_photograph = record.lattice.levels == 1
-        if record.target is None or not is_photograph or record.ending != "decision" or record.closer:
+        has_decided = record.ending == "decision" and not record.closer
+        if record.target is None or not is_photograph or not has_decided:
             return False
         chances = [float(look.show[record.target - 1]) for look in record.window_looks]
         return all(chance < PhotographPlaces.least for chance in chances)
@@ -332,17 +333,18 @@ class ZoomPath(Record):
         target of a search is no less than the probability that the picture holds it: E[N] ≥ P(N ≥ 1).
         """
         labels = self.sought or tuple(self.candidates.labels.unique().tolist())
-        chances = {label: self.candidates.of([label]).scores for label in labels}
-        sums = {label: float(chances[label].double().sum()) + 1e-9 for label in labels}  # not 0, to divide by it
+        scores = {label: self.candidates.of([label]).scores for label in labels}
+        sums = {label: float(scores[label].double().sum()) + 1e-9 for label in labels}  # not 0, to divide by it
+        total = sum(sums.values())
         mean_unseen, variance_unseen = self.unseen or (0.0, 0.0)
         numbers = {}
         for label in labels:
             if self._reacts_to([label]):
-                share = sums[label] / sum(sums.values())
+                share = sums[label] / total
                 unseen = (share * mean_unseen, share * variance_unseen)
-                numbers[label] = number_of(chances[label], unseen, self.spread)
+                numbers[label] = number_of(scores[label], unseen, self.spread)
             elif label in self._countable_if_faint:
-                numbers[label] = number_of_faint(chances[label])
+                numbers[label] = number_of_faint(scores[label])
             else:
                 numbers[label] = (math.nan, math.nan)
         if self.decision is not None and self.target in numbers:

@@ -261,9 +261,11 @@ def tagged(
     unit = frame[0] / 640
     sizes = [(unit * (11.5 * len(text) + 8), unit * 25) for text in texts]
     places = place_labels([tuple(detection["box"]) for detection in detections], sizes, frame, obstacles)
-    return [
-        {**detection, "tag": [round(x, 1) for x in place]} for detection, place in zip(detections, places, strict=True)
-    ]
+    with_tags = []
+    for detection, place in zip(detections, places, strict=True):
+        tag = [round(side, 1) for side in place]
+        with_tags.append({**detection, "tag": tag})
+    return with_tags
 
 
 def _map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:

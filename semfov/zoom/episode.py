@@ -232,8 +232,11 @@ def look_by_look(
     source.carry = recent.follow
     choose = partial(_next_choices, recent, order)
     choices = choose()
+    is_still = forgetting is None
     while choices:
-        if guess is not None and forgetting is None and len(choices) == 1 and recent.kept:
+        # Which window is next can be guessed where the belief waits for one look, after the overview.
+        is_single = len(choices) == 1 and bool(recent.kept)
+        if guess is not None and is_still and is_single:
             source.meanwhile = partial(_resample_likely, recent, guess, choices[0][0])
         windows = [window for window, _ in choices]
         looks = source.see(windows, hints=hints)

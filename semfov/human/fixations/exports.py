@@ -214,12 +214,11 @@ def _column_name(keys: Sequence[str], columns: Sequence[Column]) -> str | None:
 
 def _duration_column(program: Program, columns: Sequence[Column], name: str | None) -> Column | None:
     """Find the column of durations in a unit that is read: that of a user's `name`, or of the program."""
-    if name is not None:
-        candidates = [Column.of(name)]
-    else:
-        candidates = [column for key in program.duration for column in columns if column.key == key]
-    read = [column for column in candidates if (column.unit or program.time) in TIMES]
-    return read[0] if read else None
+    candidates = [] if name is None else [Column.of(name)]
+    if name is None:
+        for key in program.duration:
+            candidates += [column for column in columns if column.key == key]
+    return next((column for column in candidates if (column.unit or program.time) in TIMES), None)
 
 
 def _point_columns(program: Program, columns: Sequence[Column], table: str) -> tuple[Column, Column]:

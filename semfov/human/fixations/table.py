@@ -4,7 +4,7 @@ import csv
 import io
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple, get_args
@@ -115,13 +115,15 @@ def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
     by_key = {column.key: column for column in map(Column.of, reversed(table.columns))}
     names = {}
     for name in (*_COLUMNS, *_SIZE, *_MORE):
+        names[name] = name
         similar = by_key.get(name)
         if name in named:
             names[name] = named[name]
-        elif name in table.columns or similar is None or (name in _SIZE and not _may_be_pixels(similar)):
-            names[name] = name
-        else:
-            names[name] = similar.name
+        elif similar is not None and name not in table.columns:
+            # A width in other units than pixels is not the one that is meant.
+            is_meant = name not in _SIZE or _may_be_pixels(similar)
+            if is_meant:
+                names[name] = similar.name
     return names
 
 
@@ -314,14 +316,18 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
         # A person may see a picture more than once: the number of the viewing tells the scanpaths apart.
         scanpath = record.picture, record.subject, record.target
         viewings[scanpath] += 1
-        durations = [""] * len(record) if record.durations is None else record.durations.tolist()
-        box = [""] * 4 if record.box is None else record.box
-        found = "" if record.found is None else str(record.found).lower()
-        before = [record.picture, record.subject]
-        after = [*box, found, viewings[scanpath]]
-        for (x, y), duration in zip(record.points.tolist(), durations, strict=True):
-            rows.writerow([*before, x, y, *record.size, record.target or "", duration, *after])
+        rows.writerows(_rows_of(record, viewings[scanpath]))
     write_text(Path(path), text.getvalue())
+
+
+def _rows_of(record: Fixations, viewing: int) -> Iterator[list[object]]:
+    """Yield the cells of each fixation of a record, the first, second or later viewing; what is not known is empty."""
+    durations = [""] * len(record) if record.durations is None else record.durations.tolist()
+    box = [""] * 4 if record.box is None else record.box
+    found = "" if record.found is None else str(record.found).lower()
+    for (x, y), duration in zip(record.points.tolist(), durations, strict=True):
+        person = [record.picture, record.subject]
+        yield [*person, x, y, *record.size, record.target or "", duration, *box, found, viewing]
 
 
 def _record(rows: Sequence[Row], size: Size | None, coordinates: Coordinates) -> Fixations:
