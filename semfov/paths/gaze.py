@@ -21,7 +21,7 @@ from semfov.data.fixations import Fixations
 from semfov.detection import Detector, FeatureMaps
 from semfov.errors import InputError, check, check_number, check_whole, checked_keywords, lookup
 from semfov.eye import Eye
-from semfov.gaze.saliency.fixation_density import FixationDensity, shared_density
+from semfov.gaze.saliency.fixation_density import FixationDensity, density_for
 from semfov.gaze.saliency.glimpses import features_so_far
 from semfov.gaze.saliency.on_picture import interpolation
 from semfov.gaze.saliency.views import picture_terms
@@ -118,7 +118,7 @@ class GazePrediction(OtherWords):
             DataError: the file of the model is missing or damaged.
         """
         detector = looking.detector if isinstance(looking, Eye) else looking
-        fitted = _model_for(detector, model)
+        fitted = density_for(detector, model)
         size = int(image.shape[-1]), int(image.shape[-2])
         lookup(quality, get_args(Quality), "quality")
         is_wide = size[0] >= _ROUND * size[1]
@@ -562,26 +562,6 @@ class GazePrediction(OtherWords):
     def _log(self) -> Tensor:
         """Sum the terms to the log density over the cells, `(rows, columns)`, up to a constant."""
         return torch.stack([term[0] for term in self.terms.values()]).sum(0)
-
-
-def _model_for(detector: Detector, model: FixationDensity | str | PathLike[str] | None) -> FixationDensity:
-    """Find the model for a detector: the shipped one, or a copy of the given one, checked.
-
-    Args:
-        detector: the detector.
-        model: the model, or its file or folder; None for the one that is shipped.
-
-    Returns:
-        The model, on the processor.
-    """
-    if model is None:
-        return shared_density(detector)
-    if isinstance(model, str | PathLike):
-        model = FixationDensity.from_pretrained(model)
-    expected = "a FixationDensity, or its file (FixationDensity.from_pretrained)"
-    check(isinstance(model, FixationDensity), "model", expected, type(model).__name__)
-    model.check_compatible(detector)
-    return deepcopy(model).cpu()
 
 
 def _is_blank(photograph: Tensor) -> bool:

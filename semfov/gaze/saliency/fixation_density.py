@@ -442,6 +442,30 @@ def shared_density(detector: Detector) -> FixationDensity:
     return model
 
 
+def density_for(detector: Detector, model: FixationDensity | str | PathLike[str] | None) -> FixationDensity:
+    """Find the model for a detector: the shipped one, or a copy of the given one, checked.
+
+    Args:
+        detector: the detector.
+        model: the model, or its file or folder; None for the one that is shipped.
+
+    Returns:
+        The model, on the processor.
+
+    Raises:
+        InputError: none is shipped for the detector, or the given one was fitted to another detector.
+        DataError: its file is missing or damaged.
+    """
+    if model is None:
+        return shared_density(detector)
+    if isinstance(model, str | PathLike):
+        model = FixationDensity.from_pretrained(model)
+    expected = "a FixationDensity, or its file (FixationDensity.from_pretrained)"
+    check(isinstance(model, FixationDensity), "model", expected, type(model).__name__)
+    model.check_compatible(detector)
+    return deepcopy(model).cpu()
+
+
 def _size_of(features: FeatureMaps | Mapping[str, Tensor]) -> tuple[int, int]:
     """Find `(height, width)` of the picture of feature maps; of maps by name, that of the finest one."""
     if isinstance(features, FeatureMaps):
