@@ -24,6 +24,11 @@ class PictureFiles:
     Attributes:
         rows: the rows of the pictures so far, by number; those that were left out have an `error`.
         finished: the outcomes that the same command takes up after an interruption; None for one picture.
+
+    Private attributes: `_results` is the file of results, and `_folder` that of the figures beside it; None without
+    one. `_written` has the figures so far, and `_episodes` the parts of the page by the numbers of their pictures.
+
+    Invariant: each picture is added or skipped once, in any order; `finish` can be called after any of them.
     """
 
     def __init__(self, job: PictureJob[PictureOptions], stream: TextIO) -> None:
@@ -36,16 +41,23 @@ class PictureFiles:
         self._folder: Path | None = None
         if job.options.figure is not None:
             self._written = [job.options.figure]
-        out = job.options.results
-        if out is None:
-            return
+        if job.options.results is not None:
+            self._open(job.options.results, stream)
+
+    def _open(self, out: Path, stream: TextIO) -> None:
+        """Open the file of results, or the one in a folder, and what an interrupted command has left of it."""
+        job = self.job
         kind = kind_of(out)
         form = results_format(out, searched=job.title.startswith("search"), truth=job.truth)
         form.check_files([source.file for source in job.sources])
-        file = out if kind is not None else out / "results.json"
+        if kind is None:
+            file = out / "results.json"
+            self._folder = out
+        else:
+            file = out
+            # Beside a file, figures have a folder of its name: found.coco.json and found/.
+            self._folder = out.with_name(out.name.partition(".")[0])
         self._results = ResultsFile(file, form, stream)
-        # Beside a file, figures have a folder of its name: found.coco.json and found/.
-        self._folder = out if kind is None else out.with_name(out.name.partition(".")[0])
         # One picture takes seconds, and what was written to a stream is gone.
         if job.several and out != STDOUT:
             self.finished = unfinished(file, job.depends_on(), job.sources)

@@ -54,6 +54,8 @@ class _SceneLooks(Looks):
     Private attributes: `_scenes` has the looks of each scene that was entered, and `_first_rows` where they begin.
     `_evidence` and `_detections` are the tables; None until a look needs them after another scene was entered.
     `_evidence_row` and `_detections_row` `(B,)` have, for each episode, the rows of the look from cell 0.
+
+    Invariant: scenes are only added, behind those before, so that the rows of episodes stay theirs.
     """
 
     def __init__(self, open_scene: Callable[[int], StoredLooks], observer: Observer, episodes: int) -> None:
@@ -148,6 +150,8 @@ class CellGazes(Gazes[CellEpisode]):
     Private attributes: `_right` has the cells of each row's goal, `(B, X·Y)` boolean, in explorations the right classes
     of all cells, `(B, X·Y, C)`. `_trace` has the looks of the first episode, None without pictures, and `_stimulus` its
     scene, None until it is drawn.
+
+    Invariant: row b of all tensors is of episode b, whose fixated cell is among the visited ones after each look.
     """
 
     coordinates = 2

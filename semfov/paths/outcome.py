@@ -331,6 +331,8 @@ class _Listing:
     Row i of `boxes` `(M, 4)`, `scores`, `labels` and `looks` `(M,)` is a candidate, or a place without one.
     `counts[i]` tells whether its score alone suffices, and `confirmed[i]` whether a place confirmed it.
 
+    Invariant: all columns have as many rows; rows are only added, at the end, so that a row keeps its number.
+
     Args:
         candidates: the candidates of the classes that were searched for.
         score_threshold: score from which on a candidate counts.

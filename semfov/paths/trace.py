@@ -36,6 +36,13 @@ class Trace:
         target: class 1..K that is searched for; None for an exploration.
         beside: observer of the map of all classes beside the belief of a search; None if the belief is that map.
         score_threshold: score from which on objects count.
+
+    Private attributes: `_posterior` and `_presence` have the probability of the target in each cell and in the picture
+    after each fixation, `_maps` the map of all classes, and `_belief` is that of the last map, where one is kept beside
+    the search.
+
+    Invariant: `_fixated` has an entry for each fixation. So have, in a search, `_posterior` and `_presence`. `_maps`
+    has those that were read so far, from the first fixation on.
     """
 
     def __init__(
@@ -53,10 +60,10 @@ class Trace:
         self.score_threshold = score_threshold
         self._fovea = FoveaLooks(grid)
         self._fixated: list[_Fixated] = []
-        self._posterior: list[Tensor] = []  # of the target in each cell, after each fixation
+        self._posterior: list[Tensor] = []
         self._presence: list[Tensor] = []
-        self._maps: list[Tensor] = []  # of all classes, made when they are read for the first time
-        self._belief: Belief | None = None  # the belief of the last map, where one is kept beside the search
+        self._maps: list[Tensor] = []
+        self._belief: Belief | None = None
         # Maps are made as if they had been made at once: with gradients and inference mode as they were then.
         self._modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
@@ -93,7 +100,8 @@ class Trace:
         """
         number = int(cell)
         value = float(self._fixated[-1].values[0, number]) if self._fixated else None
-        probability, presence = None, None
+        probability = None
+        presence = None
         if self.target is not None:
             probability = belief.probability(self.target)[0]
             self._posterior.append(probability)

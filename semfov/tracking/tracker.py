@@ -73,6 +73,13 @@ class Tracker:
     Attributes:
         tracks: the objects, where they are in the present frame.
 
+    Private attributes: `_aside` has the objects of a scene that the camera has lost and may find again, where they were
+    in its last frame; None while none is lost. `_waited` is the time in seconds since that frame, `_last` the last
+    number that was given, and `_is_marked` tells whether the trails have a place in the present frame.
+
+    Invariant: `tracks` are in the order of their numbers, none of which is given twice; those of `_aside` are lower
+    than those that began after it.
+
     >>> tracker = Tracker()
     >>> box = np.array([[100.0, 100.0, 140.0, 180.0]])
     >>> for step in range(4):
@@ -85,10 +92,10 @@ class Tracker:
     def __init__(self, model: TrackingModel | None = None) -> None:
         self.model = model or TrackingModel()
         self.tracks = Tracks.none()
-        self._aside: Tracks | None = None  # objects of a scene that the camera has lost and may find again
-        self._waited = 0.0  # seconds since then
-        self._last = 0  # the last number that was given
-        self._is_marked = False  # whether the trails have a place in the present frame
+        self._aside: Tracks | None = None
+        self._waited = 0.0
+        self._last = 0
+        self._is_marked = False
 
     def follow(self, seconds: float, camera: CameraStep | None = None) -> None:
         """Predict the objects at the next frame.
@@ -99,18 +106,26 @@ class Tracker:
         """
         self._waited += seconds
         self._is_marked = False
-        if camera is not None and camera.motion is None:
-            if self._aside is None:
-                self._aside = self.tracks
-                self._waited = seconds
-            self.tracks = Tracks.none()
+        if camera is None:
+            self.tracks = self._after(self.tracks, seconds, None)
+            self._aside = None
+            return
+        if camera.motion is None:
+            self._set_aside(seconds)
         else:
-            self.tracks = self._after(self.tracks, seconds, None if camera is None else camera.motion)
-        if camera is not None and camera.recovered is not None and self._aside is not None:
+            self.tracks = self._after(self.tracks, seconds, camera.motion)
+        if camera.recovered is not None and self._aside is not None:
             found = self._after(self._aside, self._waited, camera.recovered)
             self.tracks = found.joined(self.tracks)
-        if camera is None or camera.recovered is not None or not camera.waits:
+        if camera.recovered is not None or not camera.waits:
             self._aside = None
+
+    def _set_aside(self, seconds: float) -> None:
+        """Set the objects of a scene aside that was lost in the last seconds; others are dropped if one waits."""
+        if self._aside is None:
+            self._aside = self.tracks
+            self._waited = seconds
+        self.tracks = Tracks.none()
 
     def _after(self, tracks: Tracks, seconds: float, motion: Motion | None) -> Tracks:
         """Predict objects some seconds later, and forget those that are hardly there any more."""
@@ -140,9 +155,9 @@ class Tracker:
         is_whole = ~seen.cut[pairs[:, 1]]
         self._miss(seen, pairs[:, 0])
         self._hit(seen, noise, pairs[is_whole])
-        fresh = ~seen.cut
-        fresh[pairs[:, 1]] = False
-        self._begin(seen, noise, fresh)
+        is_unpaired = ~seen.cut
+        is_unpaired[pairs[:, 1]] = False
+        self._begin(seen, noise, is_unpaired)
         self._merge_doubles()
         self.tracks = self.tracks.marked(anew=self._is_marked)
         self._is_marked = True
@@ -208,22 +223,22 @@ class Tracker:
         joined = self.tracks[is_other].joined(updated)
         self.tracks = joined[joined.track_ids.argsort()]
 
-    def _begin(self, seen: Seen, noise: Floats, fresh: NDArray[np.bool_]) -> None:
+    def _begin(self, seen: Seen, noise: Floats, is_new: NDArray[np.bool_]) -> None:
         """Begin an object with each of the detections `(M,)` that show none that is known."""
-        if not fresh.any():
+        if not is_new.any():
             return
-        boxes = seen.boxes[fresh]
+        boxes = seen.boxes[is_new]
         log_size = _log_size(boxes)
         count = len(boxes)
         speed = self.model.speed * np.exp(log_size.mean(-1))
         begun = Tracks(
             track_ids=self._last + 1 + np.arange(count),
-            labels=seen.labels[fresh],
-            kinematics=Kinematics.at(_centres(boxes), noise[fresh], speed),
+            labels=seen.labels[is_new],
+            kinematics=Kinematics.at(_centres(boxes), noise[is_new], speed),
             speed=speed,
             log_size=log_size,
-            size_variance=np.maximum(self.model.size**2, self._least_size_variance(seen)[fresh]),
-            shown_odds=self.model.evidence(seen.scores[fresh]),
+            size_variance=np.maximum(self.model.size**2, self._least_size_variance(seen)[is_new]),
+            shown_odds=self.model.evidence(seen.scores[is_new]),
             missed_odds=np.zeros(count),
             unseen=np.zeros(count),
             magnification=np.full(count, seen.magnification),

@@ -62,6 +62,13 @@ class ZoomBelief:
         foresight: share of what still closer looks would find in a window that counts towards its value.
         gists: the looks, in the order in which they were added.
         closest_level: s, level of the closest look at each cell, `(rows, columns)`; -1 where none was.
+
+    Private attributes: `_rate` `(levels, rows, columns)` has λ of each cell for looks of each level, and `_rated_level`
+    `(rows, columns)` the level of the look that this is from. `_gists_rated` counts the gists that both know. `_sums`
+    has the sums over windows that were asked for, by quantity and level.
+
+    Invariant: `closest_level` knows all gists, `_rate` and `_rated_level` the first `_gists_rated`; when these are all,
+    `_rated_level` equals `closest_level`. The sums are those of the cells but for windows over cells that were marked.
     """
 
     def __init__(

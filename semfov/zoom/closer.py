@@ -107,6 +107,12 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
     with the highest score :math:`s^*` of the search, which gives the probability P of the picture, both by the prior of
     the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). In a stream scores fade, and
     places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
+
+    Private attributes: `_look` is the last look of the search. `_looks` has the boxes of the target that looks have
+    shown, where they lie in the present frame, each with the time of the look. `_next` is the number of the next look.
+
+    Invariant: `_most_evident`, once it was computed, is that of `_looks`, the examined places and the present time.
+    What changes one of these calls `_change`.
     """
 
     least = DETECTION_SCORE

@@ -55,6 +55,8 @@ class SearchFacts:
         best: highest score of the target in all looks.
         box: box `(4,)` of the detection with the highest score; None without a detection.
         detected: whether a detection shows the target.
+
+    Invariant: `best`, `box` and `detected` sum up `looks`, of which there is at least one after `see` and `add`.
     """
 
     def __init__(self, belief: ZoomBelief) -> None:
@@ -223,6 +225,8 @@ class DecisionsByPresence(WindowDecisions):
     """Decisions of a search by its evidence, without closer looks (`semfov.decision.settle`).
 
     The probability that the picture holds the target takes time, and is computed where it can matter.
+
+    Invariant: `_presence` is that of the present `_facts` and `_fitted_chance`, or None; what changes these clears it.
     """
 
     def __init__(self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior) -> None:

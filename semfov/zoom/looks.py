@@ -169,7 +169,11 @@ class WindowLooks(ABC):
 
 
 class LiveWindowLooks(WindowLooks):
-    """Looks of an eye at a picture."""
+    """Looks of an eye at a picture.
+
+    Invariant: `_prepared` has windows of the present frame alone, resampled for the next look; a look and a new frame
+    empty it. `meanwhile` is for the next look alone, too.
+    """
 
     def __init__(self, eye: WindowEye, view: WindowView) -> None:
         self.eye = eye
