@@ -219,11 +219,16 @@ def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Val
     if not endings and all(isinstance(fault, InputError) for fault in faults):
         raise faults[0]  # what no picture can be looked at with is a wrong argument
     if job.several:
-        counts = ", ".join(f"{times} {name}" for name, times in endings.items())
-        skipped = f"{len(faults)} skipped" if faults else ""
-        print(f"{count} pictures: {'; '.join(filter(None, [counts, _found_in_all(files), skipped]))}")
-        print(_assumed_in_all(files), end="")
+        print(_totals(files, endings, len(faults)), end="")
     return [files.rows[number] for number in range(count)]
+
+
+def _totals(files: PictureFiles, endings: Counter[str], skipped: int) -> str:
+    """Say how all pictures ended, what was found in them, how many were skipped, and what the searches assume."""
+    totals = [", ".join(f"{times} {name}" for name, times in endings.items()), _found_in_all(files)]
+    if skipped:
+        totals.append(f"{skipped} skipped")
+    return f"{len(files.job.sources)} pictures: {'; '.join(filter(None, totals))}\n{_assumed_in_all(files)}"
 
 
 def _found_in_all(files: PictureFiles) -> str:

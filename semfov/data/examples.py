@@ -74,18 +74,20 @@ def sheet(classes: Sequence[str]) -> Scene:
     labels: list[Tensor] = []
     top = _MARGIN
     for row in rows:
-        # The same gap between all pictures of a row, and at both ends.
-        gap = (width - _width(row)) // (len(row) + 1)
-        left = gap
-        for scene in row:
+        for scene, left in zip(row, _lefts(row, width), strict=True):
             right = left + scene.size[0]
             bottom = top + scene.size[1]
             paper[:, top:bottom, left:right] = scene.image
             boxes.append(scene.boxes + torch.tensor([left, top, left, top]))
             labels.append(scene.labels)
-            left = right + gap
         top += _height(row) + _MARGIN
     return Scene("sheet", "sheet", paper, torch.cat(boxes), torch.cat(labels))
+
+
+def _lefts(row: Sequence[Scene], width: int) -> list[int]:
+    """Place the pictures of a row, with the same gap between all of them and at both ends; returns their left edges."""
+    gap = (width - _width(row)) // (len(row) + 1)
+    return [gap + _width(row[:number]) + gap * number for number in range(len(row))]
 
 
 def _width(row: Sequence[Scene]) -> int:

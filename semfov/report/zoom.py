@@ -11,6 +11,7 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp
+from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.paths import Record, RecordedLook
 from semfov.paths.look import CONFIDENT, LookView, read_region
@@ -170,26 +171,41 @@ def _warmed_up(path: Record) -> bool:
     return first > 3 * median(later)
 
 
+def _label_and_score(detections: Detections, number: int, target: int | None) -> tuple[int, float]:
+    """Find the class of a detection of one look, and its score.
+
+    As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
+
+    Args:
+        detections: a batch of one.
+        number: number of the detection, from 0.
+        target: class 1..K; None for none.
+
+    Returns:
+        The class, 0 for background, and the score.
+    """
+    label = int(detections.labels[0, number])
+    if target is not None and label:
+        target_score = float(detections.class_scores[0, number, target - 1])
+        if target_score >= CONFIDENT:
+            return target, target_score
+    return label, float(detections.confidence[0, number])
+
+
 def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     """Tell the detections of a look, those of the target first, with boxes and labels in the unit of the view."""
     detections = look.detections
     rows = []
-    for number, score in enumerate(detections.confidence[0].tolist()):
-        label = int(detections.labels[0, number])
-        # As for objects (`semfov.zoom.merge`), the score of the target counts, even if another class has a higher one.
-        if path.target is not None and label:
-            target_score = float(detections.class_scores[0, number, path.target - 1])
-            if target_score >= CONFIDENT:
-                label = path.target
-                score = target_score
+    for number in range(detections.confidence.shape[1]):
+        label, score = _label_and_score(detections, number, path.target)
         if score >= CONFIDENT:
-            row = {
+            entry = {
                 "box": view.boxes[number].tolist(),
                 "place": detections.boxes[0, number].tolist(),
                 "label": path.classes[label],
                 "score": score,
             }
-            rows.append((label == path.target, score, row))
+            rows.append((label == path.target, score, entry))
     rows.sort(key=lambda row: row[:2], reverse=True)
     entries = [entry for _, _, entry in rows]
     # Names would cover small objects. The table has them.

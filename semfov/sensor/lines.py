@@ -177,11 +177,20 @@ def banded(
     span_of_head = -(-edge // tile) * shift
     span_of_tail = count - (length - edge) // tile * shift
     span = min(count, max(span_of_head, span_of_tail) + reach)
-    first_of_tail = length - edge
-    head = _dense(index[:edge], weight[:edge], span)
-    tail = _dense(index[first_of_tail:] - (count - span), weight[first_of_tail:], span)
-    ends = torch.stack([head, tail]).to(device, dtype)
+    ends = _ends(taps, count, edge, span).to(device, dtype)
     return Lines(count, length, None, ends, middle, rows, start, shift)
+
+
+def _ends(taps: Taps, count: int, edge: int, span: int) -> Tensor:
+    """Make the matrices of the first and the last `edge` output pixels from the first and the last `span` of `count`.
+
+    Returns:
+        `(2, edge, span)`.
+    """
+    first_of_tail = len(taps.index) - edge
+    head = _dense(taps.index[:edge], taps.weight[:edge], span)
+    tail = _dense(taps.index[first_of_tail:] - (count - span), taps.weight[first_of_tail:], span)
+    return torch.stack([head, tail])
 
 
 def _are_equal(tiles: Tensor) -> bool:

@@ -131,23 +131,35 @@ class MultiScaleFovea(Sensor):
         crops = self(means, gaze[None])[0]
         fixation = fixations(gaze, crops)
         windows = self.windows(fixation[:, 0])
-        x, y = (torch.arange(n, dtype=windows.dtype, device=crops.device) + 0.5 for n in size)
-        picture = crops.new_zeros(len(crops), crops.shape[2], size[1], size[0])
+        width, height = size
+        picture = crops.new_zeros(len(crops), crops.shape[2], height, width)
         # The coarsest crop first: finer ones are laid over it.
         for scale in reversed(range(self.scales)):
-            corner = windows[:, scale, :2]
-            side = self.side * 2**scale
-            # Places in the crop from -1 to 1.
-            columns = 2 * (x - corner[:, :1]) / side - 1
-            rows = 2 * (y - corner[:, 1:]) / side - 1
-            columns_of_pixels = columns[:, None, :]
-            rows_of_pixels = rows[:, :, None]
-            places = torch.stack(torch.broadcast_tensors(columns_of_pixels, rows_of_pixels), -1)
+            places = self._places_in_crop(windows[:, scale, :2], scale, size)
             crop = crops[:, scale].to(places)
             shown = F.grid_sample(crop, places, "bilinear", "border", align_corners=False).to(crops)
             is_inside = (places.abs() <= 1).all(-1)[:, None]
             picture = torch.where(is_inside, shown, picture)
         return picture
+
+    def _places_in_crop(self, corner: Tensor, scale: int, size: tuple[int, int]) -> Tensor:
+        """Compute where the pixels of a picture lie in crops, from -1 to 1 inside them.
+
+        Args:
+            corner: `(F, 2)`, left upper corners of the crops in the picture.
+            scale: of the crops.
+            size: `(width, height)` of the picture.
+
+        Returns:
+            x and y, `(F, height, width, 2)`.
+        """
+        width, height = size
+        x = torch.arange(width, dtype=corner.dtype, device=corner.device) + 0.5
+        y = torch.arange(height, dtype=corner.dtype, device=corner.device) + 0.5
+        side = self.side * 2**scale
+        columns = 2 * (x - corner[:, :1]) / side - 1
+        rows = 2 * (y - corner[:, 1:]) / side - 1
+        return torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
 
     def boxes_to_canvas(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""

@@ -38,22 +38,17 @@ def plot_comparison(points: Sequence[ComparedPoint], measure: str = "AP50") -> F
         The figure.
     """
     figure, (axes,) = make_figure(1, 1, 5.2, 3.4, layout="constrained")
-    for number, way in enumerate(dict.fromkeys(point.way for point in points)):
-        of_way = [point for point in points if point.way == way and point.ap50 is not None]
-        seconds = [point.seconds for point in of_way]
-        heights = [point.ap50 or 0.0 for point in of_way]
+    ways = dict.fromkeys(point.way for point in points)
+    for number, way in enumerate(ways):
+        judged = [point for point in points if point.way == way and point.ap50 is not None]
+        seconds = [point.seconds for point in judged]
+        heights = [point.ap50 or 0.0 for point in judged]
         colour = COLOURS[number % len(COLOURS)]
         axes.plot(seconds, heights, marker=_MARKERS[number % len(_MARKERS)], color=colour, label=way)
-        for point, height in zip(of_way, heights, strict=True):
-            axes.annotate(
-                f"{point.passes:.3g}",
-                (point.seconds, height),
-                xytext=(0, 5),
-                textcoords="offset points",
-                ha="center",
-                color=colour,
-                fontsize=7,
-            )
+        for point, x, y in zip(judged, seconds, heights, strict=True):
+            label = f"{point.passes:.3g}"
+            above = (0, 5)
+            axes.annotate(label, (x, y), above, textcoords="offset points", ha="center", color=colour, fontsize=7)
     axes.set(xlabel="seconds a picture", ylabel=measure, xlim=(0, None), ylim=(0, 1.05))
     axes.legend(loc="lower right")
     return figure

@@ -125,32 +125,44 @@ def _carried_gist(gist: Gist, motion: Motion, lattice: Lattice) -> Gist | None:
     """
     rows, columns = gist.scores.shape[:2]
     first = np.array(gist.first)
-    pitch = np.array(lattice.pitch)
     is_overview = gist.level == 0
     squares = (first, np.array([columns, rows])) if is_overview else _moved_squares(gist, motion, lattice)
     if squares is None:
         return None
     new_first, counts = squares
     square = np.stack(np.meshgrid(*(np.arange(count) for count in counts)), -1)
+    pitch = np.array(lattice.pitch)
     centres = torch.from_numpy((new_first + (square + 0.5) * gist.scale) * pitch)
-    # Where the centres of the new squares were in the frame of the look.
+    # Where the centres of the new squares were in the frame of the look, in its squares.
     back = motion.inverse()
     origins = back.points(centres).numpy()
     place = np.floor((origins / pitch - first) / gist.scale).astype(np.intp)
     nearest = place.clip(0, (columns - 1, rows - 1))
-    column = nearest[..., 0]
-    row = nearest[..., 1]
-    scores = gist.scores[row, column]
-    size = gist.size[row, column]
-    found = gist.found[row, column]
-    if not is_overview:
-        # Beyond what the look showed it says nothing.
-        is_inside = torch.from_numpy((place == nearest).all(-1))
-        is_shown = is_inside & back.is_ahead(centres)
-        scores = scores * is_shown[..., None]
-        size = size * is_shown
-        found = found & is_shown[..., None]
-    return Gist(gist.level, (int(new_first[0]), int(new_first[1])), gist.scale, scores, size, found)
+    resampled = _resampled(gist, (int(new_first[0]), int(new_first[1])), nearest)
+    if is_overview:
+        return resampled
+    # Beyond what the look showed it says nothing.
+    is_inside = torch.from_numpy((place == nearest).all(-1))
+    is_shown = is_inside & back.is_ahead(centres)
+    return replace(
+        resampled,
+        scores=resampled.scores * is_shown[..., None],
+        size=resampled.size * is_shown,
+        found=resampled.found & is_shown[..., None],
+    )
+
+
+def _resampled(gist: Gist, first: tuple[int, int], square: NDArray[np.intp]) -> Gist:
+    """Make hints that begin at another cell, of which each has those of a square `(..., 2)`, column and row."""
+    column = square[..., 0]
+    row = square[..., 1]
+    return replace(
+        gist,
+        first=first,
+        scores=gist.scores[row, column],
+        size=gist.size[row, column],
+        found=gist.found[row, column],
+    )
 
 
 def _moved_squares(gist: Gist, motion: Motion, lattice: Lattice) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:

@@ -155,9 +155,14 @@ def picture_terms(
         map = _GAIN[quality] * map
     centre = model.centre_bias(size)
     if panorama:
-        # People turn round, so that no direction is the middle; how high they look stays.
-        centre = centre.logsumexp(1, keepdim=True).expand(cells) - math.log(cells[1])
+        centre = _same_in_all_directions(centre)
     return PictureTerms({"map": map[None], "centre bias": centre[None]}, unlikeness)
+
+
+def _same_in_all_directions(centre: Tensor) -> Tensor:
+    """Make the log bias `(rows, columns)` for people who turn round: no direction is the middle, but heights stay."""
+    columns = centre.shape[1]
+    return centre.logsumexp(1, keepdim=True).expand_as(centre) - math.log(columns)
 
 
 def _features(detector: Detector, image: Tensor, model: FixationDensity) -> FeatureMaps:
