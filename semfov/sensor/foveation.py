@@ -104,8 +104,8 @@ def _warn_of_shares(points: Tensor, size: Sequence[int]) -> None:
     if not points.is_floating_point() or points.device.type != "cpu" or not values_known(points):
         return
     if points.numel() and min(size) >= _SMALLEST_PICTURE and bool(((points > 0) & (points < 1)).all()):
-        told = f"all fixations lie in the first pixel, such as {points.reshape(-1, 2)[0].tolist()}"
-        warnings.warn(f"gaze: {told}; of shares of the picture take gaze * (width, height)", stacklevel=4)
+        doubt = f"all fixations lie in the first pixel, such as {points.reshape(-1, 2)[0].tolist()}"
+        warnings.warn(f"gaze: {doubt}; of shares of the picture take gaze * (width, height)", stacklevel=4)
 
 
 def _reconstruct(bands: Bands, fovea: Fovea, into: Tensor | None = None) -> Tensor:

@@ -1,5 +1,7 @@
 """The cheapest pairs of two sets, of which not every member needs a partner."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,13 +34,38 @@ def cheapest_pairs(costs: NDArray[np.float64]) -> NDArray[np.intp]:
     table = np.concatenate([possible, np.zeros((len(kept_rows), len(kept_rows)))], 1)
     column_of = _assigned(table)
     count = len(kept_columns)
-    made = column_of < count
-    made[made] = possible[np.flatnonzero(made), column_of[made]] < 0
-    return np.stack([kept_rows[made], kept_columns[column_of[made]]], -1)
+    # Rows that stay alone have one of the columns for that, or one at the same price.
+    is_paired = column_of < count
+    is_paired[is_paired] = possible[np.flatnonzero(is_paired), column_of[is_paired]] < 0
+    return np.stack([kept_rows[is_paired], kept_columns[column_of[is_paired]]], -1)
+
+
+class _Path(NamedTuple):
+    """The cheapest way to give a row a column: from column to column, each of whose rows takes the next one.
+
+    Attributes:
+        end: the column at its end, which no row has.
+        length: what it adds to the sum of costs.
+        distance: `(C,)`, the lengths of the paths to all columns that were compared; infinite for others.
+        before: `(C,)`, the row from which each of these is reached.
+        reached: `(C,)` boolean, the columns that are as near as the end, or nearer.
+    """
+
+    end: int
+    length: float
+    distance: NDArray[np.float64]
+    before: NDArray[np.intp]
+    reached: NDArray[np.bool_]
 
 
 def _assigned(costs: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Assign a column to each row at the lowest sum of costs; `(R, C)` with R <= C → `(R,)`."""
+    """Assign a column to each row at the lowest sum of costs; `(R, C)` with R <= C → `(R,)`.
+
+    One row after the other gets a column by the shortest path in the costs above the prices of rows and columns.
+
+    Invariant: in the rows so far, no cost is below the sum of the prices of its row and its column, and those of pairs
+    are equal to it. So no other pairs of these rows have a lower sum.
+    """
     rows, columns = costs.shape
     row_price = costs.min(1)
     column_price = np.zeros(columns)
@@ -49,32 +76,64 @@ def _assigned(costs: NDArray[np.float64]) -> NDArray[np.intp]:
     row_of[wanted] = first_rows
     column_of[first_rows] = wanted
     for start in np.flatnonzero(column_of < 0).tolist():
-        distance = np.full(columns, np.inf)
-        before = np.full(columns, -1)  # the row from which each column is reached
-        reached = np.zeros(columns, bool)
-        row = start
-        length = 0.0
-        while True:
-            through = length + costs[row] - row_price[row] - column_price
-            shorter = ~reached & (through < distance)
-            distance[shorter] = through[shorter]
-            before[shorter] = row
-            column = int(np.where(reached, np.inf, distance).argmin())
-            length = float(distance[column])
-            reached[column] = True
-            if row_of[column] < 0:
-                break
-            row = int(row_of[column])
-        # Prices of what was reached change, so that all pairs remain the cheapest ones.
-        partners = row_of[reached]
-        known = partners >= 0
-        row_price[start] += length
-        row_price[partners[known]] += length - distance[reached][known]
-        column_price[reached] -= length - distance[reached]
-        while True:
-            row = int(before[column])
-            row_of[column] = row
-            column, column_of[row] = int(column_of[row]), column
-            if row == start:
-                break
+        path = _shortest_path(start, costs, row_price, column_price, row_of)
+        # Prices of what was reached change by how much nearer it is than the end, so that the invariant holds.
+        change = path.length - path.distance[path.reached]
+        partners = row_of[path.reached]
+        are_paired = partners >= 0
+        row_price[start] += path.length
+        row_price[partners[are_paired]] += change[are_paired]
+        column_price[path.reached] -= change
+        _take(path, start, row_of, column_of)
     return column_of
+
+
+def _shortest_path(
+    start: int,
+    costs: NDArray[np.float64],
+    row_price: NDArray[np.float64],
+    column_price: NDArray[np.float64],
+    row_of: NDArray[np.intp],
+) -> _Path:
+    """Find the shortest path from a row to a column that no row has, by Dijkstra's algorithm.
+
+    Args:
+        start: the row.
+        costs: `(R, C)`.
+        row_price: `(R,)`.
+        column_price: `(C,)`.
+        row_of: `(C,)`, the row that has each column; -1 for none.
+
+    Returns:
+        The path.
+    """
+    columns = costs.shape[1]
+    distance = np.full(columns, np.inf)
+    before = np.full(columns, -1)
+    reached = np.zeros(columns, bool)
+    row = start
+    length = 0.0
+    while True:
+        through = length + costs[row] - row_price[row] - column_price
+        is_shorter = ~reached & (through < distance)
+        distance[is_shorter] = through[is_shorter]
+        before[is_shorter] = row
+        nearest = int(np.where(reached, np.inf, distance).argmin())
+        length = float(distance[nearest])
+        reached[nearest] = True
+        if row_of[nearest] < 0:
+            return _Path(nearest, length, distance, before, reached)
+        row = int(row_of[nearest])
+
+
+def _take(path: _Path, start: int, row_of: NDArray[np.intp], column_of: NDArray[np.intp]) -> None:
+    """Give each row of a path the next column, from the end of the path back to the row at its start."""
+    column = path.end
+    while True:
+        row = int(path.before[column])
+        row_of[column] = row
+        next_column = int(column_of[row])  # which this row gives to the one before
+        column_of[row] = column
+        if row == start:
+            return
+        column = next_column
