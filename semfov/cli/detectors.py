@@ -1,5 +1,6 @@
 """Subcommand detectors: lists the detectors that can be named, or the classes of one."""
 
+from collections.abc import Sequence
 from os import fspath
 from pathlib import Path
 
@@ -45,16 +46,20 @@ def _show_one(options: DetectorsOptions, path: Path) -> int:
     if written is not None:
         print(f"wrote {written}")
     if options.try_ is not None:
-        fitted = path.is_dir() or (GlimpseEvidence.shipped / f"{name}.safetensors").is_file()
-        make = ActivePerception.from_pretrained if fitted else ActivePerception.raw
+        is_fitted = path.is_dir() or (GlimpseEvidence.shipped / f"{name}.safetensors").is_file()
+        make = ActivePerception.from_pretrained if is_fitted else ActivePerception.raw
         try_detector(make(name, **loading), options.try_)
         return 0
-    print(f"{name} knows {len(classes)} classes:")
-    width = max(map(len, classes)) + 2
-    rows = -(-len(classes) // max(1, _WIDTH // width))
-    for row in range(rows):  # in order down each column
-        print("".join(class_name.ljust(width) for class_name in classes[row::rows]).rstrip())
+    print("\n".join([f"{name} knows {len(classes)} classes:", *_in_columns(classes)]))
     return 0
+
+
+def _in_columns(names: Sequence[str]) -> list[str]:
+    """Write names in columns, in order down each of them, in lines of at most `_WIDTH` characters."""
+    width = max(map(len, names)) + 2
+    columns = max(1, _WIDTH // width)
+    rows = -(-len(names) // columns)
+    return ["".join(name.ljust(width) for name in names[row::rows]).rstrip() for row in range(rows)]
 
 
 def show(options: DetectorsOptions) -> int:
