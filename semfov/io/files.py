@@ -308,13 +308,34 @@ def read_text(path: str | os.PathLike[str], otherwise: str | None = None, *, mos
     Raises:
         DataError: it cannot be read, is larger, or is no text.
     """
+    text, _ = read_encoded(path, otherwise, most=most)
+    return text
+
+
+def read_encoded(
+    path: str | os.PathLike[str], otherwise: str | None = None, *, most: int | None = None
+) -> tuple[str, str]:
+    """Read a text as `read_text` does, and name its encoding.
+
+    Args:
+        path: the file.
+        otherwise: encoding of a file that is in none of those of Unicode; None refuses it.
+        most: largest number of bytes; None for any.
+
+    Returns:
+        The text, and the encoding in which it was read, such as `utf-8`.
+
+    Raises:
+        DataError: it cannot be read, is larger, or is no text.
+    """
     content = read_bytes(path, most=most)
+    encoding = _encoding(content)
     try:
-        return content.decode(_encoding(content))
+        return content.decode(encoding), encoding
     except UnicodeDecodeError as error:
         if otherwise is None:
             raise DataError(f"{path}: expected a file of text, got other bytes ({error}); save it as UTF-8") from None
-        return content.decode(otherwise, "replace")
+        return content.decode(otherwise, "replace"), otherwise
 
 
 JsonObject = dict[str, Any]

@@ -12,7 +12,8 @@ from typing import NamedTuple, Protocol
 
 from semfov.data.sources import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, check, check_data
-from semfov.io.files import read_text, reading
+from semfov.human.fixations.encodings import read_recording
+from semfov.io.files import reading
 
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
 
@@ -97,12 +98,14 @@ class Table(NamedTuple):
         columns: their names.
         rows: of fields by these names.
         repeated: names of several columns, of which the rows have the last one.
+        encoding: of the file.
     """
 
     name: str
     columns: list[str]
     rows: list[Row]
     repeated: frozenset[str] = frozenset()
+    encoding: str = "utf-8"
 
     def check_different(self, columns: Iterable[str | None]) -> None:
         """Raise `DataError` for columns to be read whose names others have, too."""
@@ -163,7 +166,7 @@ def _table_of_file(path: Path, name: str) -> Table:
         The table.
     """
     _check_text_file(path)
-    text = read_text(path)
+    text, encoding = read_recording(path)
     preamble = _PREAMBLE.match(text)
     if preamble is not None:
         text = text[preamble.end() :]
@@ -183,7 +186,7 @@ def _table_of_file(path: Path, name: str) -> Table:
         texts = [_field(field, separator) for field in line]
         texts += [""] * (len(columns) - len(line))  # a line may end early
         rows.append(Row(name, place, dict(zip(columns, texts, strict=True))))
-    return Table(name, columns, rows, _repeated(columns))
+    return Table(name, columns, rows, _repeated(columns), encoding)
 
 
 def _field(text: str, separator: str) -> str:

@@ -11,6 +11,7 @@ from typing import Literal
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, check, check_data
 from semfov.human.fixations.columns import LOST, DataFrame, Row, Table, table_of
+from semfov.human.fixations.encodings import warn_of_letters
 from semfov.human.fixations.programs import LENGTHS, PROGRAMS, TIMES, Column, Origin, Program, Units, program_of
 from semfov.human.fixations.table import Coordinates, FrameError, Size, named_columns, read_table, records_of, scaled
 from semfov.human.fixations.unfolding import unfolded
@@ -109,7 +110,8 @@ def read_export(
         expected = f"the size of the frame, which {program.name} does not give"
         raise FrameError(f"{table.name}: expected {expected}; give size=")
     coordinates = Coordinates(units or layout.units, origin or program.origin)
-    return records_of(table.name, rows, size, coordinates)
+    records = records_of(table.name, rows, size, coordinates)
+    return warn_of_letters(table.name, table.encoding, records)
 
 
 @dataclass(frozen=True)

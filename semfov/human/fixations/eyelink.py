@@ -13,8 +13,9 @@ import numpy as np
 
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, check, check_data
+from semfov.human.fixations.encodings import WINDOWS, warn_of_letters
 from semfov.human.fixations.suspicions import warn_of_frames
-from semfov.io.files import read_text
+from semfov.io.files import read_encoded
 
 _MESSAGE = re.compile(r"^MSG\s+(\d+(?:\.\d+)?)\s+(?:(-?\d+)\s+(?=!V\s|TRIAL))?(.*)$")
 """The time of a message, the milliseconds by which it is late, and its text."""
@@ -123,7 +124,8 @@ def read_eyelink(
     """
     path = Path(path)
     check(eye in (None, "left", "right"), "eye", "'left', 'right' or None", repr(eye))
-    lines = read_text(path, "cp1252").splitlines()  # of Windows, where it is not UTF-8
+    text, encoding = read_encoded(path, WINDOWS)
+    lines = text.splitlines()
     trials, fixations = _events(path, lines)
     views = [view for trial in trials for view in trial.viewed()]
     _share_out(fixations, views)
@@ -145,7 +147,7 @@ def read_eyelink(
         remarks.append(f"{of_other_eye} of {len(viewed)} pictures have no fixation of the {eye} eye")
     if remarks:
         warnings.warn(f"{path}: {'; '.join(remarks)}", stacklevel=2)
-    return warn_of_frames(path, records)
+    return warn_of_letters(path, encoding, warn_of_frames(path, records))
 
 
 def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _Place:

@@ -10,6 +10,7 @@ from typing import Any
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, InputError, check, check_options
 from semfov.human.fixations.columns import DataFrame
+from semfov.human.fixations.encodings import WINDOWS
 from semfov.human.fixations.exports import table_reader
 from semfov.human.fixations.eyelink import read_eyelink
 from semfov.human.fixations.formats import read_cocosearch, read_osie, read_ruarte
@@ -117,7 +118,7 @@ def reader_of(source: str | PathLike[str] | DataFrame, columns: Mapping[str, str
 
 def _is_eyelink(source: str | PathLike[str]) -> bool:
     """Tell whether a text is one of EyeLink by its beginning."""
-    return read_text(source, "cp1252").lstrip().startswith(("** CONVERTED FROM", "MSG\t"))
+    return read_text(source, WINDOWS).lstrip().startswith(("** CONVERTED FROM", "MSG\t"))
 
 
 def frame_of(text: str) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, InputError, check, check_data, lookup
 from semfov.human.fixations.columns import LOST, DataFrame, Row, Table, table_of
+from semfov.human.fixations.encodings import warn_of_letters
 from semfov.human.fixations.programs import LENGTHS, Column, Origin, Units
 from semfov.human.fixations.suspicions import warn_of_frames
 from semfov.io.files import write_text
@@ -106,7 +107,8 @@ def read_table(
                 fields[field] = ""
         fields["duration"] = scaled(fields["duration"], milliseconds)
         rows.append(row._replace(fields=fields))
-    return records_of(table.name, _with_place(table.name, rows), size, Coordinates(units, origin))
+    records = records_of(table.name, _with_place(table.name, rows), size, Coordinates(units, origin))
+    return warn_of_letters(table.name, table.encoding, records)
 
 
 def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:

@@ -227,9 +227,13 @@ def test_other_arguments_are_refused(tmp_path):
 
 def test_names_of_pictures_may_be_in_the_encoding_of_windows(tmp_path):
     text = (HEAD + TRIALS).replace("a b.jpg", "übung.jpg")
-    for encoding in ("utf-8", "utf-16", "cp1252"):
-        (tmp_path / "ann.asc").write_bytes(text.encode(encoding))
-        assert "übung.jpg" in {each.picture for each in read_eyelink(tmp_path / "ann.asc")}
+    path = tmp_path / "ann.asc"
+    for encoding in ("utf-8", "utf-16"):
+        path.write_bytes(text.encode(encoding))
+        assert "übung.jpg" in {record.picture for record in read_eyelink(path)}
+    path.write_bytes(text.encode("cp1252"))
+    with pytest.warns(UserWarning, match=r"is not UTF-8, .* such as 'übung\.jpg'"):
+        assert "übung.jpg" in {record.picture for record in read_eyelink(path)}
 
 
 LOADS = """MSG\t1000 DISPLAY_COORDS 0 0 1023 767

@@ -230,12 +230,29 @@ def test_what_spreadsheets_write_before_a_table_and_capitals_are_understood(tmp_
         (f"{HEAD},x\n{ROWS}", "several named x"),
         (f"{HEAD}\n{ROWS}".replace("40", "1e9"), "line 2, x: expected a number up to 1e"),
         (f"{HEAD}\n{ROWS}".replace("a.jpg", ""), "line 2, picture: expected the name of a picture"),
-        (f"{HEAD}\n{ROWS}".replace("a.jpg", "ä.jpg"), "save it as UTF-8"),
+        (f"{HEAD}\n{ROWS}".replace("a.jpg", "\x81.jpg"), "expected a file of text, got other bytes; save it as UTF-8"),
+        (f"{HEAD}\n{ROWS}".replace("a.jpg", "ä\0.jpg"), "expected a file of text, got other bytes; save it as UTF-8"),
     ],
 )
 def test_tables_that_say_too_much_or_too_little_are_refused(tmp_path, text, said):
     (tmp_path / "a.csv").write_text(text, encoding="latin-1")
     unusable(said, read_table, tmp_path / "a.csv")
+
+
+def test_names_in_the_encoding_of_windows_are_read_and_said(tmp_path):
+    path = tmp_path / "a.csv"
+    table = f"{HEAD.replace('duration', 'duration [µs]')}\n{ROWS}"
+    path.write_bytes(table.replace("a.jpg", "café 1.jpg").encode("cp1252"))
+    said = r"a\.csv: is not UTF-8, so names are read as .* \(cp1252\), such as 'café 1\.jpg'; .* save the file as UTF-8"
+    with pytest.warns(UserWarning, match=said):
+        records = read_fixations(path)
+    assert {record.picture for record in records} == {"café 1.jpg"}
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        path.write_bytes(table.replace("a.jpg", "café 1.jpg").encode(encoding))
+        assert [record.picture for record in read_fixations(path)] == [record.picture for record in records]
+    # A sign of a unit is no name: the letters of this table are certain.
+    path.write_bytes(table.encode("cp1252"))
+    assert {record.picture for record in read_fixations(path)} == {"a.jpg"}
 
 
 @pytest.mark.parametrize("kind", ["xlsx", "parquet", "mat", "csv.gz", "edf"])
