@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 from semfov.data.sources import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, check, check_data
 from semfov.human.fixations.encodings import read_recording
+from semfov.human.fixations.smi import Events, has_events
 from semfov.io.files import reading
 
 _MISSING = ("None", "nan", "<NA>", "NaT")  # of pandas
@@ -167,6 +168,8 @@ def _table_of_file(path: Path, name: str) -> Table:
     """
     _check_text_file(path)
     text, encoding = read_recording(path)
+    if has_events(text):
+        return _table_of_events(Events.of(text, name), name, encoding)
     preamble = _PREAMBLE.match(text)
     if preamble is not None:
         text = text[preamble.end() :]
@@ -187,6 +190,15 @@ def _table_of_file(path: Path, name: str) -> Table:
         texts += [""] * (len(columns) - len(line))  # a line may end early
         rows.append(Row(name, place, dict(zip(columns, texts, strict=True))))
     return Table(name, columns, rows, _repeated(columns), encoding)
+
+
+def _table_of_events(events: Events, name: str, encoding: str) -> Table:
+    """Make a table of the fixations among the events of an eye tracker of SMI."""
+    rows = []
+    for place, line in events.fixations:
+        texts = [_field(field, events.separator) for field in line]
+        rows.append(Row(name, place, dict(zip(events.columns, texts, strict=True))))
+    return Table(name, events.columns, rows, _repeated(events.columns), encoding)
 
 
 def _field(text: str, separator: str) -> str:

@@ -47,12 +47,14 @@ def read_export(
 
     The names of the columns tell the program: Tobii Pro Lab (of glasses, the fixations that are mapped to snapshots, if
     there are some) and Tobii Studio; Pupil Cloud (also its reference images and surfaces) and Pupil Player (also
-    surfaces); PsychoPy (events `FixationEndEvent` of ioHub); Gazepoint; SMI BeGaze (event statistics); PyGaze (the
-    lists `Efix` of PyGazeAnalyser, under the names `starttime`, `endtime`, `duration`, `endx` and `endy`); pymovements
-    (events with a `location`); iMotions; and EyeLink Data Viewer (fixation reports). Units are those in the names of
-    the columns (`[MCS norm]`, `[μs]`), else those of the program, as origins are. Lines that are
-    no fixation, are not on the picture, or have no place are left out, and lines that repeat the number of a fixation
-    are one. Fixations without a picture are left out with a warning where others have one, as between two pictures.
+    surfaces); PsychoPy (events `FixationEndEvent` of ioHub); Gazepoint; SMI BeGaze (event statistics) and SMI's IDF
+    Event Detector; PyGaze (the lists `Efix` of PyGazeAnalyser, under the names `starttime`, `endtime`, `duration`,
+    `endx` and `endy`); pymovements (events with a `location`); iMotions; and EyeLink Data Viewer (fixation reports).
+    Units are those in the names of the columns (`[MCS norm]`, `[μs]`), else those of the program, as origins are. Lines
+    that are no fixation, are not on the picture, or have no place are left out, and lines that repeat the number of a
+    fixation are one. Fixations without a picture are left out with a warning where others have one, as between two
+    pictures. In texts of the IDF Event Detector, a message with the name of a picture shows it until the next such
+    message, or until the trial is over.
 
     Args:
         source: the file, or a `pandas.DataFrame`.
@@ -356,7 +358,7 @@ def _is_known(table: Table) -> bool:
     return program_of([Column.of(name) for name in table.columns]) is not None
 
 
-_GAZE = re.compile(r"gaze|pog|pred|raw[xy]|pupil")  # keys of samples
+_GAZE = re.compile(r"gaze|pog|por[xy]|pred|raw[xy]|pupil")  # keys of samples
 _PLACE = re.compile(r"fix.*[xy]$")  # keys of places of fixations
 
 

@@ -181,6 +181,15 @@ _CLOUD = Program(
     needs=("fixationid",),
 )
 _PLAYER = Program("Pupil Player", point=("normposx", "normposy"), units="fractions", origin="bottom left")
+_BEGAZE = Program(
+    "SMI BeGaze",
+    ("fixationpositionx", "fixationpositiony"),
+    duration=("eventduration", "fixationduration"),
+    picture=("stimulus", "stimulusname"),
+    subject=("participant", "participantname", "subject"),
+    trial=("trial", "trialname"),
+    keep=("category", ("fixation", "visual intake")),
+)
 
 # From the particular to the general: a table of pictures or surfaces has the columns of a plain one, too.
 PROGRAMS = (
@@ -234,15 +243,18 @@ PROGRAMS = (
         number=("fpogid",),
         keep=("fpogv", _TRUE),
     ),
+    _BEGAZE,
+    _BEGAZE._replace(point=("visualintakepositionx", "visualintakepositiony")),  # of glasses
+    _BEGAZE._replace(point=("positionx", "positiony"), needs=("fixationstart", "fixationduration")),  # up to version 3
     Program(
-        "SMI BeGaze",
-        ("fixationpositionx", "fixationpositiony"),
-        duration=("eventduration", "fixationduration"),
-        picture=("stimulus", "stimulusname"),
-        subject=("participant", "participantname", "subject"),
-        trial=("trial", "trialname"),
-        keep=("category", ("fixation", "visual intake")),
-        needs=("category",),
+        "SMI IDF Event Detector",
+        ("locationx", "locationy"),
+        time="us",
+        picture=("stimulus",),
+        subject=("participant",),
+        trial=("trial",),
+        size=("calibrationareawidth", "calibrationareaheight"),
+        needs=("eventtype",),
     ),
     Program("PyGaze", ("endx", "endy"), needs=("starttime", "endtime"), lacks=("startx",)),
     Program(

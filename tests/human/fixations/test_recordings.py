@@ -105,6 +105,29 @@ TABLES = {
         + "Trial001\tb.png\tp01\tSaccade\tRight\t11\t300\t320\t20\t-\t-\t-\n",
         {"size": (1680, 1050)},
     ),
+    "SMI BeGaze, glasses": (
+        lines(
+            f"{SMI}\tEvent Duration [ms]\tVisual Intake Position X [px]\tVisual Intake Position Y [px]",
+            "Trial001\t{picture}\tp01\tVisual Intake\tRight\t{n}\t{time}\t{x}.5\t{y}.5",
+        )
+        + "Trial001\tb.png\tp01\tBlink\tRight\t11\t20\t-\t-\n",
+        {"size": (1280, 960)},
+    ),
+    "SMI BeGaze, fixations alone": (
+        lines(
+            "Stimulus\tParticipant\tIndex\tEvent Duration [ms]\tFixation Position X [px]\tFixation Position Y [px]",
+            "{picture}\tp01\t{n}\t{time}\t{x}.5\t{y}.5",
+        ),
+        {"size": (1680, 1050)},
+    ),
+    "SMI BeGaze, fixation details of an older version": (
+        lines(
+            "Trial,Subject,Color,Name,Stimulus,Start Time [ms],End Time [ms],Fixation Start [ms],Fixation Duration [ms]"
+            ",Fixation End [ms],Position X,Position Y,Average Pupil Size [px] X,Eye L/R,Number",
+            "Trial001,p01,Coral,Ann,{picture},0,900,1.5,{time},300.5,{x}.5,{y}.5,12.1,Left,{n}",
+        ),
+        {"size": (1680, 1050)},
+    ),
     "Neon": (
         lines(
             f"{CLOUD},fixation x [px],fixation y [px],azimuth [deg],elevation [deg]",
