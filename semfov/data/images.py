@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.camera_raw import check_no_raw
 from semfov.data.deep import deep_values, is_deep, jpeg2000_bits
 from semfov.data.signatures import kind_of
 from semfov.data.tiff_tags import HEIGHT, WHITE_IS_ZERO, WIDTH, TiffTags
@@ -237,10 +238,11 @@ def open_pillow(path: str | PathLike[str]) -> Iterator["ImageFile"]:
     """Open a file in one of `_FORMATS` as a Pillow image that is not decoded yet.
 
     Raises:
-        DataError: it is no regular file, or a TIFF that Pillow would read wrongly or at a price.
+        DataError: it is no regular file, a raw one of a camera, or a TIFF that Pillow would read wrongly or at a price.
     """
     name = f"image {Path(path)}"
     check_regular(path, name)
+    check_no_raw(path, name)
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
     with Path(path).open("rb") as file, _open_in_formats(file) as image:
         if image.format == "TIFF":

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.camera_raw import check_no_raw
 from semfov.data.description import Description, as_rgb, named_colours
 from semfov.data.gdal import Dataset, Raster, WindowOptions, raster_settings
 from semfov.data.images import PhotographPicture, open_pillow, opening, quiet_decoders
@@ -209,6 +210,7 @@ def _open_raster(path: str | PathLike[str], white: White | None, bands: ChosenBa
 
 def _open_tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
     """Open a TIFF by the first reader that has all of it: tifffile, GDAL or Pillow."""
+    check_no_raw(path, f"image {Path(path)}")
     if _is_converted(path):
         expected = f"None for {path}, which is turned, or of other colours than grey and RGB"
         check(bands is None, "bands", expected, f"{bands}; convert it")

@@ -202,6 +202,35 @@ def test_a_thumbnail_before_the_picture_is_not_the_picture(tmp_path):
         assert np.array_equal(fovea(tmp_path / name), want)
 
 
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+@pytest.mark.parametrize("suffix", ["tif", "dng", "NEF", "jpg"])
+@pytest.mark.parametrize("photometric", [32803, 34892])
+def test_raw_files_of_cameras_are_refused_and_no_thumbnail_is_shown(tmp_path, suffix, photometric, byteorder):
+    """The raw page may be below a thumbnail, as most cameras write it, or the first one, as telephones do."""
+    raw = np.zeros((60, 80) if photometric == 32803 else (60, 80, 3), np.uint16)
+    pattern = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\0\1\1\2", True)]
+    below = tmp_path / f"below.{suffix}"
+    first = tmp_path / f"first.{suffix}"
+    with tifffile.TiffWriter(below, byteorder=byteorder) as file:
+        file.write(pixels(6, 8), photometric="rgb", subfiletype=1, subifds=1)
+        file.write(raw, photometric=photometric, subfiletype=0, extratags=pattern)
+    tifffile.imwrite(first, raw, photometric=photometric, extratags=pattern, byteorder=byteorder)
+    for path in (below, first):
+        for door in (read_image, open_large, picture_size):
+            unusable(r"expected a picture, got the raw values of a camera .*; convert it to JPEG or TIFF", door, path)
+
+
+def test_pages_below_a_picture_that_are_no_raw_ones_change_nothing(tmp_path):
+    """Microscopes write reduced copies there."""
+    array = pixels(60, 80)
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(array, photometric="rgb", subifds=1)
+        file.write(array[::2, ::2], photometric="rgb", subfiletype=1)
+    want = np.moveaxis(array, -1, 0)
+    assert np.array_equal(whole(open_large(tmp_path / "a.tif")), want)
+    assert np.array_equal(fovea(tmp_path / "a.tif"), want)
+
+
 def test_decoders_say_nothing_beside_our_words_and_what_nobody_would_turn_is_refused(tmp_path, caplog):
     tifffile.imwrite(tmp_path / "a.tif", pixels(6, 8)[..., 0], extratags=[(42113, "s", 0, "none", True)])
     open_large(tmp_path / "a.tif")

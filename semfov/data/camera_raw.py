@@ -1,0 +1,49 @@
+"""Raw files of cameras: TIFFs in which decoders find a thumbnail at most, as the picture itself is raw values."""
+
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+from typing import BinaryIO
+
+from semfov.data.tiff_tags import PHOTOMETRIC, SUB_PAGES, TiffTags
+from semfov.errors import check_data
+
+_RAW = (32803, 34892)  # photometric: values behind a mosaic of colours, and these with the mosaic filled in
+_HEADS = (b"II*\0", b"MM\0*")
+_MOST_PAGES = 8  # below the first one that are looked at; cameras write two or three
+
+
+def check_no_raw(path: str | PathLike[str], name: str) -> None:
+    """Raise `DataError` for a raw file of a camera, whose thumbnail would be taken for the picture.
+
+    Args:
+        path: the file, of any kind.
+        name: of the picture, for the message.
+    """
+    photometrics: list[int] = []
+    # What is no TIFF, or is damaged, is refused where it is decoded.
+    with suppress(Exception), Path(path).open("rb") as file:
+        photometrics = _photometrics_of(file)
+    is_raw = any(photometric in _RAW for photometric in photometrics)
+    remedy = "convert it to JPEG or TIFF by the camera's program or a raw converter"
+    check_data(not is_raw, name, "a picture", f"the raw values of a camera (such as DNG or NEF); {remedy}")
+
+
+def _photometrics_of(file: BinaryIO) -> list[int]:
+    """List what the numbers of the first page of a TIFF, and of the pages below it, stand for; none of other files."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    head = file.read(8)
+    if not head.startswith(_HEADS):
+        return []
+    first = ImageFileDirectory_v2(head)
+    file.seek(first.next)
+    first.load(file)
+    photometrics = [TiffTags(first).photometric] if PHOTOMETRIC in first else []
+    places = first.get(SUB_PAGES, ())
+    for place in [places] if isinstance(places, int) else places[:_MOST_PAGES]:
+        below = ImageFileDirectory_v2(head)
+        file.seek(place)
+        below.load(file)
+        photometrics.append(TiffTags(below).photometric)
+    return photometrics
