@@ -15,10 +15,9 @@ from semfov.data.large import picture_size
 from semfov.data.sources import PHOTOGRAPHS, picture_files
 from semfov.errors import DataError, SemfovError, check, printable
 from semfov.human.density_check import suspicions_by_content
-from semfov.human.fixations.exports import PictureError
 from semfov.human.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
 from semfov.human.fixations.suspicions import other_frame_of, suspicions
-from semfov.human.fixations.table import FrameError
+from semfov.human.fixations.table import FrameError, PictureError, read_table
 
 _FRAMES_NAMED = 3  # largest number of sizes of frames that are named
 
@@ -196,13 +195,14 @@ def _records(
 ) -> list[Fixations]:
     """Read the records of a file; where it has no frames, they are the pictures."""
     unnamed = {name: value for name, value in arguments.items() if name != "picture"}
-    if "picture" in arguments and "picture" not in signature(reader).parameters:
-        # The file names its pictures.
-        check(sizes is not None, "picture", "a picture or folder that exists", arguments["picture"])
-        return _records(reader, path, unnamed, sizes)
-    if "picture" in arguments and sizes is not None:  # a photograph, which may be one of those that the table names
+    names_pictures = reader is read_table or "picture" not in signature(reader).parameters
+    if "picture" in arguments and (names_pictures or sizes is not None):
+        # A photograph may be one of those that the file names; any other name is for a file that names none.
         with suppress(PictureError):
-            return _records(reader, path, unnamed, sizes)
+            records = _records(reader, path, unnamed, sizes)
+            is_used = sizes is not None or not names_pictures
+            check(is_used, "picture", "a picture or folder that exists", arguments["picture"])
+            return records
     try:
         return read_by(reader, path, arguments)
     except FrameError as error:

@@ -13,7 +13,17 @@ from semfov.errors import DataError, check, check_data
 from semfov.human.fixations.columns import LOST, DataFrame, Row, Table, table_of
 from semfov.human.fixations.encodings import warn_of_letters
 from semfov.human.fixations.programs import LENGTHS, PROGRAMS, TIMES, Column, Origin, Program, Units, program_of
-from semfov.human.fixations.table import Coordinates, FrameError, Size, named_columns, read_table, records_of, scaled
+from semfov.human.fixations.table import (
+    Coordinates,
+    FrameError,
+    PictureError,
+    Size,
+    name_pictures,
+    named_columns,
+    read_table,
+    records_of,
+    scaled,
+)
 from semfov.human.fixations.unfolding import unfolded
 
 _SCANPATH = ("picture", "subject", "target", "trial")
@@ -26,10 +36,6 @@ _EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right",
 """Sides of eyes by the first of these words in a field; the numbers are in psychopy/iohub/constants.py."""
 
 _LASTING = re.compile(r"^duration$|(fix|event|gaze|movement).*duration")  # keys of what may be durations of fixations
-
-
-class PictureError(DataError):
-    """A table does not name the picture, which `picture` may give."""
 
 
 def read_export(
@@ -49,12 +55,12 @@ def read_export(
     there are some) and Tobii Studio; Pupil Cloud (also its reference images and surfaces) and Pupil Player (also
     surfaces); PsychoPy (events `FixationEndEvent` of ioHub); Gazepoint; SMI BeGaze (event statistics) and SMI's IDF
     Event Detector; PyGaze (the lists `Efix` of PyGazeAnalyser, under the names `starttime`, `endtime`, `duration`,
-    `endx` and `endy`); pymovements (events with a `location`); iMotions; and EyeLink Data Viewer (fixation reports).
-    Units are those in the names of the columns (`[MCS norm]`, `[μs]`), else those of the program, as origins are. Lines
-    that are no fixation, are not on the picture, or have no place are left out, and lines that repeat the number of a
-    fixation are one. Fixations without a picture are left out with a warning where others have one, as between two
-    pictures. In texts of the IDF Event Detector, a message with the name of a picture shows it until the next such
-    message, or until the trial is over.
+    `endx` and `endy`); pymovements (events with a `location`); REMoDNaV; I2MC; iMotions; and EyeLink Data Viewer
+    (fixation reports). Units are those in the names of the columns (`[MCS norm]`, `[μs]`), else those of the program,
+    as origins are. Lines that are no fixation, are not on the picture, or have no place are left out, and lines that
+    repeat the number of a fixation are one. Fixations without a picture are left out with a warning where others have
+    one, as between two pictures. In texts of the IDF Event Detector, a message with the name of a picture shows it
+    until the next such message, or until the trial is over.
 
     Args:
         source: the file, or a `pandas.DataFrame`.
@@ -102,7 +108,8 @@ def read_export(
 
     rows = layout.fixations_of(table)
     _name_people(rows, subject, table)
-    _name_pictures(rows, picture, table.name)
+    if picture is not None:
+        name_pictures(rows, picture, table.name)
     check_data(bool(rows), table.name, f"fixations of {program.name}", "none that has a place on the picture")
     rows = _of_one_eye(_viewings(rows), eye)
     check_data(bool(rows), table.name, f"fixations of the {eye} eye", "those of the other one")
@@ -265,18 +272,6 @@ def _name_people(rows: Sequence[Row], subject: str | None, table: Table) -> None
         row.fields["subject"] = subject if subject is not None else row.fields["subject"] or file
 
 
-def _name_pictures(rows: Sequence[Row], picture: str | None, table: str) -> None:
-    """Write the name of the picture that a user gives into rows of one picture."""
-    if picture is None:
-        return
-    names = sorted({row.fields["picture"] for row in rows if row.fields["picture"]})
-    got = f"{len(names)} of them, such as {', '.join(names[:3])}; leave picture= out"
-    check_data(len(names) <= 1, table, "at most one name of a picture beside picture=", got)
-    for row in rows:
-        # Where the table has a name, rows without it are fixations between two pictures.
-        row.fields["picture"] = picture if row.fields["picture"] or not names else ""
-
-
 def _viewings(rows: Sequence[Row]) -> list[Row]:
     """Write the number of their viewing into `trial` of rows, and keep one row for each number of a fixation."""
     fixations: dict[object, Row] = {}
@@ -343,14 +338,17 @@ def table_reader(
         `read_table` or `read_export`.
     """
     table = table_of(source)
-    is_ours = {"picture", "subject", "x", "y"} <= {Column.of(name).key for name in table.columns}
+    keys = {Column.of(name).key for name in table.columns}
+    is_ours = {"picture", "subject", "x", "y"} <= keys
     names_points = not {*(columns or ())} <= {*_NAMED}
     if is_ours or names_points:
         return read_table
     # Unfolding looks at all rows, which most tables do not need.
-    if not (_is_known(table) or _is_known(unfolded(table))):
-        raise DataError(f"{table.name}: {_of_no_program(table)}")
-    return read_export
+    if _is_known(table) or _is_known(unfolded(table)):
+        return read_export
+    if {"x", "y"} <= keys:  # of one picture, or of one person
+        return read_table
+    raise DataError(f"{table.name}: {_of_no_program(table)}")
 
 
 def _is_known(table: Table) -> bool:

@@ -256,6 +256,21 @@ PROGRAMS = (
         size=("calibrationareawidth", "calibrationareaheight"),
         needs=("eventtype",),
     ),
+    Program(
+        "REMoDNaV",
+        ("startx", "starty"),
+        time="s",
+        keep=("label", ("fixa",)),
+        needs=("onset", "label", "amp"),
+    ),
+    Program(
+        "I2MC",
+        ("xpos", "ypos"),
+        duration=("fixdur",),
+        subject=("participant",),
+        trial=("trial",),
+        needs=("fixstart", "fixdur"),
+    ),
     Program("PyGaze", ("endx", "endy"), needs=("starttime", "endtime"), lacks=("startx",)),
     Program(
         "pymovements",

@@ -37,11 +37,17 @@ class FrameError(DataError):
     """A table does not tell the frame of its points, which `size` may give."""
 
 
+class PictureError(DataError):
+    """A table does not name the picture, which `picture` may give."""
+
+
 def read_table(
     source: str | PathLike[str] | DataFrame,
     *,
     columns: Mapping[str, str] | None = None,
     size: Size | None = None,
+    picture: str | None = None,
+    subject: str | None = None,
     units: Units | None = None,
     origin: Origin = "top left",
 ) -> list[Fixations]:
@@ -65,6 +71,8 @@ def read_table(
         source: the file, or a `pandas.DataFrame`.
         columns: names of the columns in the source by the names above, such as `{"x": "FPOGX"}`.
         size: `(width, height)` of the frame, or of each picture by its name, for a table without these columns.
+        picture: name of the picture, for a table without this column, or with one name in it.
+        subject: name of the person, for a table of one.
         units: `pixels`, or `fractions` of the sides of the frame; None takes the unit in the names of the columns, else
             pixels.
         origin: `top left`, `bottom left`, `centre`, or `centre, y up`, as in PsychoPy.
@@ -75,6 +83,7 @@ def read_table(
     Raises:
         InputError: an argument is unknown.
         DataError: the content does not have this form; the message names the file, the line and the column.
+        PictureError: a `DataError`, the table names no picture and `picture` is not given.
         FrameError: a `DataError`, the table has no frame and `size` is not given.
 
     >>> import tempfile
@@ -90,8 +99,11 @@ def read_table(
     lookup(origin, get_args(Origin), "origin")
     user_columns = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
     table = table_of(source)
-    needed = _COLUMNS if size is not None else (*_COLUMNS, *_SIZE)
     names = _column_names(table, user_columns)
+    given = {name for name, value in (("picture", picture), ("subject", subject)) if value is not None}
+    needed = [name for name in _COLUMNS if name not in given]
+    if size is None:
+        needed += _SIZE
     _check_columns(table, [names[field] for field in needed], needed)
     table.check_different(names.values())
     if size is None:
@@ -101,13 +113,19 @@ def read_table(
     milliseconds = _stated_milliseconds(table.name, names["duration"])
     rows = []
     for row in table.rows:
-        fields = {field: row.fields.get(names[field], "") for field in (*needed, *_MORE)}
+        fields = {field: row.fields.get(names[field], "") for field in (*_COLUMNS, *_SIZE, *_MORE)}
         for field in ("duration", *_EDGES):
             if fields[field].lower() in LOST:
                 fields[field] = ""
         fields["duration"] = scaled(fields["duration"], milliseconds)
         rows.append(row._replace(fields=fields))
-    records = records_of(table.name, _with_place(table.name, rows), size, Coordinates(units, origin))
+    rows = _with_place(table.name, rows)
+    if picture is not None:
+        name_pictures(rows, picture, table.name)
+    if subject is not None:
+        for row in rows:
+            row.fields["subject"] = subject
+    records = records_of(table.name, rows, size, Coordinates(units, origin))
     return warn_of_letters(table.name, table.encoding, records)
 
 
@@ -194,17 +212,35 @@ def _with_place(table: str, rows: Sequence[Row]) -> list[Row]:
 
 def _check_columns(table: Table, columns: Sequence[str], needed: Sequence[str]) -> None:
     """Raise `DataError` for a table that lacks some of the needed columns; `columns` has its names for them."""
-    missing = [column for column in columns if column not in table.columns]
+    missing = [name for name, column in zip(needed, columns, strict=True) if column not in table.columns]
     if not missing:
         return
     among = ", ".join(map(repr, table.columns))[:300]
     text = (
-        f"{table.name}: expected the columns {', '.join(needed)}, got none named {', '.join(missing)} among "
-        f"{among}; name them by columns={{…}}"
+        f"{table.name}: expected the columns {', '.join(needed)}, got none named "
+        f"{', '.join(column for column in columns if column not in table.columns)} among {among}; "
+        "name them by columns={…}"
     )
-    if {*missing} & {*_SIZE}:
-        raise FrameError(f"{text} or give size=")
-    raise DataError(text)
+    has_frames = not {*missing} & {*_SIZE}
+    # A table of one picture, of one person, or of frames of one size need not have these columns.
+    given = [f"{name}=" for name in ("picture", "subject") if name in missing]
+    if not has_frames:
+        given.append("size=")
+    if given:
+        text += f" or give {', '.join(given)}"
+    if "picture" in missing:
+        raise PictureError(text)
+    raise DataError(text) if has_frames else FrameError(text)
+
+
+def name_pictures(rows: Sequence[Row], picture: str, table: str) -> None:
+    """Write the name of the picture that a user gives into rows of one picture; raises `DataError` for several."""
+    names = sorted({row.fields["picture"] for row in rows if row.fields["picture"]})
+    got = f"{len(names)} of them, such as {', '.join(names[:3])}; leave picture= out"
+    check_data(len(names) <= 1, table, "at most one name of a picture beside picture=", got)
+    for row in rows:
+        # Where the table has a name, rows without it are fixations between two pictures.
+        row.fields["picture"] = picture if row.fields["picture"] or not names else ""
 
 
 class Coordinates(NamedTuple):

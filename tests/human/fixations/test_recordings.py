@@ -128,6 +128,22 @@ TABLES = {
         ),
         {"size": (1680, 1050)},
     ),
+    "REMoDNaV": (
+        lines(
+            "onset\tduration\tlabel\tstart_x\tstart_y\tend_x\tend_y\tamp\tpeak_vel\tmed_vel\tavg_vel",
+            "{n}.5\t0.{time}\tFIXA\t{x}.5\t{y}.5\t{x}.0\t{y}.0\t0.1\t20.1\t3.0\t4.0",
+        )
+        + "11.5\t0.03\tSACC\t100\t200\t300\t400\t5.1\t200\t90\t80\n11.6\t0.4\tPURS\t1\t2\t3\t4\t5\t6\t7\t8\n",
+        {"size": (1024, 768), "picture": "a.png"},
+    ),
+    "I2MC": (
+        lines(
+            "FixStart\tFixEnd\tFixDur\tXPos\tYPos\tFlankedByDataLoss\tFraction Interpolated\tWeightCutoff\tRMSxy\tBCEA"
+            "\tFixRangeX\tFixRangeY\tParticipant\tTrial",
+            "1\t{time}\t{time}\t{x}.5\t{y}.5\t0\t0\t2.1\t0.1\t0.1\t1\t1\tp01\t{picture}",
+        ),
+        {"size": (1024, 768), "columns": {"picture": "Trial"}},
+    ),
     "Neon": (
         lines(
             f"{CLOUD},fixation x [px],fixation y [px],azimuth [deg],elevation [deg]",

@@ -239,6 +239,37 @@ def test_tables_that_say_too_much_or_too_little_are_refused(tmp_path, text, said
     unusable(said, read_table, tmp_path / "a.csv")
 
 
+def test_a_table_of_one_picture_or_person_need_not_name_them(tmp_path):
+    """So that the remedies of the messages can be followed, one after the other."""
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,duration\n40,30,200\n50.5,20,100\n")
+    said = r"none named picture, subject, width, height among .* or give picture=, subject=, size=$"
+    unusable(said, read_fixations, path)
+    given = {"size": (80, 60), "picture": "a.jpg"}
+    unusable(
+        r"expected the columns subject, x, y, got none named subject .* or give subject=$",
+        read_fixations,
+        path,
+        **given,
+    )
+    (record,) = read_fixations(path, subject="ann", **given)
+    assert (record.picture, record.subject, record.points.tolist()) == ("a.jpg", "ann", [[40, 30], [50.5, 20]])
+    path.write_text("Look X,Look Y\n40,30\n50.5,20\n")
+    (record,) = read_fixations(path, subject="ann", columns={"x": "Look X", "y": "Look Y"}, **given)
+    assert record.points.tolist() == [[40, 30], [50.5, 20]]
+
+
+def test_a_picture_that_is_given_is_not_laid_over_several(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text(TABLE)
+    said = "at most one name of a picture beside picture=, got 2 of them, such as a.jpg, b.jpg; leave picture= out"
+    unusable(said, read_fixations, path, picture="c.jpg")
+    path.write_text(TABLE.replace("b.jpg", "a.jpg"))
+    assert {(record.picture, record.subject) for record in read_fixations(path, picture="c.jpg", subject="7")} == {
+        ("c.jpg", "7")
+    }
+
+
 def test_names_in_the_encoding_of_windows_are_read_and_said(tmp_path):
     path = tmp_path / "a.csv"
     table = f"{HEAD.replace('duration', 'duration [µs]')}\n{ROWS}"
@@ -292,7 +323,10 @@ def test_people_of_a_column_of_floats_have_whole_numbers():
         ({"size": 80}, r"^size: expected \(width, height\)"),
         ({"units": "feet"}, "^unknown unit 'feet'; known: pixels, fractions"),
         ({"sizes": {}}, "^sizes: expected an option of read_table, .* did you mean size="),
-        ({"picture": "a.jpg"}, "^picture: expected an option of read_table, .* known: columns, size, units, origin"),
+        (
+            {"eye": "left"},
+            "^eye: expected an option of read_table, .* known: columns, size, picture, subject, units, orig",
+        ),
     ],
 )
 def test_arguments_of_other_kinds_are_refused_by_name(tmp_path, given, said):
