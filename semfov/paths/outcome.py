@@ -245,11 +245,11 @@ class Outcome(ABC):
     def expected_error(self) -> dict[str, float]:
         r"""Standard deviation of the expected number of objects by the name of their class; NaN where it is not known.
 
-        The candidates are independent (a Poisson-binomial distribution), and what no look has shown has the
-        distribution of `semfov.zoom.certainty`. Pictures differ in how far the model suits them, by a share
-        :math:`\tau` (`spread`) of the expected number E:
+        The number of right candidates varies by a factor φ (`semfov.zoom.certainty.DISPERSION`) more than if they were
+        independent, and what no look has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how
+        far the model suits them, by a share :math:`\tau` (`spread`) of the expected number E:
 
-        .. math:: \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+        .. math:: \sigma^2 = \varphi \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
         """
         return NumberByClass({name: variance**0.5 for name, (_, variance) in self._claimed().items()})
 

@@ -29,6 +29,12 @@ FACTS = (
 
 SPREAD = 0.3  # the spread of a certainty (`Certainty`) for which none was fitted
 
+DISPERSION = 2.0
+"""Variance of the number of right objects, in that of independent ones: what hides one of them hides its neighbours.
+
+It is 2 where objects are there, or not, in pairs. Of people in photographs of the fit it has the largest likelihood.
+"""
+
 SEVERAL = 5  # the number of likely or clear objects from which on a detector reacts
 
 _LIKELY = 0.5  # probability from which on an object is likely
@@ -158,7 +164,10 @@ def number_of_faint(chances: Tensor) -> tuple[float, float]:
 def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tuple[float, float]:
     r"""Estimate the number of objects, with those that no look has shown.
 
-    .. math:: E = \sum_i p_i + E[n], \qquad \sigma^2 = \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+    .. math:: E = \sum_i p_i + E[n], \qquad
+              \sigma^2 = \varphi \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
+
+    φ is `DISPERSION`.
 
     Args:
         chances: `(M,)`, probabilities of the objects.
@@ -171,5 +180,5 @@ def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tu
     p = chances.double()
     mean_unseen, variance_unseen = unseen
     mean = float(p.sum()) + mean_unseen
-    variance = float((p * (1 - p)).sum()) + variance_unseen + (spread * mean) ** 2
-    return mean, variance
+    variance_of_shown = DISPERSION * float((p * (1 - p)).sum())
+    return mean, variance_of_shown + variance_unseen + (spread * mean) ** 2

@@ -27,7 +27,7 @@ from semfov.observation.matching import right_boxes
 from semfov.paths import ZoomPath
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
-from semfov.zoom.certainty import FACTS, SPREAD, Certainty
+from semfov.zoom.certainty import DISPERSION, FACTS, SPREAD, Certainty, number_of
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.evidence import CASE
@@ -445,6 +445,18 @@ def path(detector, picture):
     return ZoomAgent(WindowEye(detector), evidence).eval().find_all(picture, None, FindSettings(passes=4))
 
 
+def test_the_number_varies_as_if_objects_came_in_pairs():
+    """Each pair is there or not: its variance is brute-forced over all cases of three pairs."""
+    chances = (0.2, 0.5, 0.9)
+    mean = square = 0.0
+    for pairs in product((0, 1), repeat=len(chances)):
+        weight = math.prod(p if there else 1 - p for p, there in zip(chances, pairs, strict=True))
+        mean += weight * 2 * sum(pairs)
+        square += weight * (2 * sum(pairs)) ** 2
+    number = number_of(torch.tensor(chances).repeat(2), (0.0, 0.0), 0.0)
+    assert number == pytest.approx((mean, square - mean**2))
+
+
 def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     assert path.score_threshold == 0.5
     assert (path.objects.scores >= 0.5).all()
@@ -452,7 +464,7 @@ def test_a_record_counts_probable_objects_and_expects_more(path, tmp_path):
     assert path.spread == SPREAD
     chances = path.candidates.scores.double()
     assert sum(path.expected.values()) == pytest.approx(float(chances.sum()) + path.unseen[0], rel=1e-5)
-    variance = float((chances * (1 - chances)).sum()) + path.unseen[1]
+    variance = DISPERSION * float((chances * (1 - chances)).sum()) + path.unseen[1]
     variance += sum((SPREAD * each) ** 2 for each in path.expected.values())
     assert sum(each**2 for each in path.expected_error.values()) == pytest.approx(variance, rel=1e-5)
     assert path.describe() == f"{len(path.objects)} objects found. 4 looks"
