@@ -242,7 +242,8 @@ def open_pillow(path: str | PathLike[str]) -> Iterator["ImageFile"]:
     """
     name = f"image {Path(path)}"
     check_regular(path, name)
-    check_no_raw(path, name)
+    with quiet_decoders:
+        check_no_raw(path, name)
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
     with Path(path).open("rb") as file, _open_in_formats(file) as image:
         if image.format == "TIFF":
