@@ -120,16 +120,15 @@ class Csv(ResultsFormat):
 
         pictures: list[Values] = [row["picture"] for row in rows]
         if self.searched:
-            columns = ["picture", *DECISION_COLUMNS, "seconds", "error"]
-            return _table(columns, pictures)
-        columns = ["picture", "width", "height", *COLUMNS, *_EXPECTED, "error"]
+            return _table(["picture", *DECISION_COLUMNS, "seconds", "error"], pictures)
+        columns = dict.fromkeys(["picture", "width", "height", *COLUMNS, *_EXPECTED, "error"])
         lines: list[Values] = []
         for picture in pictures:
             lines += _object_lines(picture)
         # Objects of a head have directions, too, which come last.
         for line in lines:
-            columns += [name for name in line if name not in columns]
-        return _table(columns, lines)
+            columns |= dict.fromkeys(line)
+        return _table(list(columns), lines)
 
 
 _EXPECTED = ("expected", "expected_error")

@@ -230,9 +230,7 @@ class CameraMotion:
         is_still = _largest_shift(since_last.similarity, present.grey.shape) * max(present.ratio) < _STILL_SHIFT
         is_believed = self._is_believed(since_last, key, present, fit.similarity)
         if fit.is_repeated:
-            # Edges of the blocks of a broken film stay, too, but the blocks change.
-            is_believed = is_believed and is_still and largest_change(self._cv2, last.grey, present.grey) < _SAME
-            is_believed = is_believed and (has_stood or self._is_exactly_there(last, present))
+            is_believed = is_believed and is_still and self._repeats_in_place(last, present, has_stood=has_stood)
         if not is_believed:
             self._begin_at(present)
             if self._course is None:
@@ -260,6 +258,19 @@ class CameraMotion:
             return False
         least = _CLEAR if fit is None else max(_CLEAR, fit.median - _AS_GOOD)
         return self._is_unchanged(unmoved, present, least)
+
+    def _repeats_in_place(self, last: GreyFrame, present: GreyFrame, *, has_stood: bool) -> bool:
+        """Tell whether a pattern, which fits several motions, is where it was in the last frame.
+
+        Args:
+            last: the last frame.
+            present: the present one.
+            has_stood: whether the camera stood before the pattern in the last frame.
+        """
+        # Edges of the blocks of a broken film stay, too, but the blocks change.
+        if largest_change(self._cv2, last.grey, present.grey) >= _SAME:
+            return False
+        return has_stood or self._is_exactly_there(last, present)
 
     def _is_exactly_there(self, first: GreyFrame, present: GreyFrame) -> bool:
         """Tell whether a pattern is where it was to a few hundredths of a pixel, as after a motion by a period rarely.

@@ -12,7 +12,7 @@ from pathlib import Path
 from semfov.paths.look import CONFIDENT
 from semfov.report.episode import Data
 from semfov.report.overview import overview_html
-from semfov.report.parts import ABOUT, EpisodePart, part_of
+from semfov.report.parts import ABOUT, EpisodePart, Part, part_of
 from semfov.report.template import colour_steps, filled, write_html
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 
@@ -59,19 +59,6 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     ('<!DOCTYPE html>', True)
     """
     parts = [part_of(episode, number) for number, episode in enumerate(episodes)]
-    # Each picture is in the page once, also where several episodes show it.
-    uris = dict.fromkeys(uri for part in parts for uri in part.pictures)
-    numbers = {uri: number for number, uri in enumerate(uris)}
-    data = {
-        "episodes": [part.script_data(numbers) for part in parts],
-        "pictures": list(numbers),
-        "colours": {
-            "time": colour_steps(TIME),
-            "overlay": colour_steps(overlay_colours()),
-            "probability": colour_steps(PROBABILITY, _OPACITY),
-            "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
-        },
-    }
     script_draws = not episodes or any(isinstance(part, EpisodePart) for part in parts)
     # A single episode begins with its outcome, and one of several has it where it is chosen.
     is_single = not sections and len(episodes) == 1
@@ -85,7 +72,23 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         "fixations": "" if script_draws else " hidden",
         **(_of_single(episodes[0]) if is_single else _of_several(episodes)),
     }
-    return filled("page", data, contents)
+    return filled("page", _script_data(parts), contents)
+
+
+def _script_data(parts: Sequence[Part]) -> Data:
+    """Collect what the script of a page reads; each picture is in it once, also where several episodes show it."""
+    uris = dict.fromkeys(uri for part in parts for uri in part.pictures)
+    numbers = {uri: number for number, uri in enumerate(uris)}
+    return {
+        "episodes": [part.script_data(numbers) for part in parts],
+        "pictures": list(numbers),
+        "colours": {
+            "time": colour_steps(TIME),
+            "overlay": colour_steps(overlay_colours()),
+            "probability": colour_steps(PROBABILITY, _OPACITY),
+            "uncertainty": colour_steps(UNCERTAINTY, _OPACITY),
+        },
+    }
 
 
 def _of_single(episode: Data) -> dict[str, str]:

@@ -46,9 +46,16 @@ def plot_comparison(points: Sequence[ComparedPoint], measure: str = "AP50") -> F
         colour = COLOURS[number % len(COLOURS)]
         axes.plot(seconds, heights, marker=_MARKERS[number % len(_MARKERS)], color=colour, label=way)
         for point, x, y in zip(judged, seconds, heights, strict=True):
-            label = f"{point.passes:.3g}"
-            above = (0, 5)
-            axes.annotate(label, (x, y), above, textcoords="offset points", ha="center", color=colour, fontsize=7)
+            # A little above the point.
+            axes.annotate(
+                f"{point.passes:.3g}",
+                (x, y),
+                xytext=(0, 5),
+                textcoords="offset points",
+                ha="center",
+                color=colour,
+                fontsize=7,
+            )
     axes.set(xlabel="seconds a picture", ylabel=measure, xlim=(0, None), ylim=(0, 1.05))
     axes.legend(loc="lower right")
     return figure
