@@ -57,7 +57,7 @@ def agent(name: str = "yolox-nano", kind: str = "recommended", **options: Any) -
 
     Args:
         name: a detector with shipped models; with `raw`, any detector.
-        kind: `recommended`, `published`, `learned_chain` or `raw`.
+        kind: `recommended`, `published` or `raw`.
         options: options of the method of `semfov.ActivePerception` that has the name of the kind.
 
     Returns:
@@ -69,7 +69,6 @@ def agent(name: str = "yolox-nano", kind: str = "recommended", **options: Any) -
     agents = {
         "recommended": _semfov.ActivePerception.recommended,
         "published": _semfov.ActivePerception.published,
-        "learned_chain": _semfov.ActivePerception.learned_chain,
         "raw": _semfov.ActivePerception.raw,
     }
     if kind not in agents:

@@ -5,11 +5,11 @@
 The detector looks at every photograph from every cell; `eval.search` shares these looks under the same `--cache`. The
 photographs are dealt into folds. An observation model is fitted through the belief of searches in the other folds
 (`semfov.fit.through_belief`), and searches those of its own. The table has the targets found after some gaze shifts,
-and the difference to the learned target evidence, photograph by photograph. The model that is fitted on all photographs
-is saved in `out`. If the command is stopped, repeat it to continue.
+and the difference to the learned chain, photograph by photograph. The model that is fitted on all photographs is
+saved in `out`. If the command is stopped, repeat it to continue.
 
 With `--belief.search_model` nothing is fitted, and this model searches all photographs; with `--data.ids` they may be
-those that neither it nor the target evidence was fitted on.
+those that it was not fitted on.
 """
 
 import sys
@@ -32,6 +32,7 @@ from semfov.metrics.episodes import FloatArray, standard_error
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.config import PolicyConfig, RunConfig
+from semfov.runs.presets import AGENT
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import make_observation
@@ -42,12 +43,11 @@ _STEPS: dict[str, str | PolicyConfig] = {
     "set by hand": PolicyConfig(
         "non-predictive", tempering=0.25, footprint="box_centre", memory="closest", misses=True
     ),
-    "learned": "non-predictive-fitted",
-    "target evidence": "target-evidence",
+    "learned": AGENT,
 }
 """Policies by their names in the table."""
 
-_HEAD = "target evidence"
+_LEARNED = "learned"
 _SHIFTS = (1, 5, 10, 15, 30)
 
 
@@ -135,7 +135,7 @@ def search_by_steps(config: ChainConfig) -> list[ResultRecord]:
 
 
 def chain_summary(records: Sequence[ResultRecord], shifts: int, model: str | None = None) -> str:
-    """Write the table, as Markdown: the targets found by each policy, and the differences to the target evidence.
+    """Write the table, as Markdown: the targets found by each policy, and the differences to the learned chain.
 
     Args:
         records: the searches.
@@ -151,15 +151,14 @@ def chain_summary(records: Sequence[ResultRecord], shifts: int, model: str | Non
     for name, curve in curves.items():
         rows.append([name, *_cells(curve, at)])
     for name, curve in curves.items():
-        if name != _HEAD:
-            rows.append([f"{name} - {_HEAD}", *_cells(curve - curves[_HEAD], at, sign="+")])
-    photographs, searches = len(curves[_HEAD]), sum(record["policy"] == _HEAD for record in records)
+        if name != _LEARNED:
+            rows.append([f"{name} - {_LEARNED}", *_cells(curve - curves[_LEARNED], at, sign="+")])
+    photographs, searches = len(curves[_LEARNED]), sum(record["policy"] == _LEARNED for record in records)
     learned = "the model that was fitted on the other folds" if model is None else f"`{model}`"
     return "\n".join(
         [
             f"Targets found within n gaze shifts (%), ± standard error over {photographs} photographs; {searches} "
-            f"searches by each policy. *learned*: by {learned}. *target evidence*: the model that is shipped, which "
-            "may have been fitted on these photographs.",
+            f"searches by each policy. *learned*: by {learned}.",
             "",
             *table(rows),
             "",

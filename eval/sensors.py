@@ -28,8 +28,8 @@ from eval.explore.report import success
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.report import performance
 from eval.search.run import SearchConfig, SearchRun
-from semfov.belief.look_features import highest_score
 from semfov.data.scene import Scenes
+from semfov.detection.detections import highest_score
 from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.fit.protocols import choose_classes

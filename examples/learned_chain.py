@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 import semfov
-from semfov.belief.observers import Semantic
+from semfov.belief.observers import SemanticSearch
 
 COLUMNS, ROWS, LOOKS = 10, 8, 3
 Search = tuple[Tensor, int, Tensor]  # the image, the class to search for, and the cells that hold it
@@ -44,7 +44,7 @@ class Chain(nn.Module):
 
     def forward(self, image: Tensor, cells: Tensor, target: int, goal: Tensor) -> Tensor:
         """Search an image `(3, H, W)` from `cells` `(n,)`; returns −ln of the share of the goal `(X·Y,)`, a scalar."""
-        grid, observer = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2])), Semantic.searching(self.model)
+        grid, observer = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2])), SemanticSearch(self.model)
         belief = observer.start(1, grid, image)
         everywhere = torch.ones(1, len(grid), dtype=torch.bool)
         for fixation in grid.centres[cells].split(1):

@@ -22,7 +22,6 @@ from .agents import ZoomAgent as ZoomAgent
 from .belief import Belief as Belief
 from .belief import DirichletBelief as DirichletBelief
 from .belief import Grid as Grid
-from .belief import TargetEvidence as TargetEvidence
 from .belief import fusion as fusion
 from .cli.search import run as run
 from .data import EmbeddedScenes as EmbeddedScenes

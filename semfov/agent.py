@@ -13,10 +13,9 @@ from semfov.agents.kinds import KINDS_OF_LOOK, KindOfLook
 from semfov.agents.picture import OpenedPicture, PictureLike, check_order
 from semfov.agents.windows import ZoomAgent
 from semfov.belief.grid import check_cells
-from semfov.belief.observers import Observer, SemanticMap, Target
+from semfov.belief.observers import Observer, SemanticMap, SemanticSearch
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.prior import PriorLike
-from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_numbers
 from semfov.data.inputs import Color
@@ -35,7 +34,7 @@ from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazePrediction, Record
 from semfov.paths.viewed import ScanpathLike
-from semfov.presets import learned_chain_arguments, published_arguments, raw_arguments, recommended_arguments
+from semfov.presets import published_arguments, raw_arguments, recommended_arguments
 from semfov.settings import (
     ExploreSettings,
     FindSettings,
@@ -103,7 +102,7 @@ class ActivePerception(nn.Module):
         self.columns, self.rows = grid
         settings = eye.settings()
         for module in self.modules():
-            if isinstance(module, FovealObservationModel | TargetEvidence | Verification):
+            if isinstance(module, FovealObservationModel | Verification):
                 check_same_detector(module.metadata.get("detector", {}), settings["detector"], module.title)
                 check_sensor(module.metadata.get("sensor", {}), settings["sensor"], module.title, strict=True)
                 check_grid(module.metadata.get("training", {}), grid, module.title)
@@ -113,17 +112,15 @@ class ActivePerception(nn.Module):
         cls,
         name: str = "yolox-nano",
         *,
-        sigma: float = 100.0,
-        growth: float = 2.0,
         grid: tuple[int, int] = (10, 10),
         **options: Any,
     ) -> Self:
-        """Make the agent for everyday use, which searches with learned evidence and explores with the semantic map.
+        """Make the agent for everyday use: the paper's chain, with an observation model that was trained for its tasks.
+
+        It sees through the `gradual` fovea, or looks at windows.
 
         Args:
             name: a detector with shipped models: `yolox-nano`, `yolov3-tiny`, `nanodet-plus-m-1.5x` (with `weights=`).
-            sigma: width of the fovea, in pixels of an image whose longer side is 640; the models are fitted for 100.
-            growth: growth of the fovea (`Foveation`); the models are fitted for 2, and for 1 as in the paper.
             grid: `(columns, rows)` of the belief; the models are fitted on 10 x 10 cells, and hold for 5 to 20 a side.
             options: options of `semfov.load_detector`.
 
@@ -131,10 +128,10 @@ class ActivePerception(nn.Module):
             The agent, in `eval` mode and without gradients.
 
         Raises:
-            InputError: no models are shipped for this detector, this sensor or this grid.
+            InputError: no models are shipped for this detector, or for this grid.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(recommended_arguments, name, sigma, growth, grid, **options)
+        return cls._of(recommended_arguments, name, grid, **options)
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolox-nano", **options: Any) -> Self:
@@ -188,21 +185,6 @@ class ActivePerception(nn.Module):
             DataError: the weights cannot be downloaded, or are damaged.
         """
         return cls._of(published_arguments, name, sensor, search, calibrated, **options)
-
-    @classmethod
-    def learned_chain(cls, name: str = "yolox-nano", **options: Any) -> Self:
-        """Make the paper's agent with an observation model that was trained through the belief to find targets.
-
-        It sees through the `gradual` fovea. It knows how likely a miss is, and takes the closest look at each cell.
-
-        Args:
-            name: `yolox-nano`, or `nanodet-plus-m-1.5x` (with `weights=`).
-            options: options of `semfov.load_detector`.
-
-        Returns:
-            The agent, in `eval` mode and without gradients.
-        """
-        return cls._of(learned_chain_arguments, name, **options)
 
     @classmethod
     def raw(cls, name: DetectorLike = "yolox-nano", *, sensor: str = "published", **options: Any) -> Self:
@@ -282,14 +264,14 @@ class ActivePerception(nn.Module):
         """The part of the agent that turns a head in a scene.
 
         Raises:
-            InputError: the agent has no learned evidence and semantic map for its sensor.
+            InputError: the agent has no observation models for searches and maps.
         """
         search = self.searching.observer
         explore = self.exploring.observer
-        if not (isinstance(search, Target) and isinstance(explore, SemanticMap)):
+        if not (isinstance(search, SemanticSearch) and isinstance(explore, SemanticMap)):
             got = f"{type(search).__name__} and {type(explore).__name__}"
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
-            raise InputError(f"how: expected learned evidence and a semantic map for a head, got {got}; {remedy}")
+            raise InputError(f"how: expected a semantic search and a semantic map for a head, got {got}; {remedy}")
         return HeadAgent(self.eye, search.model, explore.model)
 
     def kind_of_look(

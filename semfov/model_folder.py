@@ -7,8 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from semfov.belief.observers import Observer, Semantic, SemanticMap, Target
-from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.observers import Observer, Semantic, SemanticMap, SemanticSearch
 from semfov.belief.verification import Verification
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
@@ -24,11 +23,11 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.named import SENSORS
 from semfov.zoom.evidence import GlimpseEvidence
 
-_FolderModel = FovealObservationModel | TargetEvidence | Verification | GlimpseEvidence
+_FolderModel = FovealObservationModel | Verification | GlimpseEvidence
 
 KINDS: dict[str, type[_FolderModel]] = {
     "observation": FovealObservationModel,
-    "evidence": TargetEvidence,
+    "search": FovealObservationModel,
     "verification": Verification,
     "windows": GlimpseEvidence,
 }
@@ -202,17 +201,17 @@ class ModelFolder:
             "eye": eye,
             "search": (self._search_observer(), Policy("non-predictive")),
             "explore": self._exploration(eye),
-            "verification": self._models.get("verification") if self.used("evidence") else None,
+            "verification": self._models.get("verification") if self.used("search") else None,
             "windows": self._models.get("windows"),
             "grid": self.manifest.grid,
         }
 
     def _search_observer(self) -> Observer:
-        """Make the observer of searches: learned evidence, or scores as they were better when fitted."""
+        """Make the observer of searches: by the model fitted for them, or scores as they were better when fitted."""
         components = len(self.manifest.classes) + 1
-        evidence = self._models.get("evidence")
-        if isinstance(evidence, TargetEvidence):
-            return Target(evidence)
+        searching = self._models.get("search")
+        if isinstance(searching, FovealObservationModel):
+            return SemanticSearch(searching)
         if not self.used("tempering"):
             return Semantic(components)
         settings = self.manifest.parts["tempering"].settings

@@ -1,59 +1,44 @@
 """Preset agents: eye, observers and policies by the name of a detector or of a folder of models.
 
-Each function returns the arguments of `semfov.ActivePerception`. The class methods `recommended`, `published`,
-`learned_chain` and `raw` document the parameters.
+Each function returns the arguments of `semfov.ActivePerception`. The class methods `recommended`, `published`
+and `raw` document the parameters.
 """
 
 from os import PathLike, fspath
 from typing import Any
 
 from semfov.belief.grid import check_cells
-from semfov.belief.observers import Semantic, SemanticMap, Target
-from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.belief.verification import Verification
 from semfov.detection.load import DetectorLike, load_detector
-from semfov.errors import InputError, check, lookup
+from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
-from semfov.io.compatibility import learned_for, trained_for
+from semfov.io.compatibility import searching_for, trained_for
 from semfov.io.pretrained import shipped_model
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import SENSORS, named_sensor
 from semfov.zoom import GlimpseEvidence
 
 PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.published)
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
 
-_THROUGH_BELIEF = "-search"
-"""End of the names of observation models that were fitted through the belief, after that of their detector."""
 
-
-def recommended_arguments(
-    name: str, sigma: float, growth: float, grid: tuple[int, int], **options: Any
-) -> dict[str, Any]:
-    """Make the arguments of the recommended agent: learned evidence for search, the semantic map for exploration."""
-    fit = (
-        "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
-    )
-    if growth not in (1.0, 2.0):
-        raise InputError(f"growth: models are shipped for 1 and 2, got {growth}; {fit}")
-    if sigma != 100.0:
-        raise InputError(f"sigma: models are shipped for 100 pixels on an image of 640 pixels, got {sigma}; {fit}")
+def recommended_arguments(name: str, grid: tuple[int, int], **options: Any) -> dict[str, Any]:
+    """Make the arguments of the recommended agent, which searches and explores by learned observation models."""
     check_cells(grid)
     detector = load_detector(name, **options)
-    eye = Eye(Foveation(sigma, growth=growth), detector)
-    name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
-    evidence = TargetEvidence.from_pretrained(name)
+    eye = Eye(named_sensor("gradual"), detector)
+    fitted = shipped_model(FovealObservationModel, searching_for(detector.name), name)
     return {
         "eye": eye,
-        "search": (Target(evidence), Policy("non-predictive")),
+        "search": (SemanticSearch(FovealObservationModel.from_pretrained(fitted)), Policy("non-predictive")),
         "explore": (
-            SemanticMap(FovealObservationModel.from_pretrained(trained_for(detector.name, growth))),
-            Policy("closer-look", fovea=sigma / eye.reference),
+            SemanticMap(FovealObservationModel.from_pretrained(trained_for(detector.name, growth=2))),
+            Policy("closer-look", fovea=eye.sensor.width(eye.sensor.settings()) / eye.reference),
         ),
-        "verification": Verification.if_shipped(name),
+        "verification": Verification.if_shipped(detector.name),
         "windows": GlimpseEvidence.if_shipped(detector.name),
         "grid": grid,
     }
@@ -96,23 +81,6 @@ def published_arguments(
     observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
     policy = Policy("predictive", model) if search == "predictive" else Policy("non-predictive")
     return {"eye": eye, "search": (observer, policy), "explore": (observer, Policy("kl", model)), "grid": grid}
-
-
-def learned_chain_arguments(name: str, **options: Any) -> dict[str, Any]:
-    """Make the arguments of the agent whose observation model was fitted through the belief, one for both tasks."""
-    detector = load_detector(name, **options)
-    files = sorted(FovealObservationModel.shipped.glob(f"*{_THROUGH_BELIEF}.safetensors"))
-    fitted = lookup(
-        detector.name, [file.stem.removesuffix(_THROUGH_BELIEF) for file in files], "detector with a learned chain"
-    )
-    eye = Eye(named_sensor("gradual"), detector)
-    observer = Semantic.searching(FovealObservationModel.from_pretrained(f"{fitted}{_THROUGH_BELIEF}"))
-    fovea = eye.sensor.width(eye.sensor.settings()) / eye.reference
-    return {
-        "eye": eye,
-        "search": (observer, Policy("non-predictive")),
-        "explore": (observer, Policy("closer-look", fovea=fovea)),
-    }
 
 
 def raw_arguments(name: DetectorLike, sensor: str, **options: Any) -> dict[str, Any]:

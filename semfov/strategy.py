@@ -6,13 +6,14 @@ from typing import Any
 from torch import Tensor, nn
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import AnyOf, Observer, Target
+from semfov.belief.observers import AnyOf, Observer, SemanticSearch
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.prior import Prior, PriorLike
 from semfov.data.classes import class_index
 from semfov.errors import check
 from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Uniform
 from semfov.gaze.policies import Policy
+from semfov.observation.presence import EVEN
 
 
 def classes_named(target: TargetLike) -> list[str | int]:
@@ -59,12 +60,22 @@ class Strategy(nn.Module):
             The strategy of the search, and the prior by which its probabilities change.
         """
         observer = self.observer
-        is_about_several = isinstance(observer, AnyOf) and prior is not None
-        check(not is_about_several, "prior", "None for a search for any of several classes", prior)
-        if not isinstance(observer, Target):
-            return self, Prior.of(prior, None, target)
-        known = Prior.of(prior, observer.model.shares, target)
-        return Strategy(Target(observer.model, together=observer.together, prior=known), self.policy), known
+        if isinstance(observer, AnyOf):
+            check(prior is None, "prior", "None for a search for any of several classes", prior)
+            return self._with_any_there(observer)
+        if not isinstance(observer, SemanticSearch):
+            return self, Prior.of(prior, None)
+        changed = observer.with_prior(prior, target)
+        return Strategy(changed, self.policy), changed.prior
+
+    def _with_any_there(self, observer: AnyOf) -> tuple["Strategy", Prior]:
+        r"""Assume that any of n classes is there in half of the pictures: each in :math:`1 - 2^{-1/n}` of them."""
+        inner = observer.observer
+        if not isinstance(inner, SemanticSearch) or inner.model.presence is None:
+            return self, Prior.of(None, None)
+        each = Prior(1 - (1 - EVEN) ** (1 / len(observer.weights)), EVEN, known=False)
+        changed = SemanticSearch(inner.model, prior=each, footprint=inner.footprint)
+        return Strategy(AnyOf(changed, observer.weights), self.policy), each
 
     def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
         """Prepare the search for a target.

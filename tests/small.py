@@ -12,11 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from semfov import ActivePerception, EmbeddedScenes, Eye, FovealObservationModel, Foveation, Grid, Scanpath
-from semfov.belief import Belief, DirichletBelief, TargetEvidence, Verification
+from semfov.belief import Belief, DirichletBelief, Verification
 from semfov.belief.observers import Look, Semantic
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import Policy
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.paths.fovea import FoveaLook, FoveaLooks
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
 
@@ -142,11 +144,17 @@ def model() -> FovealObservationModel:
     return FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=0.1 + 0.8 * rand(4, 3)).eval()
 
 
-def evidence() -> TargetEvidence:
-    """An untrained model of target evidence."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return TargetEvidence(4, 4).eval()
+def search_model() -> FovealObservationModel:
+    """An observation model of searches: with odds of a miss, refutation, presence and thresholds."""
+    fitted = model()
+    odds = 0.05 + 0.3 * rand(4, 3)
+    shares = torch.tensor([0.2, 0.5, 0.8])
+    presence = Presence(
+        torch.tensor(-0.4), torch.tensor([0.7, 0.2]), shares, Thresholds(0.7, stop_below=0.02, place=0.3)
+    )
+    return FovealObservationModel(
+        fitted.alpha, fitted.edges, CLASSES, miss_odds=odds, refutation=0.6, presence=presence
+    ).eval()
 
 
 def observing() -> Semantic:

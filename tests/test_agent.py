@@ -17,8 +17,7 @@ from semfov import (
     load_detector,
     saliency,
 )
-from semfov.belief import TargetEvidence
-from semfov.belief.observers import Semantic, Target
+from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.decision import confirms
 from semfov.episode import STAGES
 from semfov.errors import InputError
@@ -194,11 +193,12 @@ def test_an_observer_shared_by_both_tasks_has_one_belief(image):
 def test_learned_models_are_submodules_of_the_agent(image):
     """State, dtype, gradients and copies of the agent include the models of its observers and policies."""
     misses = FovealObservationModel.identity(["red", "green"], [0.2], miss_rate=torch.full((3, 2), 0.5))
-    evidence, expected = TargetEvidence(4, 4), FovealObservationModel.identity(["red", "green"], [0.3])
-    search = Target(evidence), Policy("non-predictive")
+    sought = FovealObservationModel.identity(["red", "green"], [0.2], miss_odds=torch.full((3, 2), 0.3))
+    expected = FovealObservationModel.identity(["red", "green"], [0.3])
+    search = SemanticSearch(sought), Policy("non-predictive")
     agent = ActivePerception(squares_eye(), search, (Semantic(3, misses=misses), Policy("kl", expected)), grid=(8, 6))
     learned = {
-        "searching.observer.model": evidence,
+        "searching.observer.model": sought,
         "exploring.observer.misses": misses,
         "exploring.policy.model": expected,
     }
@@ -208,7 +208,7 @@ def test_learned_models_are_submodules_of_the_agent(image):
         assert {f"{path}.{name}" for name in model.state_dict()} <= set(state)
         for name, parameter in model.named_parameters():
             assert named[f"{path}.{name}"] is parameter
-    assert len([*evidence.parameters()]) > 0
+    assert len([*sought.parameters()]) > 0
     agent.double().requires_grad_(False)
     for model in learned.values():
         assert all(
@@ -367,10 +367,10 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
     ("make", "options", "said"),
     [
         (ActivePerception.recommended, {"columns": 12}, r"columns: expected an option of .*; did you mean grid=\?$"),
-        (ActivePerception.from_pretrained, {"sigmas": 50.0}, r"sigmas: .*; did you mean sigma=\?$"),
+        (ActivePerception.from_pretrained, {"strides": 32}, r"strides: .*; did you mean stride=\?$"),
         (ActivePerception.published, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
         (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one; known: name, sensor,"),
-        (ActivePerception.learned_chain, {"sigma": 50.0}, r"sigma: .*, got an unknown one; known: name,"),
+        (ActivePerception.recommended, {"sigma": 50.0}, r"sigma: .*, got an unknown one; known: name,"),
         (ActivePerception.raw, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
         (ZoomAgent.recommended, {"finst": 0.5}, r"finst: .*; did you mean finest="),
         (

@@ -33,7 +33,7 @@ assert Path(sys.prefix) in home.parents, home
 models = sorted(path for path in home.rglob("*.safetensors"))
 assert len(models) > 15, models
 semfov.FovealObservationModel.from_pretrained("yolox-nano")
-semfov.TargetEvidence.from_pretrained("yolox-nano")
+semfov.FovealObservationModel.from_pretrained("yolox-nano-search")
 assert "<script" in page_html("a page", [])
 view = semfov.foveate(torch.rand(1, 3, 8, 8), (4.0, 4.0), sigma=2.0)
 print(semfov.__version__, view.shape[-1])

@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from semfov import Detections, Eye, FovealObservationModel, Foveation, Grid, Selection, TargetEvidence
-from semfov.belief.observers import Semantic, Target
+from semfov import Detections, Eye, FovealObservationModel, Foveation, Grid, Selection
+from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.episode import STAGES, EpisodeLook, LiveLooks, Looks, StoredLooks, rollout
 from semfov.gaze import Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_from
 from semfov.gaze.policies import Policy
-from tests.refusals import refused
+from semfov.observation.presence import Presence
 from tests.small import Coloured, tensors
 
 GRID = Grid(3, 2, (90, 60))
@@ -42,10 +42,13 @@ def stored(classes=3, most=4, dtype=torch.float64):
     return Detections(boxes.to(dtype), scores.to(dtype), torch.arange(most) < count[:, None])
 
 
-def evidence():
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return TargetEvidence(6, 5).eval().requires_grad_(False)
+def searching(classes=3):
+    """An observer of searches, with an observation model that is not trained."""
+    names = [f"class {number}" for number in range(1, classes + 1)]
+    odds = 0.05 + 0.3 * rand(classes + 1, 2, seed=4).float()
+    presence = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((classes,), 0.5))
+    model = FovealObservationModel.identity(names, [0.4], miss_odds=odds, refutation=0.6, presence=presence)
+    return SemanticSearch(model.eval().requires_grad_(False))
 
 
 def reached(step):
@@ -217,7 +220,8 @@ def test_stored_looks_are_weighed_only_once_by_each_observer_and_target():
             self.weighed += 1
             return super().weigh(*arguments)
 
-    class CountedTarget(Target):
+    class CountedByTarget(Semantic):
+        by_target = True
         asked = ()
 
         def weigh(self, detections, fixation, grid, target=None):
@@ -225,19 +229,13 @@ def test_stored_looks_are_weighed_only_once_by_each_observer_and_target():
             return super().weigh(detections, fixation, grid, target)
 
     looks = StoredLooks(stored(), GRID, TARGETS)
-    mapper, seeker = Counted(4), CountedTarget(evidence().double())
+    mapper, seeker = Counted(4), CountedByTarget(4)
     for observer in (mapper, seeker):
         list(rollout(looks, observer, by_target, START, Greedy(drawn_from(NOISE)), most=4))
     assert mapper.weighed == 1
     assert seeker.asked == (1, 2, 3)
     list(rollout(looks.of(slice(0, 2)), mapper, by_target, START[:2], Greedy(drawn_from(NOISE)), most=2))
     assert mapper.weighed == 1
-
-
-def test_an_observer_of_targets_without_a_target_is_refused():
-    looks = LiveLooks(*live(), GRID)
-    steps = rollout(looks, Target(evidence()), Uniform(), START, Greedy(drawn_from(NOISE)), most=2)
-    refused("target: expected a class to search for", list, steps)
 
 
 def live():
@@ -250,14 +248,13 @@ def live():
     return eye, eye.open(picture)
 
 
-@pytest.mark.parametrize("kind", ["map", "target"])
+@pytest.mark.parametrize("kind", ["map", "search"])
 @pytest.mark.parametrize("target", [1, 3])
 def test_live_and_stored_looks_give_the_same_scanpath(kind, target):
     eye, view = live()
     seen = eye.look(view, GRID.centres)
     assert len(set(seen.count.tolist())) > 1  # The number of detections depends on the fixation.
-    mapper = Semantic(4, tempering=0.5)
-    observer = {"map": mapper, "target": Target(evidence())}[kind]
+    observer = {"map": Semantic(4, tempering=0.5), "search": searching()}[kind]
     run = partial(
         rollout, observer=observer, acquisition=TargetPosterior(target), start=START, choice=Greedy(drawn_from(NOISE))
     )
@@ -288,7 +285,7 @@ STRATEGIES = {
     "map with misses, non-predictive": lambda: (Semantic(21, observed(), misses=observed()), Policy("non-predictive")),
     "soft map, non-predictive": lambda: (Semantic(21, tempering=0.25, footprint="soft"), Policy("non-predictive")),
     "closest look, kl": lambda: (Semantic(21, memory="closest"), Policy("kl", observed())),
-    "target, non-predictive": lambda: (Target(evidence()), Policy("non-predictive")),
+    "search, non-predictive": lambda: (searching(20), Policy("non-predictive")),
     "map, random": lambda: (Semantic(21), Policy("random")),
 }
 
@@ -430,9 +427,9 @@ def test_the_cell_of_a_soft_point_is_the_cell_that_contains_it():
         assert not any(bool((GRID.centres == point.float()).all(-1).any()) for point in step.next_fixation)
 
 
-@pytest.mark.parametrize("kind", ["map", "target"])
+@pytest.mark.parametrize("kind", ["map", "search"])
 def test_a_recorded_scanpath_is_replayed_to_the_bit(kind):
-    observer = Semantic(4) if kind == "map" else Target(evidence().double())
+    observer = Semantic(4) if kind == "map" else searching().double()
     looks = StoredLooks(stored(), GRID, TARGETS)
     run = partial(rollout, looks, observer, by_target, START)
     first = list(run(Greedy(drawn_from(NOISE)), most=5, ends=reached))
@@ -450,7 +447,7 @@ def test_a_recorded_scanpath_is_replayed_to_the_bit(kind):
 
 
 def test_stored_looks_of_some_episodes_are_those_of_a_source_for_them_alone():
-    looks, observer = StoredLooks(stored(), GRID, TARGETS), Target(evidence().double())
+    looks, observer = StoredLooks(stored(), GRID, TARGETS), searching().double()
     for episodes in (torch.tensor([2, 0]), slice(1, 2)):
         sources = looks.of(episodes), StoredLooks(stored(), GRID, TARGETS[episodes])
         some, alone = (
@@ -459,7 +456,7 @@ def test_stored_looks_of_some_episodes_are_those_of_a_source_for_them_alone():
         )
         assert torch.equal(sources[0].targets, TARGETS[episodes])
         for one, other in zip(some, alone, strict=True):
-            assert torch.equal(one.belief.present, other.belief.present)
+            assert torch.equal(one.belief.beta, other.belief.beta)
     assert StoredLooks(stored(), GRID).of(slice(0, 1)).targets is None
 
 
@@ -502,13 +499,12 @@ def test_only_the_stages_of_a_cycle_are_timed(monkeypatch):
     assert rows == [rest, rest | {"weigh": 0.0}, rest | {"weigh": 0.0}]
 
 
-@pytest.mark.parametrize("kind", ["map", "target"])
+@pytest.mark.parametrize("kind", ["map", "search"])
 def test_beliefs_have_the_device_and_dtype_of_the_looks(kind, dtype, device):
     """Beliefs, values and fixations follow the detections."""
     seen = stored(dtype=dtype)
     seen = Detections(seen.boxes.to(device), seen.scores.to(device), seen.mask.to(device))
-    model = evidence().to(device, dtype)
-    observer, targets = Semantic(4) if kind == "map" else Target(model), TARGETS.to(device)
+    observer, targets = Semantic(4) if kind == "map" else searching().to(device, dtype), TARGETS.to(device)
     looks, choice = StoredLooks(seen, GRID, targets), Greedy(drawn_from(NOISE.to(device, dtype)))
     acquire = lambda episodes, cell: TargetPosterior(targets[episodes])  # noqa: E731
     for step in rollout(looks, observer, acquire, START.to(device), choice, most=3):

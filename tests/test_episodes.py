@@ -11,7 +11,6 @@ from semfov.agents.fovea_episode import FoveaEpisode, GazePlan
 from semfov.agents.head import HeadAgent, HeadEpisode
 from semfov.agents.window_episode import GivenWindows
 from semfov.agents.windows import ZoomAgent
-from semfov.belief import TargetEvidence
 from semfov.belief.observers import Semantic, SemanticMap
 from semfov.decision.stopping import AtDetection, AtGoal, StoppingCriterion
 from semfov.gaze.policies import Policy
@@ -68,7 +67,8 @@ def of_head():
     torch.manual_seed(0)
     eye = Eye(Foveation(100.0, growth=2.0), Tiles(("red", "green", "blue"), fill=0.0, pure=True)).eval()
     observation = FovealObservationModel.identity(["red", "green", "blue"], [0.2])
-    agent = HeadAgent(eye.requires_grad_(False), TargetEvidence(components=4), observation).eval()
+    searching = FovealObservationModel.identity(["red", "green", "blue"], [0.2], miss_odds=torch.full((4, 2), 0.3))
+    agent = HeadAgent(eye.requires_grad_(False), searching, observation).eval()
     agent = agent.requires_grad_(False)
     image = torch.zeros(3, 180, 360)
     image[2, 80:100, 200:220] = 1

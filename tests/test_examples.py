@@ -145,7 +145,8 @@ def test_a_simulated_camera_is_searched_though_its_frames_are_late(run, tmp_path
     assert "horse: found" in output
     clock, turns = re.search(r"clock says ([\d.]+) s, and (\d+) turns", output).groups()
     assert int(turns) > 1
-    assert float(clock) == pytest.approx(seconds[-1], abs=1)
+    # A turn takes a little longer than the agent expects.
+    assert float(clock) == pytest.approx(seconds[-1], abs=0.2 * int(turns))
     with Image.open(tmp_path / "camera.png") as picture:
         assert min(picture.size) > 300
 

@@ -10,13 +10,14 @@ import torch
 from torch.nn import functional as F
 
 import semfov
-from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid, InputError, TargetEvidence
-from semfov.belief.observers import Semantic, SemanticMap, Target
-from semfov.belief.target_evidence import Thresholds
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid, InputError
+from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.data.examples import example
 from semfov.data.sources import open_stream
 from semfov.episode import Forgetting
 from semfov.gaze.policies import Policy
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.settings import StreamSettings
 from tests.films import encode
 from tests.refusals import refused
@@ -32,12 +33,11 @@ def scene(x, y=8, size=24):
     return picture
 
 
-def learned():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(3)
-        model = TargetEvidence(6, 5, components=3)
-        torch.nn.init.normal_(model.prior)
-    return model
+def searching(thresholds=None):
+    odds = torch.tensor([[1.0, 1], [0.1, 0.3], [0.15, 0.2]])
+    presence = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.tensor([0.7, 0.9]), thresholds)
+    model = FovealObservationModel.identity(["red", "green"], [0.2], miss_odds=odds, refutation=0.6, presence=presence)
+    return SemanticSearch(model)
 
 
 def observation():
@@ -48,7 +48,7 @@ def observers():
     return {
         "semantic": Semantic(3),
         "closest": Semantic(3, memory="closest"),
-        "target": Target(learned()),
+        "search": searching(),
         "map": SemanticMap(observation()),
     }
 
@@ -56,7 +56,7 @@ def observers():
 def agent_with(observer, policy=None):
     eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
     policy = policy or Policy("non-predictive")
-    mapper = Semantic(3) if observer.by_target else observer
+    mapper = Semantic(3) if isinstance(observer, SemanticSearch) else observer
     return ActivePerception(eye, (observer, policy), (mapper, Policy("random")), grid=(8, 6)).eval()
 
 
@@ -101,10 +101,7 @@ def test_live_search_of_a_constant_image_at_rate_zero_equals_a_search(name, one_
 
 
 def test_a_prior_changes_the_fovea_in_a_search_and_in_a_stream_by_the_odds(one_thread):
-    model = learned()
-    model.shares = torch.tensor([0.7, 0.9])
-    model.thresholds = Thresholds(1.0, 0.0, 0.5)
-    agent, image = agent_with(Target(model)), scene(100, 80)
+    agent, image = agent_with(searching(Thresholds(1.0, 0.0, 0.5))), scene(100, 80)
     live = agent.live("green", rate=0, start=3, seed=5, how="fovea", prior=0.2)
     with torch.inference_mode():
         usual = agent.search(image, "green", start=3, shifts=4, seed=5, how="fovea", prior="fit", stop_below=0.0)
@@ -246,7 +243,7 @@ def test_a_film_gives_the_same_beliefs_in_any_container(tmp_path, how):
     films = {}
     for end in ("mp4", "mkv", "avi", "webm"):
         stream = open_stream(encode(tmp_path / f"film.{end}", "libvpx-vp9", times, pictures))
-        live = agent_with(observers()["target"]).live("green", how=how, start=3 if how == "fovea" else None)
+        live = agent_with(observers()["search"]).live("green", how=how, start=3 if how == "fovea" else None)
         films[end] = [(picture, live.step(picture.image, picture.passed)) for picture in stream.frames]
         assert not stream.gaps["lost"]
     for film in films.values():
@@ -285,7 +282,7 @@ def test_frames_of_opencv_give_the_same_moments():
     image = scene(100, 80)
     picture = (image * 255).round() / 255
     frame = (picture * 255).byte().permute(1, 2, 0).flip(-1).numpy()
-    observer = observers()["target"]
+    observer = observers()["search"]
     moments = [
         agent_with(observer).live("green", start=3, color=color).step(each)
         for color, each in (("rgb", picture), ("bgr", frame), ("bgr", picture.flip(0)))
@@ -328,7 +325,7 @@ def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once():
     """Each frame, which is reduced for the moment, is written over the one before."""
 
     def moments():
-        live = agent_with(observers()["target"]).live("green", seed=5, how="fovea", rate=0.3)
+        live = agent_with(observers()["search"]).live("green", seed=5, how="fovea", rate=0.3)
         buffer = np.empty((960, 1280, 3), np.uint8)
         for number in range(6):
             small = (scene(20 * number) * 255).byte().permute(1, 2, 0).numpy()
@@ -351,7 +348,7 @@ def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once():
 def test_a_moment_that_nobody_keeps_makes_no_photograph(monkeypatch):
     reduced = []
     monkeypatch.setattr("semfov.agents.fovea_episode._reduced", lambda *frame: reduced.append(frame))
-    live = agent_with(observers()["target"]).live("green", seed=5, how="fovea", rate=0.3)
+    live = agent_with(observers()["search"]).live("green", seed=5, how="fovea", rate=0.3)
     for number in range(6):
         moment = live.step(scene(20 * number), 0.2)
     assert moment.number == 5

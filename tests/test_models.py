@@ -11,7 +11,7 @@ import torch
 import semfov
 from semfov import FovealObservationModel
 from semfov.belief import Verification
-from semfov.io.compatibility import learned_for
+from semfov.observation.presence import presence_facts
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
@@ -19,12 +19,8 @@ from semfov.zoom.evidence import CASE
 from semfov.zoom.hint_maps import features
 from semfov.zoom.hints import Gist
 
-KINDS = (
-    FovealObservationModel, semfov.TargetEvidence, Verification, GlimpseEvidence,
-    semfov.saliency.FixationDensity,
-)  # fmt: skip
+KINDS = (FovealObservationModel, Verification, GlimpseEvidence, semfov.saliency.FixationDensity)
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
-TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 
 
@@ -75,32 +71,6 @@ def test_shipped_observation_models(path):
     assert sum(map(sum, model.metadata["counts"])) == model.metadata["samples"]
 
 
-def check_name(model, path):
-    """The name of a model matches the detector and the sensor that it was trained for."""
-    detector = path.stem.removesuffix("-published")
-    assert model.metadata["detector"]["name"] == detector
-    assert model.metadata["training"]
-    assert all(bool(tensor.any()) for tensor in model.state_dict().values())
-    assert learned_for(detector, model.metadata["sensor"]["growth"]) == path.stem
-
-
-@pytest.mark.parametrize("path", TARGET, ids=lambda path: path.stem)
-def test_shipped_models_of_target_evidence(path):
-    model = semfov.TargetEvidence.from_pretrained(path.stem)
-    check_name(model, path)
-    grid = semfov.Grid(10, 10, (640, 480))
-    box = torch.tensor([[[300.0, 200.0, 360.0, 260.0]]])
-    scores = torch.full((1, 1, 81), 0.001)
-    scores[..., 7] = 0.92
-    seen = semfov.Detections(box, scores, torch.ones(1, 1, dtype=torch.bool))
-    with torch.no_grad():
-        odds = model(seen, torch.tensor([[330.0, 230.0]]), grid, 7)[0]
-        other = model(seen, torch.tensor([[330.0, 230.0]]), grid, 8)[0]
-    middle = int(grid.cell_of(torch.tensor([330.0, 230.0])))
-    assert odds.argmax() == middle
-    assert odds[middle] > max(0.0, float(other[middle]) + 1)
-
-
 @pytest.mark.parametrize("kind", ["", "-sharp"])
 @pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x"])
 def test_shipped_models_make_semantic_maps(detector, kind):
@@ -146,25 +116,22 @@ def test_shipped_models_of_glimpse_evidence(path):
     torch.testing.assert_close(taper, taper.flip(0))
 
 
-SEARCHING = {"yolox-nano-search", "nanodet-plus-m-1.5x-search"}
 DETECTORS = ("yolov3-tiny", "yolox-nano", "nanodet-plus-m-1.5x")
 
 
 def test_every_detector_has_all_kinds_of_models():
-    names = {"yolov3-tiny", "yolox-nano"}
-    learned = {learned_for(name, growth) for name in names for growth in (1.0, 2.0)} | {"nanodet-plus-m-1.5x"}
-    assert {path.stem for path in TARGET} == learned
-    kinds = ("", "-sharp", "-published", "-published-narrow", "-zoom")
-    at_thresholds = {f"{name}-published-{threshold}" for name in names for threshold in (0.1, 0.25, 0.5)}
-    every = {name + kind for name in names | {"nanodet-plus-m-1.5x"} for kind in kinds}
-    assert {path.stem for path in OBSERVATION} == every | at_thresholds | SEARCHING
+    kinds = ("", "-sharp", "-published", "-published-narrow", "-zoom", "-search")
+    at_thresholds = {f"{name}-published-{threshold}" for name in DETECTORS[:2] for threshold in (0.1, 0.25, 0.5)}
+    every = {name + kind for name in DETECTORS for kind in kinds}
+    assert {path.stem for path in OBSERVATION} == every | at_thresholds
+    assert {path.stem for path in Verification.shipped.glob("*.safetensors")} == {*DETECTORS}
 
 
-@pytest.mark.parametrize("name", sorted(SEARCHING))
-def test_models_fitted_through_the_belief_go_on_from_the_others(name):
+@pytest.mark.parametrize("name", DETECTORS)
+def test_models_of_searches_go_on_from_the_others(name):
     """Of the same eye and α; nearer objects are missed less often, and fixated cells refute what covers them."""
-    model = semfov.FovealObservationModel.from_pretrained(name)
-    before = semfov.FovealObservationModel.from_pretrained(name.removesuffix("-search"))
+    model = semfov.FovealObservationModel.from_pretrained(f"{name}-search")
+    before = semfov.FovealObservationModel.from_pretrained(name)
     assert torch.equal(model.log_alpha, before.log_alpha)
     assert before.log_miss is None
     assert not before.log_exponents.any()
@@ -174,7 +141,39 @@ def test_models_fitted_through_the_belief_go_on_from_the_others(name):
     assert bool((odds[1, 1:] > odds[0, 1:]).all())
     assert float(model.refutation.detach()) > 0.5
     assert model.metadata["method"] == "search"
-    assert model.metadata["search"]["photographs"] > 40
+
+
+@pytest.mark.parametrize("name", ["yolox-nano", "nanodet-plus-m-1.5x"])
+def test_models_of_searches_say_what_they_were_fitted_to(name):
+    metadata = semfov.FovealObservationModel.from_pretrained(f"{name}-search").metadata
+    assert metadata["search"]["photographs"] > 40
+    assert metadata["training"]["holdout"] == 5
+    assert metadata["data"]
+
+
+def test_yolov3_tiny_searches_with_the_numbers_of_yolox_nano():
+    model, other = (
+        semfov.FovealObservationModel.from_pretrained(f"{name}-search") for name in ("yolov3-tiny", "yolox-nano")
+    )
+    assert "those of yolox-nano-search" in model.metadata["search"]
+    assert torch.equal(model.log_miss, other.log_miss)
+    assert torch.equal(model.presence.weight, other.presence.weight)
+    assert model.presence.thresholds == other.presence.thresholds
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_the_presence_of_models_of_searches_grows_with_what_the_looks_show(name):
+    presence = semfov.FovealObservationModel.from_pretrained(f"{name}-search").presence
+    assert bool((presence.weight > 0).all())
+    assert presence.shares.shape == (80,)
+    thresholds = presence.thresholds
+    assert 0.49 < thresholds.confirm < 1
+    assert 0 < thresholds.stop_below <= 0.3
+    # Nothing was seen in one look, and the class with certainty in the other: below and above the threshold.
+    facts = presence_facts(torch.tensor([[1e-6], [0.99]]), torch.tensor([1e-3, 0.95]).log())
+    unseen, seen = presence(facts).sigmoid().tolist()
+    assert unseen < 0.1
+    assert seen > thresholds.confirm
 
 
 @pytest.mark.parametrize("growth", [1.0, 2.0])
@@ -221,30 +220,6 @@ def test_published_agent_searches_and_explores(sensor):
         semfov.ActivePerception.published(sensor="gradual")
 
 
-def test_the_learned_chain_searches_and_explores_by_one_belief():
-    """Its policy goes by the belief that was fitted; a picture that shows the class holds it, without any head."""
-    agent = semfov.ActivePerception.learned_chain()
-    assert agent.searching.observer is agent.exploring.observer
-    assert agent.searching.observer.observation.metadata["method"] == "search"
-    assert agent.verification is None
-    scenes = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)
-    scene, target = scenes[0], scenes.targets(0)[0]
-    found = agent.search(scene.image, target, boxes=scene.boxes[scene.labels == target], start=0)
-    assert found.found
-    assert found.shifts <= 5
-    explored = agent.explore(scene.image, start=0, shifts=2)
-    assert len(explored) == 3
-    nowhere = torch.zeros(0, 4)  # boxes that no fixation lands on, so that both searches make all looks
-    present = agent.search(scene.image, target, start=0, shifts=4, boxes=nowhere)
-    absent = agent.search(scene.image, "toaster", start=0, shifts=4, boxes=nowhere)
-    assert present.presence[-1] > 10 * absent.presence[-1]
-
-
-def test_the_learned_chain_names_the_detectors_that_it_was_learned_for():
-    with pytest.raises(semfov.InputError, match=r"learned chain 'yolov3-tiny'; did you mean 'yolox-nano'"):
-        semfov.ActivePerception.learned_chain("yolov3-tiny")
-
-
 def test_recommended_agent_searches_and_explores():
     agent = semfov.ActivePerception.from_pretrained()
     scenes = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)
@@ -259,3 +234,7 @@ def test_recommended_agent_searches_and_explores():
     explored = agent.explore(scene.image, start=0, shifts=2)
     assert explored.posterior is None
     assert len(explored) == 3
+    nowhere = torch.zeros(0, 4)  # boxes that no fixation lands on, so that both searches make all looks
+    present = agent.search(scene.image, target, start=0, shifts=4, boxes=nowhere)
+    absent = agent.search(scene.image, "toaster", start=0, shifts=4, boxes=nowhere)
+    assert present.presence[-1] > 0.5 > absent.presence[-1]

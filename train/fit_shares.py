@@ -1,12 +1,12 @@
-"""How often the targets of a fit's searches were there: `python -m train.fit_shares` writes it into fitted models.
+"""How often the targets of a fit's searches were there: `python -m train.fit_shares` writes it into a fitted model.
 
-    python -m train.fit_shares --data.root DIR --data.annotations instances.json --windows FILE --evidence FILE
+    python -m train.fit_shares --data.root DIR --data.annotations instances.json --windows FILE
 
-The photographs are those that the models were fitted to. The shares follow from the rule by which a fit draws its
-searches. Evidence for windows looks at the photographs `looked`, one pass each, to correct them by class. Fits write
-the shares themselves, so this is for models that were fitted without them. The Brier score that is printed is that of
-searches of the photographs looked at for each of the commonest classes, with its share of these photographs as
-`prior`; each half of them has the correction of the other half.
+The photographs are those that the evidence for windows was fitted to. The shares follow from the rule by which a fit
+draws its searches; looks at the photographs `looked`, one pass each, correct them by class. Fits write the shares
+themselves, so this is for models that were fitted without them. The Brier score that is printed is that of searches of
+the photographs looked at for each of the commonest classes, with its share of these photographs as `prior`; each half
+of them has the correction of the other half.
 """
 
 import sys
@@ -17,11 +17,10 @@ import torch
 from torch import Tensor
 
 from semfov.belief.prior import with_prior
-from semfov.belief.target_evidence import TargetEvidence
 from semfov.data.scene import Scenes
-from semfov.errors import check
-from semfov.fit.evidence import FitSearchConfig, search_shares
+from semfov.errors import InputError, check
 from semfov.fit.photographs import measured_shares, shares_by_frequency
+from semfov.fit.settings import FitConfig
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
@@ -35,18 +34,19 @@ _COMMONEST = 10  # number of classes whose probabilities are judged
 
 
 @dataclass(frozen=True)
-class FitSharesConfig(FitSearchConfig):
-    """Write the shares of the searches of a fit into its models.
+class FitSharesConfig(FitConfig):
+    """Write the shares of the searches of a fit into its model.
 
     Args:
-        windows: file of evidence for windows (None: none).
+        data: the photographs from whose classes the searches of the fit were drawn.
+        windows: file of evidence for windows.
         looked: the photographs that evidence for windows was fitted to.
-        evidence: file of evidence for a target (None: none), whose searches were drawn by the settings.
     """
 
+    unused = ("sensor", "seed", "name")
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
     windows: Path | None = None
     looked: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    evidence: Path | None = None
     out: Path = Path("runs/fit_shares")
 
 
@@ -64,16 +64,12 @@ def _whole_looks(eye: WindowEye, scenes: Scenes) -> tuple[Tensor, Tensor]:
 
 def fit_shares(config: FitSharesConfig) -> None:
     """Write the shares, and print their range."""
+    if config.windows is None:
+        raise InputError("windows: expected the file of evidence for windows, got none")
     detector = make_detector(config.detector)
     scenes = make_scenes(config.data, detector.classes)
-    if config.windows is not None:
-        looked = make_scenes(config.looked, detector.classes)
-        _write_windows(config.windows, scenes, looked, WindowEye(detector).eval().requires_grad_(False))
-    if config.evidence is not None:
-        evidence = TargetEvidence.from_pretrained(config.evidence)
-        evidence.shares = search_shares(scenes, config)
-        evidence.save(config.evidence)
-        print(f"{config.evidence}: {_span(evidence.shares)}")
+    looked = make_scenes(config.looked, detector.classes)
+    _write_windows(config.windows, scenes, looked, WindowEye(detector).eval().requires_grad_(False))
 
 
 def _write_windows(path: Path, scenes: Scenes, looked: Scenes, eye: WindowEye) -> None:

@@ -4,31 +4,28 @@
 
 Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-The agent searches the photographs for present and for absent classes with its learned target evidence. After some looks
-the places that seem to hold the target are looked at closely: a window around each is enlarged to the detector's input.
-Two logistic regressions learn from these closer looks whether the target is at the place, and whether it is in the
-photograph. Then the searches are repeated, each with a model that was fitted to other photographs, to evaluate the
+The agent searches the photographs for present and for absent classes by a model that was fitted to search. After some
+looks the places that seem to hold the target are looked at closely: a window around each is enlarged to the detector's
+input. Two logistic regressions learn from these closer looks whether the target is at the place, and whether it is in
+the photograph. Then the searches are repeated, each with a model that was fitted to other photographs, to evaluate the
 decisions and to choose their threshold. The folder `out` gets the model (`<name>.safetensors`) and the report. All
 looks are stored, photograph by photograph, in the folder `cache`: the same command continues an interrupted fit.
 """
 
 import json
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from semfov.belief.target_evidence import TargetEvidence
 from semfov.errors import DataError
-from semfov.eye import Eye
 from semfov.fit.searches import open_photographs
 from semfov.fit.training import training_of
 from semfov.fit.verification import VerificationConfig, fit_in_folds
 from semfov.fit.verification_report import verification_report
-from semfov.io.ranges import Count
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import store_folder
-from semfov.runs.setup import make_eye, make_learned, make_scenes
+from semfov.runs.setup import make_eye, make_scenes, make_searching
 from semfov.runs.store import cell_store
 from train.outputs import model_path, write_outputs
 
@@ -38,48 +35,33 @@ class FitVerificationConfig(VerificationConfig):
     """Fit the verification of targets.
 
     Args:
-        target_model: learned target evidence, by name or file (None: the one for the detector and the sensor).
-        fitted: number of photographs that this evidence was fitted to (`--data.limit` of `train.fit_search` with
-            `--data.min_instances 2`); those from which it learned are left out here (None: none is left out).
+        search_model: observation model fitted to search, by name or file (None: the one shipped for the detector).
         cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
     """
 
     unused = ("workers", "scheduler")
     data: DataConfig = field(default_factory=DataConfig)
-    target_model: str | None = None
-    fitted: Count | None = None
+    search_model: str | None = None
     out: Path = Path("runs/fit_verification")
 
 
 def fit_verification(config: FitVerificationConfig) -> None:
     """Search the photographs, look closely at candidates, fit, evaluate in folds, and write all results."""
     eye = make_eye(config.detector, config.sensor)
-    evidence = make_learned(TargetEvidence, config.target_model, eye)
+    model = make_searching(config.search_model, eye)
     scenes = make_scenes(config.data, eye.detector.classes)
-    learned_from = _learned_from(config, eye, evidence)
-    chosen = [index for index, name in enumerate(scenes.ids) if name not in learned_from]
-    if len(chosen) < config.folds:
-        raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
+    if len(scenes) < config.folds:
+        raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(scenes)}")
     components = len(eye.detector.classes) + 1
     folder = store_folder(config.cache) / "searches"
     store = cell_store(folder, eye.settings(), config.columns, config.rows, components)
-    photographs = open_photographs(eye, scenes, chosen, config, store=store)
-    fitted = fit_in_folds(photographs, evidence, config)
-    fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
+    photographs = open_photographs(eye, scenes, range(len(scenes)), config, store=store)
+    fitted = fit_in_folds(photographs, model, config)
+    fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "search_model")}
     path = model_path(config, eye.detector.name)
     fitted.model.save(path)
     report = verification_report(fitted, f"{len(photographs)} photographs")
     write_outputs(config, report.text, ("judged.json", json.dumps(report.figures, indent=2) + "\n"), path)
-
-
-def _learned_from(config: FitVerificationConfig, eye: Eye, evidence: TargetEvidence) -> set[object]:
-    """Find the ids of the photographs that the target evidence learned from."""
-    if config.fitted is None:
-        return set()
-    data = replace(config.data, min_instances=2, max_target_area=None, limit=config.fitted)
-    ids = make_scenes(data, eye.detector.classes).ids
-    holdout = evidence.metadata.get("training", {}).get("holdout", 5)
-    return {name for number, name in enumerate(ids) if number % holdout}
 
 
 main = command(fit_verification, FitVerificationConfig, __doc__)

@@ -1,16 +1,10 @@
 """What fits write: the model, a report, and the settings and measures."""
 
-import json
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from semfov.fit.looking import Looking
-from semfov.fit.settings import FitOnLooksConfig
-from semfov.fit.training import Fit
 from semfov.io.files import inside, write_text
-from semfov.runs.scene_run import finish
 
 
 class OutputSettings(Protocol):
@@ -65,18 +59,3 @@ def write_outputs(config: OutputSettings, report: str, figures: tuple[str, str],
     if model is not None:
         written.insert(0, model)
     print("written:", *(f"  {path}" for path in written), sep="\n")
-
-
-def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, Looking], Fit[Any]]) -> None:
-    """Look from every cell, fit, and write the model, the report, the settings and the measures.
-
-    Args:
-        config: settings of the fit.
-        fit: fits a model to stored looks.
-    """
-    run = Looking(config)
-    finish(run, "looking")
-    fitted = fit(config, run)
-    path = model_path(config, run.eye.detector.name)
-    fitted.model.save(path)
-    write_outputs(config, fitted.report, ("judged.json", json.dumps(fitted.judged, indent=2) + "\n"), path)

@@ -14,13 +14,14 @@ from torch import Tensor
 
 from benchmarks.fuzz.runner import Case, Draw, changed
 from semfov import DirichletStatistics, FovealObservationModel
-from semfov.belief import TargetEvidence
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
 from semfov.errors import DataError
 from semfov.io import storage
 from semfov.io.pretrained import Pretrained
 from semfov.io.storage import read_tensors, write_tensors
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 
 CFG = """[net]
 width=32
@@ -47,7 +48,7 @@ JUNK: list[Any] = [
 
 
 def model_files(draw: Draw, folder: Path) -> Case:
-    """Observation models, statistics, target evidence and cached tensors: truncated, or with changed bits or bytes."""
+    """Observation models, statistics and cached tensors: truncated, or with changed bits or bytes."""
     name = draw.choose(_SAVED, "file")
     save, load = _SAVED[name]
     path, again = folder / "file.safetensors", folder / "again.safetensors"
@@ -99,7 +100,7 @@ def darknet_files(draw: Draw, folder: Path) -> Case:
 
 def model_fields(draw: Draw, folder: Path) -> Case:
     """Models with a changed tensor or value, and a correct checksum: refused, or loaded exactly as the file says."""
-    model = draw.choose((_model, _evidence), "model")()
+    model = draw.choose((_model, _search_model), "model")()
     kind = type(model)
     tensors = {name: tensor.detach().clone() for name, tensor in model._tensors().items()}
     record = json.loads(json.dumps({"kind": kind.kind, "version": "0", **model._record(), "metadata": model.metadata}))
@@ -127,9 +128,10 @@ def model_fields(draw: Draw, folder: Path) -> Case:
         storage.write_file(path, tensors, record)
 
     def check(loaded: Pretrained) -> None:
-        for name, tensor in loaded._tensors().items():
-            assert torch.equal(tensor, tensors[name]), name
-            assert bool(tensor.isfinite().all())
+        kept = loaded._tensors()
+        assert all(bool(tensor.isfinite().all()) for tensor in kept.values())
+        for name, tensor in tensors.items():
+            assert torch.equal(kept[name], tensor), name
         restored = json.loads(json.dumps({**loaded._record(), "metadata": loaded.metadata}))
         assert all(restored[key] == record[key] for key in restored if key in record), damage
         if isinstance(loaded, FovealObservationModel):
@@ -169,10 +171,16 @@ def _model() -> FovealObservationModel:
         )
 
 
-def _evidence() -> TargetEvidence:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return TargetEvidence(2, 3, components=3)
+def _search_model() -> FovealObservationModel:
+    thresholds = Thresholds(0.75, stop_below=0.125, place=0.25)
+    return FovealObservationModel.identity(
+        ["cup", "cat"],
+        [0.2],
+        miss_odds=torch.full((3, 2), 0.01),
+        refutation=0.9,
+        presence=Presence(torch.tensor(-0.5), torch.tensor([0.75, 0.25]), torch.tensor([0.25, 0.5]), thresholds),
+        metadata={"detector": {"name": "toy"}},
+    )
 
 
 def _statistics() -> DirichletStatistics:
@@ -184,10 +192,9 @@ def _content(loaded: object) -> str:
     if isinstance(loaded, tuple):
         statistics, record = loaded
         return f"{statistics.count.tolist()} {statistics.sums.tolist()} {record}"
-    assert isinstance(loaded, FovealObservationModel | TargetEvidence)
+    assert isinstance(loaded, FovealObservationModel)
     state = {name: tensor.tolist() for name, tensor in loaded.state_dict().items()}
-    about = (loaded.classes, loaded.epsilon) if isinstance(loaded, FovealObservationModel) else loaded.widths
-    return f"{state} {loaded.metadata} {about}"
+    return f"{state} {loaded.metadata} {loaded._record()}"
 
 
 def _load_cached(path: Path) -> object:
@@ -198,8 +205,7 @@ def _load_cached(path: Path) -> object:
 
 
 _SAVED: dict[str, tuple[Callable[[Path], None], Callable[[Path], object]]] = {
-    "observation model": (lambda path: _model().save(path), FovealObservationModel.from_pretrained),
+    "observation model": (lambda path: _search_model().save(path), FovealObservationModel.from_pretrained),
     "statistics": (lambda path: _statistics().save(path), DirichletStatistics.load),
-    "target evidence": (lambda path: _evidence().save(path), TargetEvidence.from_pretrained),
     "cached tensors": (lambda path: write_tensors(path, "key", {"a": torch.arange(9.0)}), _load_cached),
 }

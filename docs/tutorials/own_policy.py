@@ -33,10 +33,10 @@ print(policies.policy_names("exploration"))
 # ## Put it into an agent
 #
 # An agent is an eye with a strategy for search and one for exploration. We take the eye and the map of the
-# recommended agent for the published fovea, and combine them with the new policy.
+# recommended agent, and combine them with the new policy.
 
 # %% alt="The scanpath over a photograph of a market by the new policy, with the foveated views and the classes of the map"
-recommended = semfov.ActivePerception.recommended(sigma=100, growth=1)
+recommended = semfov.ActivePerception.recommended()
 search = recommended.searching.observer, recommended.searching.policy
 mapper, closer = recommended.exploring.observer, recommended.exploring.policy
 agents = {

@@ -9,7 +9,7 @@ scores predict the true class, background included. Use photographs on which the
 Then every photograph is searched for a class that it holds and for a class that it does not hold. Tables and a
 reliability diagram show how well the belief's probabilities agree with which cells hold the target, by number of looks
 and by distance from the closest fixation. The beliefs use raw scores, calibrated scores as published, tempered scores,
-and learned evidence. Detections from every cell are stored and shared with `python -m eval.search`.
+and learned observation models. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
 from eval.calibration.evaluation import CalibrationConfig, judge_calibration

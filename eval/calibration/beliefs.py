@@ -18,8 +18,7 @@ from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
 from eval.decide.run import detected_on_landing, landing
 from eval.search.run import SearchConfig
-from semfov.belief import TargetEvidence
-from semfov.belief.observers import Observer, SemanticMap, Target
+from semfov.belief.observers import Observer, SemanticMap, SemanticSearch
 from semfov.episode import Step, rollout
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.looking import CellLooks
@@ -31,7 +30,7 @@ from semfov.gaze.policies import Policy
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import label
 from semfov.runs.results import ResultRecord
-from semfov.runs.setup import make_learned, make_map
+from semfov.runs.setup import make_map, make_searching
 
 COUNTS = (1, 5, 15)
 """Numbers of looks after which beliefs are evaluated."""
@@ -60,7 +59,7 @@ LEARNED, MAP = "learned", "semantic map"
 class BeliefCalibrationRun(ComparedLooking):
     """Two searches in every scene, for a present class and for an absent class, that do not stop at the target.
 
-    The learned target evidence guides the gaze, as in the agent. Where no such model is shipped, the tempered belief
+    The learned belief guides the gaze, as in the agent. Where no model of searches is shipped, the tempered belief
     guides it. All beliefs are updated with the same looks.
     """
 
@@ -71,16 +70,14 @@ class BeliefCalibrationRun(ComparedLooking):
         super().__init__(replace(config, policies=tuple(_ALL_CLASSES.values())))
         self.left_out: dict[str, str] = {}
         belief, leave_out = self.config.belief, self.left_out.__setitem__
-        evidence = if_shipped(
-            partial(make_learned, TargetEvidence), belief.target_model, self.eye, partial(leave_out, LEARNED)
-        )
+        of_search = if_shipped(make_searching, belief.search_model, self.eye, partial(leave_out, LEARNED))
         of_map = if_shipped(make_map, belief.map_model, self.eye, partial(leave_out, MAP))
-        self.models = self.models._replace(evidence=evidence, map=of_map)
+        self.models = self.models._replace(search=of_search, map=of_map)
         self.observers: dict[str, Observer] = {
             name: self.strategies[label(choice, self.task)].observer for name, choice in _ALL_CLASSES.items()
         }
-        if evidence is not None:
-            self.observers[LEARNED] = Target(evidence)
+        if of_search is not None:
+            self.observers[LEARNED] = SemanticSearch(of_search)
         if of_map is not None:
             self.observers[MAP] = SemanticMap(of_map)
 

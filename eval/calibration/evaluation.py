@@ -40,7 +40,7 @@ class CalibrationConfig(EyeConfig):
         seed: random seed of the fixations and of the searches.
         beliefs: evaluate beliefs, too, for which every cell of every photograph is fixated once.
         grid: `[columns, rows]` of the grid of the beliefs.
-        target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
+        search_model: observation model of searches, by name or file (None: the one shipped for the detector).
         map_model: observation model of the semantic map, by name or file (None: ours for the detector and sensor).
         target_area: a class is searched for only if its boxes cover at most this share of the image.
         out: folder for the tables and the figures.
@@ -56,7 +56,7 @@ class CalibrationConfig(EyeConfig):
     seed: Seed = 0
     beliefs: bool = True
     grid: tuple[Side, Side] = (10, 10)
-    target_model: str | None = None
+    search_model: str | None = None
     map_model: str | None = None
     target_area: Share = 0.2
     out: Path = Path("runs/calibration")
@@ -94,7 +94,7 @@ def judge_beliefs(config: CalibrationConfig) -> None:
         belief=BeliefConfig(
             *config.grid,
             model=config.model,
-            target_model=config.target_model,
+            search_model=config.search_model,
             map_model=config.map_model,
         ),
         protocol=ProtocolConfig(shifts=COUNTS[-1] - 1, seed=config.seed),

@@ -11,8 +11,7 @@ from semfov.eye import Eye
 from semfov.gaze.acquisition.base import FUNCTIONS
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DetectorConfig, PolicyConfig
-from semfov.runs.presets import TARGET_EVIDENCE as EVIDENCE
-from semfov.runs.presets import resolve
+from semfov.runs.presets import AGENT, resolve
 
 _Config = TypeVar("_Config", bound=ComparedConfig)
 
@@ -27,11 +26,11 @@ def with_models(config: _Config) -> _Config:
     if config.models is None:
         return config
     folder = ModelFolder(config.models)
-    for name in ("model", "target_model", "map_model"):
+    for name in ("model", "search_model", "map_model"):
         value = getattr(config.belief, name)
         check(value is None, f"belief.{name}", "null, since models defines it", value)
-    files = {part: folder.file(part) for part in ("observation", "evidence")}
-    names = {"model": "observation", "target_model": "evidence"}
+    files = {part: folder.file(part) for part in ("observation", "search")}
+    names = {"model": "observation", "search_model": "search"}
     columns, rows = folder.manifest.grid
     models: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
     models["map_model"] = _text(config.models if files["observation"] else None)
@@ -76,8 +75,8 @@ def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> str | Po
     """Return the policy that the agent of a folder uses."""
     if config.task == "exploration":
         return PolicyConfig("closer-look", "learned") if folder.file("observation") else "random-raw"
-    if folder.used("evidence"):
-        return EVIDENCE
+    if folder.used("search"):
+        return AGENT
     if not folder.used("tempering"):
         return "non-predictive-raw"
     settings = folder.manifest.parts["tempering"].settings
@@ -89,10 +88,10 @@ def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> str | Po
 def _needs(choice: str | PolicyConfig, config: ComparedConfig) -> list[str]:
     """Parts of the folder that a policy needs."""
     policy = resolve(choice, config.task)
-    if policy.policy == EVIDENCE:
-        return ["evidence"]
+    if policy.scores == "learned":
+        return ["search"] if config.task == "search" else ["observation"]
     model = policy.policy in FUNCTIONS and FUNCTIONS[policy.policy].needs_model
-    return ["observation"] if model or policy.scores in ("calibrated", "learned") else []
+    return ["observation"] if model or policy.scores == "calibrated" else []
 
 
 def _text(path: Path | None) -> str | None:

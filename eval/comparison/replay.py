@@ -6,7 +6,7 @@ import torch
 
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.model_folder import if_shipped
-from semfov.belief.observers import Observer, Semantic, SemanticMap
+from semfov.belief.observers import Observer, Semantic, SemanticMap, SemanticSearch
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Given
 from semfov.paths import Scanpath
@@ -18,9 +18,8 @@ from semfov.runs.setup import make_map
 def replay(run: ComparedLooking, index: int, record: ResultRecord) -> Scanpath:
     """Replay a recorded episode.
 
-    A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:
-    that of the recommended agent or, if no model is shipped for the eye, one by Kaplan's rule from tempered
-    scores.
+    The learned belief of searches is no map of all classes, which is then maintained beside it: that of the recommended
+    agent or, if no model is shipped for the eye, one by Kaplan's rule from tempered scores.
     """
     grid, candidate = run.grid(index), run.candidate(record["policy"], index)
     cue = record.get("cue")
@@ -35,7 +34,7 @@ def replay(run: ComparedLooking, index: int, record: ResultRecord) -> Scanpath:
         most=cells.shape[1],
     )
     beside: Observer | None = None
-    if not isinstance(candidate.observer, Semantic | SemanticMap):
+    if isinstance(candidate.observer, SemanticSearch):
         model = if_shipped(make_map, run.config.belief.map_model, run.eye)
         beside = Semantic(len(run.scenes.classes) + 1, tempering=0.5) if model is None else SemanticMap(model)
     with torch.no_grad():

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.plain import PLAIN, plain_rules
-from eval.decide.run import AGENT, LANDINGS, LANDINGS_TEXT, landing_cells
+from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
+from semfov.runs.presets import AGENT
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -20,13 +20,12 @@ from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.belief.look_features import highest_score
-from semfov.belief.observers import Semantic, Target
-from semfov.belief.target_evidence import Thresholds
+from semfov.belief.observers import Observer, Semantic
+from semfov.belief.prior import Prior
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation
 from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, cell_of, conclude, confirms, decide
-from semfov.detection.detections import Detections
+from semfov.detection.detections import Detections, highest_score
 from semfov.episode import Looks, Step, StoredLooks
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye
@@ -38,10 +37,12 @@ from semfov.gaze.policies import Policy
 from semfov.io.ranges import Range, Share
 from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looks import photograph_looks
+from semfov.runs.presets import AGENT
 from semfov.runs.results import ResultRecord
-from semfov.runs.setup import make_learned, make_observation
+from semfov.runs.setup import make_observation, make_verification
 from semfov.runs.store import RememberedLooks
 from semfov.settings import DecisionSettings
 from semfov.strategy import Strategy
@@ -55,8 +56,8 @@ _Rule = Callable[[Step, int, Grid], Tensor]
 WINDOWS = "windows"
 """The way of the recommended agent: a look at the whole photograph, and closer looks at windows."""
 
-AGENT, UNVERIFIED, RANDOM = "target-evidence", "target-evidence, no closer looks", "random gaze"
-"""Ways to search with a fovea: with closer looks and without, and the same belief with random gaze."""
+UNVERIFIED, RANDOM = f"{AGENT}, no closer looks", "random gaze"
+"""Other ways to search with the agent's belief: without closer looks, and with random gaze."""
 
 PUBLISHED, CALIBRATED = "published belief", "calibrated belief"
 """Beliefs by Kaplan's rule from calibrated scores: with an observation model of the paper's, fitted by maximum
@@ -71,7 +72,7 @@ class DecideConfig(ComparedConfig):
     """Search for present and for absent classes, each until a decision.
 
     Args:
-        belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
+        belief: the belief, a grid of class distributions; `search_model` is the agent's.
         protocol: the protocol; `shifts` and `seed` are used.
         confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
             in the image for a search without closer looks (None: the model's own threshold).
@@ -88,12 +89,12 @@ class DecideConfig(ComparedConfig):
         references: also search without closer looks, with random gaze and with the published belief, for which
             photographs are looked at from every cell; without them the agent's looks suffice.
         out: folder for tables, records and the figure.
-        models: folder written by `semfov fit`, which defines detector, sensor, grid, learned evidence and
+        models: folder written by `semfov fit`, which defines detector, sensor, grid, the model of searches and
             verification.
     """
 
     unused = ("saliency", "policies")
-    policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
+    policies: tuple[str | PolicyConfig, ...] = (AGENT,)
     confirm: Share | None = None
     stop_below: Share | None = None
     place: Share | None = None
@@ -114,7 +115,7 @@ class DecideConfig(ComparedConfig):
 
 
 class DecisionRun(ComparedLooking):
-    """Searches with the learned target evidence, with the same belief under random gaze, and with the published belief.
+    """Searches of the agent, with the same belief under random gaze, and with the published belief.
 
     The published belief (calibrated scores, Kaplan's rule, predictive search) decides in two ways: by the same
     thresholds as the others, and, without thresholds, as soon as a detection at the gaze shows the target. It is called
@@ -131,20 +132,18 @@ class DecisionRun(ComparedLooking):
         # The key of the run, which the base makes first, depends on this model.
         self.verification: Verification | None = None
         super().__init__(config)
-        evidence = self.models.evidence
-        assert evidence is not None
-        chosen = evidence.thresholds or Thresholds(0.9, 0.05)
+        # All share one observer, so that the likelihoods of the looks are computed only once.
+        observer = self.strategies[AGENT].observer
+        chosen = observer.thresholds or Thresholds(0.9, 0.05)
         self.thresholds = chosen.changed(config.confirm, config.stop_below, config.place)
-        # The shipped model was fitted with the shipped evidence.
-        if config.closer and (config.verification or config.belief.target_model is None):
-            self.verification = if_shipped(partial(make_learned, Verification), config.verification, self.eye)
+        # The shipped verification was fitted with the shipped model of searches.
+        if config.closer and (config.verification or config.belief.search_model is None):
+            self.verification = if_shipped(make_verification, config.verification, self.eye)
         self.verified = {AGENT, RANDOM} if self.verification is not None else set()
         self.by_windows = WindowEye(self.eye.detector).eval().requires_grad_(False)
         self.windows = None
-        if config.belief.target_model is None or config.windows is not None:
+        if config.belief.search_model is None or config.windows is not None:
             self.windows = if_shipped(_window_evidence, config.windows, self.eye)
-        # All share one observer, so that the likelihoods of the looks are computed only once.
-        observer = Target(evidence)
         learned, random = Strategy(observer, Policy("non-predictive")), Strategy(observer, Policy("random"))
         self.compared: dict[str, tuple[Strategy, _Rule]] = {AGENT: (learned, self._by_thresholds)}
         if not config.references:
@@ -170,13 +169,15 @@ class DecisionRun(ComparedLooking):
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
-    def _verifier(self, closer: Callable[[tuple[float, ...]], Detections], grid: Grid, target: int) -> Verifier[Step]:
-        """Return the closer looks of one search."""
+    def _verifier(
+        self, closer: Callable[[tuple[float, ...]], Detections], grid: Grid, target: int, prior: Prior
+    ) -> Verifier[Step]:
+        """Return the closer looks of one search, with a share of the searches whose target is there."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
         config = self.config
         thresholds = self.verification.thresholds.changed(config.confirm, config.stop_below, config.place)
-        candidates = CandidateCells(grid, target)
+        candidates = CandidateCells(grid, target, prior=prior)
         return Verifier(
             self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
         )
@@ -252,12 +253,19 @@ class DecisionRun(ComparedLooking):
             looks: Looks = CellLooks(remembered, grid, grid.centres, target)
             if everywhere is not None:
                 looks = StoredLooks(everywhere, grid, torch.tensor([target]))
-            for name, (strategy, judge) in self.compared.items():
+            # Ways with one observer have one here, too, so that looks are weighed once.
+            told: dict[Observer, tuple[Strategy, Prior]] = {}
+            for name, (compared, judge) in self.compared.items():
 
                 def rule(step: Step, judge: _Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
-                verifier = self._verifier(remembered, grid, target) if name in self.verified else None
+                if compared.observer not in told:
+                    # Targets are drawn as they were in the fit, and there as often.
+                    told[compared.observer] = compared.with_prior("fit", target)
+                changed, prior = told[compared.observer]
+                strategy = Strategy(changed.observer, compared.policy)
+                verifier = self._verifier(remembered, grid, target, prior) if name in self.verified else None
                 with torch.inference_mode():
                     steps = search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
                     last, path = steps[-1], torch.cat([step.cell for step in steps])

@@ -15,9 +15,8 @@ from torch.nn import functional as F
 
 from eval.comparison.records import own_settings
 from eval.head.scan import Scan
-from semfov.belief import TargetEvidence
 from semfov.belief.belief import Belief
-from semfov.belief.observers import SemanticMap, Target
+from semfov.belief.observers import SemanticMap, SemanticSearch
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
@@ -38,7 +37,7 @@ from semfov.runs.config import DataConfig, SensorConfig, WorkConfig
 from semfov.runs.looks import LOOK_SOURCES, tight
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
-from semfov.runs.setup import make_eye, make_learned, make_map, make_scenes
+from semfov.runs.setup import make_eye, make_map, make_scenes, make_searching
 from semfov.runs.store import DetectionStore, RememberedLooks
 from semfov.sensor.sphere import Boxes
 
@@ -109,7 +108,7 @@ class HeadRun(SceneRun):
         check(0 < config.prior < 1, "prior", "a probability above 0 and below 1", config.prior)
         self.eye = make_eye(config.detector, SensorConfig())
         self.fovea = SensorConfig().fovea
-        self.target_evidence = make_learned(TargetEvidence, None, self.eye)
+        self.searching = make_searching(None, self.eye)
         self.observation = make_map(None, self.eye)
         photographs = make_scenes(config.data, self.eye.detector.classes)
         if not len(photographs):
@@ -131,7 +130,7 @@ class HeadRun(SceneRun):
 
     def depends_on(self) -> dict[str, Any]:
         """List the eye, its models and the settings."""
-        models = [self.target_evidence, self.observation]
+        models = [self.searching, self.observation]
         return {"eye": self.eye.settings(), "models": models, "settings": own_settings(self.config)}
 
     def world(self, index: int) -> World:
@@ -208,7 +207,7 @@ class HeadRun(SceneRun):
         config, records = self.config, list[ResultRecord]()
         places, labels = self.places(index), self.scenes.annotation(index).labels
         gain = SearchGain(views, config.foresight)
-        observer = SceneObserver(Target(self.target_evidence), views, prior=config.prior)
+        observer = SceneObserver(SemanticSearch(self.searching, footprint="overlap"), views, prior=config.prior)
         for target in self.targets(index):
             target_places, start = places[labels == target], self.start(index, views, target)
             if bool(_rests_on(views, start, target_places).any()):

@@ -14,6 +14,7 @@ from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import check
 from semfov.runs.config import PolicyConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.presets import AGENT
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class IVSNConfig(SearchConfig):
         "random",
         "non-predictive-raw",
         TemplateAttention.name,
-        "target-evidence",
+        AGENT,
     )
     templates: str | None = None
     out: Path = Path("runs/ivsn")

@@ -22,6 +22,7 @@ from semfov.runs.config import (
     Scores,
     SensorConfig,
 )
+from semfov.runs.presets import AGENT
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 
@@ -81,7 +82,7 @@ _BEYOND = (
     PolicyConfig("non-predictive", tempering=0.25),
     CENTRAL,
     PolicyConfig("non-predictive", "calibrated", tempering=0.25, footprint="soft"),
-    "target-evidence",
+    AGENT,
 )
 """Search policies with semfov's own sensor and models."""
 
@@ -265,9 +266,8 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         yield f"beyond-search-{name}", seek(policies=_BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
-            yield f"{control}-{name}", seek(policies=("random", "target-evidence"), protocol=protocol)
+            yield f"{control}-{name}", seek(policies=("random", AGENT), protocol=protocol)
         yield f"decide-{name}", DecideConfig(**common)
-        yield f"decide-published-{name}", DecideConfig(**common, sensor=sensor)
         every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
         yield f"beliefs-{name}", CalibrationConfig(**every)
         yield f"beyond-explore-{name}", tour(policies=_BEYOND_EXPLORATION)

@@ -15,6 +15,7 @@ from semfov.fit.protocols import Trial, episodes_of, run_episodes
 from semfov.gaze.acquisition.base import Task
 from semfov.io.ranges import Whole
 from semfov.runs.config import PolicyConfig
+from semfov.runs.presets import AGENT
 from semfov.runs.results import ResultRecord
 from semfov.runs.seeds import noise_for
 
@@ -25,13 +26,11 @@ class SearchConfig(ComparedConfig):
 
     Args:
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
-            scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
-            `published` (predictive-calibrated), `target-evidence`, `random`, `vocus2`, `itti-koch`, `people`;
-            `non-predictive-fitted` (an observation model fitted through the belief);
-            and `non-predictive` (also called `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
-            `place-information`, `entropy-limit` or `ideal-observer`, each followed by `-raw` or `-calibrated`. The last
-            four also take `-learned`, which uses the same evidence as `target-evidence`;
-            `maximum-a-posteriori-learned` is `target-evidence` itself.
+            scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (non-predictive-learned),
+            `published` (predictive-calibrated), `random`, `vocus2`, `itti-koch`, `people`; and `non-predictive` (also
+            called `maximum-a-posteriori`), `foveal-hit`, `place-information`, `entropy-limit`, `ideal-observer`,
+            `predictive` or `neighbourhood`, each followed by `-raw` or `-calibrated`, or but for the last two by
+            `-learned`, the belief of the agent.
         out: folder for tables, figures, per-episode records and the manifest.
         scanpaths: number of episodes to draw as figures.
     """
@@ -42,7 +41,7 @@ class SearchConfig(ComparedConfig):
         "predictive-raw",
         "non-predictive-calibrated",
         "predictive-calibrated",
-        "target-evidence",
+        AGENT,
     )
     out: Path = Path("runs/search")
     scanpaths: Whole = 3

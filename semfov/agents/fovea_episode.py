@@ -20,7 +20,6 @@ from torch.nn import functional as F
 from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, no_frame_yet, on_cpu
 from semfov.belief import Belief, Grid, Verification
 from semfov.belief.prior import Prior, PriorLike
-from semfov.belief.target_evidence import Thresholds
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
 from semfov.decision import MOST_CLOSER, OUTCOMES, CandidateCells, CloseUp, Decision, Verifier
 from semfov.decision.stopping import ByCloserLooks, ByPresence, StoppingCriterion
@@ -32,6 +31,7 @@ from semfov.eye import Eye
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_by
 from semfov.gaze.viewer import Viewer
 from semfov.motion import Motion
+from semfov.observation.thresholds import Thresholds
 from semfov.paths import Ending, FoveaMoment, GazePrediction, Scanpath
 from semfov.paths.fovea import FoveaLook, moment_look
 from semfov.paths.stimulus import Stimulus, in_bytes, reduced_copy

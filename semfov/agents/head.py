@@ -9,12 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, on_cpu
-from semfov.belief.observers import SemanticMap, Target
-from semfov.belief.prior import Prior
-from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.belief.observers import SemanticMap, SemanticSearch
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import Color
-from semfov.decision import Decision, check_thresholds, conclude, place_known, settle
+from semfov.decision import OUTCOMES, Decision, check_thresholds, most_evident_box, place_known, settle
 from semfov.detection.load import load_detector
 from semfov.errors import InputError, check_number, check_whole
 from semfov.eye import Eye
@@ -24,20 +22,21 @@ from semfov.head.closer import CloserLooks
 from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
-from semfov.io.compatibility import learned_for, trained_for
+from semfov.io.compatibility import searching_for, trained_for
 from semfov.io.pretrained import shipped_model
 from semfov.kinds import HEAD
 from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.thresholds import Thresholds
 from semfov.paths import Ending, HeadPath
 from semfov.paths.head import HeadLook, head_look
 from semfov.paths.stimulus import reduced_copy
 from semfov.sensor.foveation import Foveation
 from semfov.settings import MOST_PASSES, ExploreSettings, FindSettings, LookSettings, SearchSettings, StartSettings
 
-_SIGMA = 100.0  # width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels
+_SIGMA = 100.0  # width of the fovea that the shipped models were fitted with, in pixels of a view of 640 pixels
 _PASSES = 40  # default of the largest number of looks
 _DURATION = 30.0  # default time limit of a scene in seconds
-_CONFIRM = 0.7  # probability of the target in the fixated cell at which a search ends as found
+_CONFIRM = 0.65  # probability of the target in the fixated cell at which a search ends as found
 
 
 class HeadAgent(nn.Module):
@@ -49,7 +48,7 @@ class HeadAgent(nn.Module):
 
     Args:
         eye: sensor and detector.
-        search: evidence model for a target.
+        search: observation model fitted for searches.
         explore: observation model for a map.
 
     Attributes:
@@ -62,10 +61,11 @@ class HeadAgent(nn.Module):
         print(path, path.gaze(-1))
     """
 
-    def __init__(self, eye: Eye, search: TargetEvidence, explore: FovealObservationModel) -> None:
+    def __init__(self, eye: Eye, search: FovealObservationModel, explore: FovealObservationModel) -> None:
         super().__init__()
         self.eye, self.classes = eye, ("background", *eye.detector.classes)
-        self.target_evidence, self.observation = search, explore
+        self.searching = search
+        self.observation = explore
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", **options: Any) -> Self:
@@ -83,9 +83,9 @@ class HeadAgent(nn.Module):
             DataError: the weights cannot be obtained, or are damaged.
         """
         eye = Eye(Foveation(_SIGMA, growth=2.0), load_detector(name, **options))
-        shipped = shipped_model(TargetEvidence, learned_for(eye.detector.name, 2.0), name)
-        search = TargetEvidence.from_pretrained(shipped)
-        explore = FovealObservationModel.from_pretrained(trained_for(eye.detector.name, 2.0))
+        fitted = shipped_model(FovealObservationModel, searching_for(eye.detector.name), name)
+        search = FovealObservationModel.from_pretrained(fitted)
+        explore = FovealObservationModel.from_pretrained(trained_for(eye.detector.name, growth=2))
         search.check_compatible(eye.settings())
         explore.check_compatible(eye.settings())
         return cls(eye, search, explore).eval().requires_grad_(False)
@@ -115,7 +115,7 @@ class HeadAgent(nn.Module):
         """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerSecond`).
 
         The target is found when the gaze is on a cell that holds it with a probability of at least `confirm` (None:
-        0.7). It is absent if every cell that the views show was fixated, or is less probable than `stop_below` (None:
+        0.65). It is absent if every cell that the views show was fixated, or is less probable than `stop_below` (None:
         than a cell that was never seen), and no cell holds it with a probability of one half. Both end the search. A
         search that a limit ends is undecided (`semfov.decision.settle`).
 
@@ -142,18 +142,19 @@ class HeadAgent(nn.Module):
         check_number(foresight, "foresight", 0, 1e6)
         limits = EpisodeLimits.of(settings, _PASSES)
         views = self.views(scene, color)
-        evidence = on_cpu(self.target_evidence)  # where the geometry of the scene is
-        prior = Prior.of(settings.prior, evidence.shares, index)
-        never_seen = prior(chance)
+        model = on_cpu(self.searching)  # where the geometry of the scene is
+        # Views are resampled to the cells of the scene, in which a single cell would be blurred.
+        inner = SemanticSearch(model, footprint="overlap").with_prior(settings.prior, index)
+        never_seen = inner.prior(chance)
         gain = SearchGain(views, foresight)
-        observer = SceneObserver(Target(evidence, prior=prior), views, prior=never_seen)
+        observer = SceneObserver(inner, views, prior=never_seen)
         confirm = _CONFIRM if settings.confirm is None else settings.confirm
         stop_below = never_seen if settings.stop_below is None else settings.stop_below
         thresholds = Thresholds(confirm, stop_below, place=confirm)
         return HeadEpisode(
             self, observer, gain, index,
             thresholds=thresholds, limits=limits, start=_first_action(settings), duration=_duration(settings),
-            seed=settings.seed, prior=settings.given_share, assumed=prior.assumed,
+            seed=settings.seed, prior=settings.given_share, assumed=inner.prior.assumed,
         ).run()  # fmt: skip
 
     def find_all(
@@ -407,9 +408,9 @@ def _decide_look(views: Views, step: HeadStep, target: int, thresholds: Threshol
     # in which a cell that was never seen has exactly the threshold.
     best_unseen = probability.masked_fill(belief.examined | ~views.reachable, 0).amax(-1)
     outcome = int(settle(belief.presence(target).double(), located, best_unseen, thresholds))
-    looks = [step.detections]
-    decision = conclude(outcome, belief, looks, views.view_grid, target, cell_of_view, thresholds.confirm)
-    if decision.outcome != "found":
-        return decision
-    box = None if decision.box is None else views.world.boxes(decision.box[None], views.poses[pose])[0]
-    return replace(decision, cell=int(cell), box=box, place=float(at_gaze[0, 0]))
+    presence = float(belief.presence(target))
+    if OUTCOMES[outcome] != "found":
+        return Decision(OUTCOMES[outcome], presence, confirm=thresholds.confirm)
+    in_view = most_evident_box([step.detections], views.view_grid, target, cell_of_view)
+    box = None if in_view is None else views.world.boxes(in_view[None], views.poses[pose])[0]
+    return Decision("found", presence, int(cell), box, float(at_gaze[0, 0]), thresholds.confirm)

@@ -81,7 +81,7 @@ class WindowTask:
 
     def __post_init__(self) -> None:
         if self.evidence is None and self.goal.searches:
-            Prior.of(self.decisions.prior, None, 0)  # without evidence there is no probability
+            Prior.of(self.decisions.prior, None)  # without evidence there is no probability
 
     def takes_slices(self, lattice: Lattice) -> bool:
         """Whether a picture is looked at by slices, in the order of the overview's scores: not chosen by a belief."""

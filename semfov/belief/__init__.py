@@ -8,7 +8,6 @@ from semfov.belief.belief import Belief, DirichletBelief
 from semfov.belief.fusion import fuse
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, likelihoods
-from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 
 __all__ = [
@@ -17,7 +16,6 @@ __all__ = [
     "Footprint",
     "Grid",
     "Observation",
-    "TargetEvidence",
     "Verification",
     "fuse",
     "fusion",

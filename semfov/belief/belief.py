@@ -100,7 +100,7 @@ class Belief(ABC):
             InputError: the belief is about a single target.
         """
         raise InputError(
-            f"belief: expected a belief about all classes (of observers.Semantic or SemanticMap), got "
+            f"belief: expected a belief about all classes (of observers.Semantic, SemanticMap or SemanticSearch), got "
             f"{type(self).__name__}"
         )
 

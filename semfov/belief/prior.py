@@ -8,10 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check
-from semfov.io.schema import Field, is_number
-
-SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
-"""Schema of the shares, by class, of the searches of a fit whose target was there, in the file of a model."""
+from semfov.io.schema import is_number
 
 PriorLike: TypeAlias = float | Literal["fit"] | None
 """A share of the pictures that hold the target, `fit` for that of the searches of the fit, or None for one half."""
@@ -61,31 +58,30 @@ class Prior:
     known: bool = True
 
     @classmethod
-    def of(cls, prior: PriorLike, shares: Tensor | None, target: int) -> Self:
+    def of(cls, prior: PriorLike, fitted: float | None, usual: float | None = None) -> Self:
         """Compare a share with that of the fit.
 
         Args:
             prior: share of the searches whose target is there; None for one half, `fit` for that of the fit. Models
                 that do not know the share of their fit stay as they are.
-            shares: `(K,)`, by class, those of the fit; None if they are not known.
-            target: class 1..K.
+            fitted: share that the probabilities of the model assume; None if it is not known.
+            usual: share in the searches of the fit; None if they assume the same.
 
         Returns:
             Both shares.
 
         Raises:
-            InputError: the share is no probability between 0 and 1, or those of the fit are not known.
+            InputError: the share is no probability between 0 and 1, or that of the fit is not known.
         """
         if prior is not None and prior != "fit":
             check_share(prior)
             remedy = "use ActivePerception.recommended, or fit them to your detector (semfov fit)"
-            expected = "None for models without the shares of their fit"
-            check(shares is not None, "prior", expected, f"{prior}; {remedy}")
-        if shares is None:
+            expected = "None for models without the share of their fit"
+            check(fitted is not None, "prior", expected, f"{prior}; {remedy}")
+        if fitted is None:
             return cls(known=False)
-        fitted = float(shares[target - 1])
         if prior == "fit":
-            return cls(fitted, fitted)
+            return cls(fitted if usual is None else usual, fitted)
         return cls(0.5 if prior is None else float(prior), fitted)
 
     @property

@@ -7,11 +7,11 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.target_evidence import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
 from semfov.detection.detections import Detections
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Field, Schema
 from semfov.observation.matching import box_iou
+from semfov.observation.thresholds import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
 
 CLOSER_FEATURES = 7  # number of features of a closer look (`closer_features`)
 _MATCHED = 0.3  # least overlap (intersection over union) of a detection with a box at which it shows the same object

@@ -15,7 +15,6 @@ from semfov.detection.onnx_file import write_settings
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check, check_device
 from semfov.io.manifest import Manifest
-from semfov.sensor import SENSORS, Foveation
 
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
@@ -146,15 +145,9 @@ def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePercept
     if options.models is not None:
         return _load_from_folder(options, options.models, loading)
     if options.agent == "recommended":
-        sensor = SENSORS[options.sensor or "gradual"]
-        kind = sensor.make.__name__
-        check(sensor.make is Foveation, "sensor", "a Foveation, since models are shipped for no other sensor", kind)
-        sigma = sensor.settings["sigma"]
-        growth = sensor.settings["growth"]
-        return ActivePerception.recommended(options.detector, sigma=sigma, growth=growth, **loading)
-    if options.agent == "learned-chain":
-        check(options.sensor in (None, "gradual"), "sensor", "gradual with --agent learned-chain", options.sensor)
-        return ActivePerception.learned_chain(options.detector, **loading)
+        expected = "gradual with --agent recommended, whose models are fitted for it"
+        check(options.sensor in (None, "gradual"), "sensor", expected, options.sensor)
+        return ActivePerception.recommended(options.detector, **loading)
     make = ActivePerception.published if options.agent == "published" else ActivePerception.raw
     return make(options.detector, sensor=options.sensor or "published", **loading)
 

@@ -1,11 +1,11 @@
 """Subcommand detectors: lists the detectors that can be named, or the classes of one."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import fspath
 from pathlib import Path
 
 from semfov.agent import ActivePerception
-from semfov.belief import TargetEvidence, Verification
+from semfov.belief import Verification
 from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import DetectorsOptions
 from semfov.cli.outcome import table_lines
@@ -14,20 +14,21 @@ from semfov.detection.load import check_detector, load_detector
 from semfov.detection.weights import WEIGHTS, weights_path
 from semfov.errors import check
 from semfov.gaze.saliency import FixationDensity
+from semfov.io.compatibility import searching_for
 from semfov.io.files import cache_folder
 from semfov.io.manifest import Manifest
 from semfov.io.pretrained import Pretrained
 from semfov.observation.foveal import FovealObservationModel
 from semfov.zoom import GlimpseEvidence
 
-_PURPOSES: dict[str, type[Pretrained]] = {
-    "search": TargetEvidence,
-    "closer looks": Verification,
-    "explore": FovealObservationModel,
-    "large pictures": GlimpseEvidence,
-    "gaze": FixationDensity,
+_PURPOSES: dict[str, tuple[type[Pretrained], Callable[[str], str]]] = {
+    "search": (FovealObservationModel, searching_for),
+    "closer looks": (Verification, str),
+    "explore": (FovealObservationModel, str),
+    "large pictures": (GlimpseEvidence, str),
+    "gaze": (FixationDensity, str),
 }
-"""Models that are shipped for some detectors, by what they are for."""
+"""Models that are shipped for some detectors, by what they are for: their kind, and their name for a detector's."""
 
 _WIDTH = 100  # characters of a line of names
 
@@ -79,7 +80,11 @@ def show(options: DetectorsOptions) -> int:
     for name, weights in WEIGHTS.items():
         elsewhere = "downloaded when needed" if weights.sources else "given by --weights"
         place = "here" if weights_path(name).is_file() else elsewhere
-        purposes = [purpose for purpose, kind in _PURPOSES.items() if (kind.shipped / f"{name}.safetensors").is_file()]
+        purposes = [
+            purpose
+            for purpose, (kind, model) in _PURPOSES.items()
+            if (kind.shipped / f"{model(name)}.safetensors").is_file()
+        ]
         rows.append([name, f"{weights.size / 1e6:.0f} MB", place, ", ".join(purposes) or "none", weights.licence])
     print("\n".join(table_lines(rows)))
     print(f"\nDownloaded weights are kept in {cache_folder()}.")

@@ -66,7 +66,7 @@ class DetectorOptions(Settings):
     device: str | None = None
 
 
-AgentKind = Literal["recommended", "published", "learned-chain", "raw"]
+AgentKind = Literal["recommended", "published", "raw"]
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ class AgentOptions(StartSettings, DetectorOptions):
 
     Args:
         agent: `recommended` (learned models, if they are shipped for the detector), `published` (the paper's:
-            calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration), `learned-chain` (the
-            paper's chain, trained through the belief) or `raw` (any detector, no model: scores as they are).
+            calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
+            no model: scores as they are).
         detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
         half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.

@@ -39,7 +39,7 @@ does (`settle`):
     ending of the record     "decision" if it is over or found; else the limit, or "cells" / "shifts" of a fovea and
                              "windows" where none is left
 
-Without learned evidence a search has no probabilities: a detection whose score is at least `confirm` is `found`
+Without fitted models a search has no probabilities: a detection whose score is at least `confirm` is `found`
 (ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.
 """
 
@@ -62,6 +62,7 @@ from semfov.decision.rule import (
     final_outcome,
     found_at_once,
     gains_less,
+    most_evident_box,
     place_known,
     settle,
 )
@@ -91,6 +92,7 @@ __all__ = [
     "final_outcome",
     "found_at_once",
     "gains_less",
+    "most_evident_box",
     "place_known",
     "settle",
 ]

@@ -11,7 +11,6 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.prior import Prior
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import closer_features
 from semfov.data.inputs import FRAME
 from semfov.decision.rule import CloseUp, cell_of, place_known
@@ -19,6 +18,7 @@ from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.motion import Motion
 from semfov.observation.matching import box_iou, inside_frame
+from semfov.observation.thresholds import Thresholds
 
 SAME = 0.5  # boxes with at least this overlap (intersection over union) are of the same object
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again

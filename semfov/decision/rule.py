@@ -9,11 +9,11 @@ from torch import Tensor
 
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import InputError, check, check_whole
 from semfov.io.schema import is_number
+from semfov.observation.thresholds import Thresholds
 from semfov.words import DECISION, OtherWords
 
 Outcome = Literal["found", "absent", "undecided"]
@@ -32,7 +32,7 @@ class Decision(OtherWords):
 
     Attributes:
         outcome: `found`, `absent`, or `undecided`.
-        probability: that the picture holds the target; without learned evidence the best score of a detection.
+        probability: that the picture holds the target; without fitted models the best score of a detection.
         cell: cell of the found target, where places are cells.
         box: box `(4,)` of the found target, if a detection shows it.
         place: probability that the target is there; None where only its presence was judged.
@@ -173,10 +173,9 @@ def conclude(
     if OUTCOMES[outcome] != "found":
         return Decision(OUTCOMES[outcome], presence, confirm=confirm)
     probability = belief.probability(target)[0]
-    evidence = [_evidence_of_cells(look, grid, target) for look in looks]
     if cell is None:
-        cell = _strongest_cell(probability, evidence)
-    box = _most_evident_box(looks, evidence, cell)
+        cell = _strongest_cell(probability, [_evidence_of_cells(look, grid, target) for look in looks])
+    box = most_evident_box(looks, grid, target, cell)
     return Decision("found", presence, cell, box, float(probability[cell]), confirm)
 
 
@@ -200,12 +199,22 @@ def _evidence_of_cells(look: Detections, grid: Grid, target: int) -> Tensor:
     return grid.footprint(look.boxes, "soft")[0] * scores[:, None]
 
 
-def _most_evident_box(looks: Sequence[Detections], evidence: Sequence[Tensor], cell: int) -> Tensor | None:
-    """Box `(4,)` of the detection with the strongest evidence in a cell; None if no detection has any there."""
+def most_evident_box(looks: Sequence[Detections], grid: Grid, target: int, cell: int) -> Tensor | None:
+    """Find the detection that shows the target in a cell with the strongest evidence: its score times its footprint.
+
+    Args:
+        looks: detections of the looks, batches of one.
+        grid: the cells.
+        target: class 1..K.
+        cell: number of the cell.
+
+    Returns:
+        Its box `(4,)`; None if no detection has any evidence there.
+    """
     highest = 0.0
     box = None
-    for look, evidence_of_look in zip(looks, evidence, strict=True):
-        in_cell = evidence_of_look[:, cell]
+    for look in looks:
+        in_cell = _evidence_of_cells(look, grid, target)[:, cell]
         if len(in_cell) and float(in_cell.max()) > highest:
             highest = float(in_cell.max())
             box = look.boxes[0, int(in_cell.argmax())]

@@ -10,7 +10,6 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
-from semfov.belief.target_evidence import Thresholds
 from semfov.data.inputs import FRAME
 from semfov.decision.candidates import CandidatePlace
 from semfov.decision.rule import FOUND, GO_ON, CloseUp, Decision, conclude, decide, detects, gains_less
@@ -18,6 +17,7 @@ from semfov.decision.state import DecisionState
 from semfov.decision.verifier import Verifier
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
+from semfov.observation.thresholds import Thresholds
 
 _MOST_RECENT = 1000  # largest number of looks whose detections are kept in a stream
 

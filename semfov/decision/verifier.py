@@ -8,7 +8,6 @@ from typing import Generic, NamedTuple
 import torch
 from torch import Tensor
 
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, follow_target
 from semfov.data.inputs import FRAME
 from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, LookAt, LookType
@@ -17,6 +16,7 @@ from semfov.episode import Step
 from semfov.errors import check, check_whole
 from semfov.motion import Motion
 from semfov.observation.matching import box_iou, inside_frame
+from semfov.observation.thresholds import Thresholds
 
 MOST_CLOSER = 2
 """Number of closer looks after which a place is found that is probable enough; by default a search makes no more."""

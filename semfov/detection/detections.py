@@ -325,3 +325,18 @@ class Detections:
             image = replace(image, confidence=confidence[None])
         order = vectors[:, 1:].amax(-1).argsort(descending=True, stable=True)
         return image.take(order)
+
+
+def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
+    """Find the highest score of classes among the detections of each look.
+
+    Args:
+        detections: a batch of B looks.
+        target: a class, or classes `(T,)`.
+
+    Returns:
+        `(B,)`, or `(B, T)`; 0 without detections.
+    """
+    scores = detections.scores * detections.mask[..., None]
+    highest = scores.amax(1) if scores.shape[1] else scores.new_zeros(len(scores), scores.shape[-1])
+    return highest[..., target]

@@ -100,15 +100,22 @@ class OnnxDetector(Detector):
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
-        return self.propose_likely(_checked_floats(canvas), 0.0)
+        return self._propose(_checked_floats(canvas), 0.0)
 
     def propose_bytes(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas of bytes `(B, 3, H, W)`, converted directly to the input."""
         check_bytes(canvas)
-        return self.propose_likely(canvas, 0.0)
+        return self._propose(canvas, 0.0)
 
     def propose_likely(self, canvas: Tensor, least: float) -> Candidates:
         """Compute the boxes of the head that may have a confidence; after the first pass few others are decoded."""
+        kind = type(self)
+        if kind.propose is not OnnxDetector.propose or kind.propose_bytes is not OnnxDetector.propose_bytes:
+            return super().propose_likely(canvas, least)  # a subclass computes its boxes in its own way
+        return self._propose(canvas, least)
+
+    def _propose(self, canvas: Tensor, least: float) -> Candidates:
+        """Compute the boxes of the head that may have a confidence."""
         self._check_canvas(canvas)
         if canvas.dtype == torch.uint8:
             image = self.preprocessing.of_bytes(canvas)

@@ -137,7 +137,6 @@ class CellGazes(Gazes[CellEpisode]):
         task: `search` or `exploration`.
         settings: cost and reward of looks, and what observations contain.
         count: B, the number of episodes.
-        together: whether learned beliefs of all episodes are computed at once.
         pictures: whether the looks of the first episode are kept, so that they can be drawn.
 
     Attributes:
@@ -166,7 +165,6 @@ class CellGazes(Gazes[CellEpisode]):
         settings: GazeSettings,
         count: int = 1,
         *,
-        together: bool = False,
         pictures: bool = False,
     ) -> None:
         rows, columns = scenery.shape
@@ -179,7 +177,7 @@ class CellGazes(Gazes[CellEpisode]):
         self.belief_space = spaces.Box(0, 1, (belief_planes + 2, rows, columns), np.float32)
         super().__init__(scenery, task, settings, count)
         self.pictures = pictures
-        self.observer: Observer = scenery.together if together else scenery.observer
+        self.observer = scenery.observer
         self.looks = _SceneLooks(scenery.open, self.observer, count)
         self.cell = torch.zeros(count, dtype=torch.int64)
         self.size = torch.zeros(count, 2)

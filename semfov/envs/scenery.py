@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import check_cells
-from semfov.belief.observers import Observer, Target
+from semfov.belief.observers import Observer
 from semfov.data import Annotation, Scenes, class_index
 from semfov.data.large import open_large
 from semfov.data.mosaics import Mosaics
@@ -116,7 +116,6 @@ class Scenery(_Surroundings[Eye]):
         protocol: starts of the episodes, and the largest number of shifts.
         shape: numbers of rows and columns of the cells.
         observer: keeps the belief.
-        together: keeps beliefs of all episodes of a batch at once: faster, but its rounding depends on the batch.
         scenes: numbers of the scenes with objects to look for.
         episodes: lists all episodes of a scene.
         grid: lays the cells over a scene.
@@ -136,9 +135,6 @@ class Scenery(_Surroundings[Eye]):
         self.shape = (looking.config.belief.rows, looking.config.belief.columns)
         self.annotation = self.pictures.annotation
         self.observer: Observer = looking.strategies[self.policy].observer
-        self.together = self.observer
-        if isinstance(self.observer, Target):
-            self.together = type(self.observer)(self.observer.model, together=True)
         # Results are kept for as long as an environment uses this scenery.
         self.episodes = cache(self._list)
         self.grid = cache(looking.grid)

@@ -25,8 +25,7 @@ _KIND = "GazeVectorEnv"
 class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], EzPickle):
     """Many episodes side by side, each in a scene of its own; a step of all is one step of the batched loop.
 
-    With seed s, environment i does the same as a `GazeEnv` with seed s + i. With `together`, the default, learned
-    beliefs of all episodes are computed at once. This is faster, but the rounding then depends on the batch.
+    With seed s, environment i does the same as a `GazeEnv` with seed s + i.
 
     Invariant: `_terminated` and `_truncated` `(num_envs,)` say how each episode has ended. Both are false while it goes
     on, that is from its start to the step that ends it. `_randoms` has a generator for each environment.
@@ -40,7 +39,6 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         belief: whether observations contain the belief.
         glimpse: side in pixels of the foveated image that observations contain; None leaves it out.
         detections: whether infos contain the detections.
-        together: whether learned beliefs of all episodes are computed at once.
         autoreset_mode: when finished episodes restart: in the next step (`NextStep`, Gymnasium's default), in the same
             step (`SameStep`), or when a reset names them (`Disabled`).
         options: options of `open_scenery`, where no scenery is given.
@@ -68,7 +66,6 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         belief: bool = False,
         glimpse: int | None = None,
         detections: bool = True,
-        together: bool = True,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options: object,
     ) -> None:
@@ -90,11 +87,10 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
             belief=belief,
             glimpse=glimpse,
             detections=detections,
-            together=together,
             autoreset_mode=mode,
         )
         settings = GazeSettings(look_cost, find, belief, glimpse)
-        self.gazes = CellGazes(self.scenery, self.task, settings, num_envs, together=together)
+        self.gazes = CellGazes(self.scenery, self.task, settings, num_envs)
         self.single_observation_space = self.gazes.observation_space
         self.single_action_space = self.gazes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)

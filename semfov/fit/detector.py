@@ -49,12 +49,11 @@ def fit_detector(
 ) -> ActivePerception:
     """Fit all models that the recommended agent needs to a detector, and return the agent.
 
-    This is `semfov fit` as a function. The detector looks at every photograph from every cell. Then
-    an observation model, the exponent of its likelihoods, target evidence and the verification of targets by closer
-    looks are fitted, and, on mosaics of enough photographs, the evidence for pictures larger than the detector's input
-    (unless `windows=False`). Each of them is compared with raw scores on held-out photographs, and
-    the verification with the same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent
-    again.
+    This is `semfov fit` as a function. The detector looks at every photograph from every cell. Then an observation
+    model, the exponent of its likelihoods, the model of searches and the verification of targets by closer looks are
+    fitted, and, on mosaics of enough photographs, the evidence for pictures larger than the detector's input (unless
+    `windows=False`). Each of them is compared with raw scores on held-out photographs, and the verification with the
+    same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent again.
 
     Args:
         model: the detector: a name or a file, as for `semfov.load_detector`.

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from semfov.errors import DataError, InputError
-from semfov.fit.evidence_part import EvidenceFit
 from semfov.fit.looking import Looking
 from semfov.fit.observation import ObservationFit
 from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.search_part import SearchFit
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.tempering import TemperingFit
 from semfov.fit.verification_part import VerificationFit
@@ -27,7 +27,7 @@ from semfov.runs.setup import detector_options
 FITS: dict[str, type[PartFit]] = {
     "observation": ObservationFit,
     "tempering": TemperingFit,
-    "evidence": EvidenceFit,
+    "search": SearchFit,
     "verification": VerificationFit,
     "windows": WindowsFit,
 }

@@ -11,7 +11,7 @@ from semfov.runs.tables import table
 _TITLES = {
     "observation": "Observation model (scores of detections)",
     "tempering": "Tempering",
-    "evidence": "Target evidence (searches)",
+    "search": "Search model (searches)",
     "verification": "Verification (closer looks)",
     "windows": "Evidence by magnification (large pictures)",
 }
@@ -101,9 +101,8 @@ def thin_classes(counts: Mapping[str, int], thin: int) -> list[str]:
             lines += [f"**{words} to learn from** ({len(names)} classes): {', '.join(names)}.", ""]
     if lines:
         lines += [
-            "The target evidence processes the scores of all classes with one network; only one number per class, its "
-            "frequency, is separate. The semantic map has three numbers for all classes. The observation model changes "
-            "the scores of a class without examples very little.",
+            "The search model and the semantic map have a few numbers each, the same for all classes. The observation "
+            "model changes the scores of a class without examples very little.",
             "",
         ]
     return lines

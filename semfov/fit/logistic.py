@@ -9,7 +9,13 @@ _CONVERGED = 1e-9
 
 
 def logistic_regression(
-    facts: Tensor, right: Tensor, *, times: Tensor | None = None, ridge: float = 1.0, steps: int = 30
+    facts: Tensor,
+    right: Tensor,
+    *,
+    times: Tensor | None = None,
+    known: Tensor | None = None,
+    ridge: float = 1.0,
+    steps: int = 30,
 ) -> list[float]:
     """Fit a logistic regression by penalised maximum likelihood, with Newton's method.
 
@@ -17,6 +23,7 @@ def logistic_regression(
         facts: `(n, m)`, inputs of each case.
         right: `(n,)`, the answers, 0 or 1.
         times: `(n,)`, how often each case counts; None: once.
+        known: `(n,)`, log odds of each case that are given, and to which the fitted ones are added; None: 0.
         ridge: strength with which the weights are held near 0.
         steps: largest number of steps.
 
@@ -31,11 +38,14 @@ def logistic_regression(
     weight[-2:] = 0.5
     if times is not None:
         weight[:-2] = times
+    given = torch.zeros_like(weight)
+    if known is not None:
+        given[:-2] = known
     prior = torch.full((inputs.shape[-1],), ridge, dtype=torch.float64)
     prior[0] = _OF_OFFSET
     coefficients = torch.zeros_like(prior)
     for _ in range(steps):
-        chance = (inputs @ coefficients).sigmoid()
+        chance = (given + inputs @ coefficients).sigmoid()
         gradient = inputs.T @ (weight * (answers - chance)) - prior * coefficients
         curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + prior.diag()
         step = torch.linalg.solve(curvature, gradient).clamp(-_LONGEST_STEP, _LONGEST_STEP)

@@ -112,7 +112,7 @@ class Looking(SceneRun):
 
 
 class CellLooks(Looks):
-    """Looks at one image from the centres of its cells; the evidence of each is weighed when an episode makes it.
+    """Looks at one image from the centres of its cells; each is weighed when an episode makes it.
 
     Attributes:
         look: gives the detections from a cell, by number.

@@ -34,7 +34,7 @@ FOOTPRINT: Footprint = "box_centre"
 """Which cells a detection updates where scores are fused with an exponent of their own."""
 
 _FEW = 8  # detectors with fewer classes also learn from photographs that contain none of them
-_MANY = 100  # with at least this many photographs, one in five is held out and training takes all its steps
+_MANY = 100  # with at least this many photographs, one in five is held out
 _MOST_SHIFTS = 15  # maximum number of gaze shifts in the searches and explorations that are compared
 
 
@@ -57,7 +57,7 @@ class PartInputs:
 
     Attributes:
         run: the photographs, and their looks from every cell of a grid.
-        config: the settings of the whole fit, with numbers of steps for so many photographs.
+        config: the settings of the whole fit, with the share that is held out of so many photographs.
         components: number of scores in all, K + 1.
         absent: number of absent classes to search for in a photograph; None: as many as present ones.
         protocol: the searches and explorations by which parts are compared.
@@ -69,12 +69,10 @@ class PartInputs:
 
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.run = run
-        # Few photographs leave fewer to learn from, in fewer steps, and still some to compare on.
-        share = min(len(run.scenes) / _MANY, 1)
+        # Of few photographs more are held out, so that there are some to compare on.
         self.config = replace(
             config,
-            holdout=config.holdout or (3 if share < 1 else 5),
-            steps=config.steps or max(250, round(500 * share)),
+            holdout=config.holdout or (3 if len(run.scenes) < _MANY else 5),
         )
         self.components = len(run.scenes.classes) + 1
         self.absent = 2 if self.components <= _FEW else None

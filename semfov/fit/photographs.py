@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
@@ -19,6 +18,7 @@ from semfov.fit.verification_report import verification_report
 from semfov.fit.windows_certainty import Exploration, fit_spread, left_out
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.certainty import Certainty

@@ -5,8 +5,7 @@ from dataclasses import asdict, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from semfov.belief import TargetEvidence
-from semfov.belief.observers import Observer, Semantic, SemanticMap, Target
+from semfov.belief.observers import Observer, Semantic, SemanticMap, SemanticSearch
 from semfov.errors import check
 from semfov.eye import Eye
 from semfov.fit.looking import Looking
@@ -16,12 +15,12 @@ from semfov.gaze.policies import Policy
 from semfov.io.code import class_digest
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
-from semfov.runs.presets import TARGET_EVIDENCE, label, resolve
+from semfov.runs.presets import label, resolve
 from semfov.runs.scene_run import SceneRun, digest_of
-from semfov.runs.setup import make_fitted, make_learned, make_map, make_observation
+from semfov.runs.setup import make_map, make_observation, make_searching
 from semfov.strategy import Strategy
 
-_OF_SEMANTIC = ("footprint", "tempering", "memory", "misses", "association")
+_OF_SEMANTIC = ("footprint", "tempering", "memory", "misses")
 """Settings of the belief that a policy may have of its own."""
 
 
@@ -48,7 +47,7 @@ class PolicyLooking(Looking):
                 policy, self.task, config.belief, len(self.scenes.classes) + 1, models, config.sensor.fovea
             )
             # Policies with the same belief share an observer, which then weighs each look only once.
-            observer = observers.setdefault(_belief_settings(policy, self.task), strategy.observer)
+            observer = observers.setdefault(_belief_settings(policy), strategy.observer)
             self.strategies[name] = Strategy(observer, strategy.policy)
         self.models = _Models(**models.loaded)
 
@@ -67,7 +66,7 @@ class PolicyLooking(Looking):
         return {
             **super().depends_on(),
             "task": self.task,
-            "models": [models.observation, models.fitted, models.evidence, models.map],
+            "models": [models.observation, models.search, models.map],
             # Models count by their digests, and the size of batches changes nothing.
             "belief": {name: value for name, value in belief.items() if not name.endswith("model")},
             "protocol": {name: value for name, value in protocol.items() if name != "batch"},
@@ -90,8 +89,7 @@ class _Models(NamedTuple):
     """Fitted models that the policies of a run need; None for a model that no policy needs."""
 
     observation: FovealObservationModel | None = None
-    fitted: FovealObservationModel | None = None
-    evidence: TargetEvidence | None = None
+    search: FovealObservationModel | None = None
     map: FovealObservationModel | None = None
 
 
@@ -113,22 +111,13 @@ def _load(name: str, belief: BeliefConfig, eye: Eye) -> Any:
     """Load a model that a policy needs, and check that it was fitted for the detector and the sensor."""
     if name == "observation":
         return make_observation(belief.model, eye)
-    if name == "fitted":
-        return make_fitted(belief.search_model, eye)
-    if name == "evidence":
-        return make_learned(TargetEvidence, belief.target_model, eye)
+    if name == "search":
+        return make_searching(belief.search_model, eye)
     return make_map(belief.map_model, eye)
 
 
-def _by_evidence(policy: PolicyConfig, task: Task) -> bool:
-    """Tell whether a policy uses the learned target evidence."""
-    return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
-
-
-def _belief_settings(policy: PolicyConfig, task: Task) -> PolicyConfig:
+def _belief_settings(policy: PolicyConfig) -> PolicyConfig:
     """Return settings that are equal for policies with the same belief: those of the policy without its choice."""
-    if _by_evidence(policy, task):
-        return replace(policy, policy=TARGET_EVIDENCE, scores="learned", saliency=None, samples=None)
     return replace(policy, policy=Uniform.name, saliency=None, samples=None)
 
 
@@ -148,15 +137,10 @@ def _make_strategy(
     Returns:
         The strategy.
     """
-    if policy.policy == TARGET_EVIDENCE:
-        return Strategy(Target(model("evidence")), Policy("non-predictive"))
     chosen = _make_policy(policy, belief, model, fovea)
-    if _by_evidence(policy, task):
-        return Strategy(Target(model("evidence")), chosen)
     if policy.scores == "learned":
-        return Strategy(SemanticMap(model("map")), chosen)
-    if policy.scores == "fitted":
-        return Strategy(Semantic.searching(model("fitted")), chosen)
+        observer = SemanticSearch(model("search")) if task == "search" else SemanticMap(model("map"))
+        return Strategy(observer, chosen)
     return Strategy(_make_semantic(policy, belief, components, model), chosen)
 
 

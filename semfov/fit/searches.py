@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Target
-from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.belief.observers import SemanticSearch
 from semfov.data.scene import Scenes
 from semfov.decision import MOST_CLOSER, OUTCOMES, CandidateCells, CandidatePlaces, cell_of, conclude, decide
 from semfov.decision.candidates import LookType
@@ -22,6 +21,8 @@ from semfov.fit.looking import CellLooks
 from semfov.fit.protocols import DrawnSearch, choose_classes, choose_searches
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
@@ -82,11 +83,11 @@ class TargetSearch(ABC, Generic[LookType]):
         """Tell whether the target is at a box `(4,)`."""
 
     def outcome(self, index: int, thresholds: Thresholds) -> int:
-        """Decide after a look by the evidence alone: the outcome's number in `OUTCOMES`, 0 to go on."""
+        """Decide after a look by the belief alone: the outcome's number in `OUTCOMES`, 0 to go on."""
         return 0
 
     def found_right(self, index: int) -> bool:
-        """Tell whether the target is at the place that a search finds after a look by the evidence alone."""
+        """Tell whether the target is at the place that a search finds after a look by the belief alone."""
         raise NotImplementedError(f"{type(self).__name__} finds no place without closer looks")
 
     def unverified_end(self, thresholds: Thresholds | None) -> SearchEnd:
@@ -203,7 +204,7 @@ class _PhotographSearch(TargetSearch[Step]):
     after = (1, 3, 5, 8, 12)
 
     def __init__(
-        self, photograph: SearchedPhotograph, search: DrawnSearch, evidence: TargetEvidence, looks: int
+        self, photograph: SearchedPhotograph, search: DrawnSearch, model: FovealObservationModel, looks: int
     ) -> None:
         self.picture = photograph.number
         self.target = search.target
@@ -211,7 +212,7 @@ class _PhotographSearch(TargetSearch[Step]):
         self.spare = search.spare
         self.photograph = photograph
         self.search = search
-        self.evidence = evidence
+        self.model = model
         self.most_looks = looks
 
     @cached_property
@@ -221,7 +222,7 @@ class _PhotographSearch(TargetSearch[Step]):
         grid = photograph.grid
         source = CellLooks(photograph.looks, grid, grid.centres, self.target)
         choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), source.like))
-        observer = Target(self.evidence)
+        observer = SemanticSearch(self.model)
         policy = TargetPosterior(self.target)
         return list(rollout(source, observer, policy, self.search.start, choice, most=self.most_looks))
 
@@ -245,7 +246,7 @@ class _PhotographSearch(TargetSearch[Step]):
         return int(decide(self.steps[index], self.target, thresholds))
 
     def found_right(self, index: int) -> bool:
-        """Tell whether an object overlaps the cell of strongest evidence."""
+        """Tell whether an object overlaps the cell of the decision."""
         looks = [step.detections for step in self.steps[: index + 1]]
         found = OUTCOMES.index("found")
         decision = conclude(found, self.steps[index].belief, looks, self.photograph.grid, self.target)
@@ -253,13 +254,13 @@ class _PhotographSearch(TargetSearch[Step]):
 
 
 def photograph_searches(
-    photographs: Sequence[SearchedPhotograph], evidence: TargetEvidence, looks: int, title: str
+    photographs: Sequence[SearchedPhotograph], model: FovealObservationModel, looks: int, title: str
 ) -> Iterator[_PhotographSearch]:
     """Search photographs for all their classes; after the searches of one, its looks are stored and freed.
 
     Args:
         photographs: photographs with the classes to search for.
-        evidence: tells from the looks where the class may be.
+        model: tells from the looks where the class may be.
         looks: largest number of looks in a search.
         title: title of the progress bar.
 
@@ -268,5 +269,5 @@ def photograph_searches(
     """
     for photograph in track(photographs, title, "photograph"):
         for search in photograph.targets:
-            yield _PhotographSearch(photograph, search, evidence, looks)
+            yield _PhotographSearch(photograph, search, model, looks)
         photograph.looks.close()

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from semfov.errors import InputError
 from semfov.fit.gaze_model import GazeModelFit
@@ -45,29 +45,6 @@ class FitOnCellsConfig(FitConfig):
 
 
 @dataclass(frozen=True)
-class FitOnLooksConfig(FitOnCellsConfig):
-    """Base of the settings of fits on looks from every cell of photographs.
-
-    Args:
-        holdout: one in every n photographs is held out for the evaluation.
-        looks: number of looks in a training episode.
-        steps: number of training steps.
-        batch: number of examples in a step.
-        rate: highest learning rate.
-    """
-
-    # Share of the fixations in training that are drawn at random, so that the model learns from all cells.
-    astray: ClassVar[float] = 0.3
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
-    holdout: Annotated[int, Range(2, 10**9)] = 5
-    looks: Annotated[int, Range(2, 10_000)] = 16
-    steps: Count = 500
-    batch: Count = 48
-    rate: Positive = 5e-3
-    out: Path = Path("runs/fit")
-
-
-@dataclass(frozen=True)
 class FitDetectorConfig(FitOnCellsConfig):
     """Fit all models that the agent needs to your own detector.
 
@@ -81,7 +58,7 @@ class FitDetectorConfig(FitOnCellsConfig):
         judged: maximum number of held-out photographs on which searches and explorations are compared with raw scores,
             and to which the verification is fitted.
         fixations: looks at each photograph to fit the observation model to.
-        steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
+        steps: steps of the fit through the belief, by which searches land on their targets sooner.
         windows: also fit the evidence for pictures larger than the detector's input, if there are enough photographs.
         window_steps: training steps of that evidence.
         gaze: pictures that people viewed, to fit where people look to. Without photographs, nothing else is fitted.
@@ -97,7 +74,7 @@ class FitDetectorConfig(FitOnCellsConfig):
     holdout: Annotated[int, Range(2, 10**9)] | None = None
     judged: Count = 100
     fixations: Count = 8
-    steps: Count | None = None
+    steps: Count = 150
     windows: bool = True
     window_steps: Count = 400
     gaze: GazeModelFit = field(default_factory=GazeModelFit)

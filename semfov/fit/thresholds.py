@@ -5,8 +5,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, settle
+from semfov.observation.thresholds import Thresholds
 
 SUREST = 0.99
 """Upper limit of the threshold for found targets."""

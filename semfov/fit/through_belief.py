@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Semantic
+from semfov.belief.observers import SemanticSearch
 from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
@@ -94,7 +94,7 @@ def searches_of(
     return SearchedLooks(looks, fixations, grid, torch.tensor([*goals]), torch.stack([*goals.values()]))
 
 
-def landing_loss(observer: Semantic, searched: SearchedLooks, order: Tensor) -> Tensor | None:
+def landing_loss(observer: SemanticSearch, searched: SearchedLooks, order: Tensor) -> Tensor | None:
     r"""Compute the loss of searches that fixate in a given order, a mean over looks and targets not found yet.
 
     .. math:: -\ln \frac{\sum_{x \in \text{goal}} P(t \in x)}{\sum_x P(t \in x)}, \quad x \text{ not fixated yet}
@@ -111,7 +111,7 @@ def landing_loss(observer: Semantic, searched: SearchedLooks, order: Tensor) -> 
     """
     fixations = searched.fixations[order]
     looks = observer.weigh(searched.detections[order], fixations, searched.grid)
-    belief = observer.start(1, searched.grid, looks.likelihood)
+    belief = observer.start(1, searched.grid, looks.ratio)
     visited = torch.zeros(len(searched.grid), dtype=torch.bool)
     losses = []
     for number, cell in enumerate(searched.grid.cell_of(fixations).tolist()):
@@ -141,7 +141,7 @@ def mean_landing_loss(model: FovealObservationModel, searches: Sequence[Searched
     Returns:
         The mean over photographs whose first look leaves a target to find.
     """
-    observer = Semantic.searching(model)
+    observer = SemanticSearch(model)
     losses = []
     for searched in searches:
         loss = landing_loss(observer, searched, torch.arange(min(looks, len(searched.fixations))))
@@ -159,6 +159,7 @@ def starting_model(model: FovealObservationModel) -> FovealObservationModel:
     log_miss[0] = 0.0  # background cannot be missed
     start.log_miss = nn.Parameter(log_miss)
     start.refutation.fill_(_REFUTATION)
+    start.presence = None  # that of another belief
     return start
 
 
@@ -203,7 +204,7 @@ def fit_through_belief(
     assert trained.log_miss is not None
     trained.log_miss.requires_grad_(True)
     parametrize.register_parametrization(trained, "log_miss", _Curve(trained.log_miss))
-    observer = Semantic.searching(trained)
+    observer = SemanticSearch(trained)
     generator = torch.Generator().manual_seed(seed)
 
     def loss_of(_: int) -> Tensor | None:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import FOUND, Verifier, final_outcome, found_at_once
 from semfov.decision.candidates import LookType
@@ -17,13 +16,15 @@ from semfov.errors import DataError
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, TargetSearch, photograph_searches
 from semfov.fit.settings import FitOnCellsConfig
 from semfov.io.ranges import Count, Positive, Range, Share
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.thresholds import Thresholds
 
 _LEVELS = tuple(number / 100 for number in range(50, 100))  # values from which the threshold `confirm` is chosen
 _STRENGTH = 10.0
 """Strength of a prior, chosen on photographs that no result is reported on (docs/decisions/closer_looks.md)."""
 
 _PLACES = 3  # places examined after some looks
-_LEAST_CHANCE = 0.03  # least probability of these places
+_LEAST_CHANCE = 0.01  # least probability of these places
 _RIDGE = 1e-4
 
 
@@ -46,8 +47,8 @@ class VerificationConfig(FitOnCellsConfig):
     absent: Count | None = None
     max_target_area: Positive = 0.2
     looks: Annotated[int, Range(2, 10_000)] = 12
-    place: Share = 0.2
-    stop_below: Share = 0.2
+    place: Share = 0.05
+    stop_below: Share = 0.0005
     false_alarms: Share = 0.01
     folds: Annotated[int, Range(2, 1000)] = 5
 
@@ -122,7 +123,7 @@ class VerificationInFolds(NamedTuple):
 
 def fit_in_folds(
     photographs: Sequence[SearchedPhotograph],
-    evidence: TargetEvidence,
+    searching: FovealObservationModel,
     config: VerificationConfig,
     prior: Verification | None = None,
     surest: float = _LEVELS[-1],
@@ -131,7 +132,7 @@ def fit_in_folds(
 
     Args:
         photographs: photographs with the classes to search for.
-        evidence: leads the searches, and decides those without closer looks.
+        searching: leads the searches, and decides those without closer looks.
         config: settings of searches and folds.
         prior: centre of the prior of the parameters (None: a weak one around 0).
         surest: upper limit of `confirm`.
@@ -142,16 +143,17 @@ def fit_in_folds(
     Raises:
         DataError: all places that were examined hold the target, or none does.
     """
-    first = photograph_searches(photographs, evidence, config.looks, "looking")
+    first = photograph_searches(photographs, searching, config.looks, "looking")
     closer_looks = examine(first, config.folds)
     if closer_looks is None:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
     folds = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(config.folds)]
     model = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
-    again = photograph_searches(photographs, evidence, config.looks, "verifying")
+    again = photograph_searches(photographs, searching, config.looks, "verifying")
     # No place is sure, so that a search makes all its closer looks, and any threshold can be applied to it afterwards.
     limits = Thresholds(1.0, config.stop_below, config.place)
-    searches = list(verify(again, folds, limits, evidence.thresholds))
+    thresholds = None if searching.presence is None else searching.presence.thresholds
+    searches = list(verify(again, folds, limits, thresholds))
     confirm = choose_confirm(searches, config.false_alarms, surest)
     model.thresholds = Thresholds(confirm, config.stop_below, config.place)
     return VerificationInFolds(model, folds, closer_looks, searches)
@@ -166,7 +168,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
         folds: number of folds of the pictures.
 
     Returns:
-        The closer looks; None if no place is right, or none is wrong.
+        The closer looks; None if no place is right, or none is wrong, and if all pictures hold the target, or none.
     """
     features: list[Tensor] = []
     right: list[bool] = []
@@ -180,9 +182,14 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
             right.append(search.right(box))
             present.append(search.present)
             fold.append(search.picture % folds)
-    if all(right) or not any(right):
+    if _is_one_kind(right) or _is_one_kind(present):
         return None
     return CloserLooks(torch.stack(features), torch.tensor(right), torch.tensor(present), torch.tensor(fold))
+
+
+def _is_one_kind(answers: Sequence[bool]) -> bool:
+    """Tell whether all answers are the same."""
+    return len({*answers}) < 2
 
 
 def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:
@@ -214,7 +221,7 @@ def verify(
         searches: searches for a class.
         folds: models by fold.
         limits: which places are worth a closer look, and when no look is; with `confirm` 1 all closer looks are made.
-        thresholds: those of the evidence, which decide searches without closer looks (None: these find nothing).
+        thresholds: those of the belief, which decide searches without closer looks (None: these find nothing).
 
     Yields:
         Each search with all its closer looks.

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.verification import Verification
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference
@@ -16,14 +15,18 @@ from semfov.fit.training import training_of
 from semfov.fit.verification import VerificationConfig, VerificationInFolds, VerifiedSearch, fit_in_folds, mean_of
 from semfov.fit.verification_report import verification_report
 from semfov.metrics.episodes import FloatArray
+from semfov.observation.foveal import FovealObservationModel
 
-_SHIPPED = ("yolox-nano", "yolov3-tiny")  # shipped models whose mean is the centre of the prior for other detectors
+_SHIPPED = (
+    "yolox-nano",
+    "nanodet-plus-m-1.5x",
+)  # shipped models whose mean is the centre of the prior for other detectors
 _ABSENT = 200  # the threshold is chosen on about this many searches for absent classes
 _MOST_ABSENT = 20  # and at most so many of them in a photograph
 
 
 class VerificationFit(PartFit):
-    """Fit the verification to held-out photographs: the target evidence is surer on those it learned from."""
+    """Fit the verification to held-out photographs: searches are surer of those that their model learned from."""
 
     settings: VerificationConfig
 
@@ -35,18 +38,18 @@ class VerificationFit(PartFit):
 
     def fit(self) -> PartResult:
         """Fit in folds, and compare decisions with those of the same agent without closer looks."""
-        evidence = self.inputs.model("evidence")
-        if not isinstance(evidence, TargetEvidence):
-            return self.left_out("not fitted, since the agent does not use the target evidence")
+        model = self.inputs.model("search")
+        if not isinstance(model, FovealObservationModel):
+            return self.left_out("not fitted, since the agent does not use the model of searches")
         photographs = self._photographs()
-        config = self._settings_for(len(photographs), evidence)
+        config = self._settings_for(len(photographs), model)
         prior = mean_of([Verification.from_pretrained(name) for name in _SHIPPED])
-        fitted = fit_in_folds(photographs, evidence, config, prior, SUREST_OF_FEW)
-        model = fitted.model
-        model.metadata = {**self.run.eye.settings(), **training_of(config, self.run.scenes)}
+        fitted = fit_in_folds(photographs, model, config, prior, SUREST_OF_FEW)
+        verification = fitted.model
+        verification.metadata = {**self.run.eye.settings(), **training_of(config, self.run.scenes)}
         gain, why = _compare(fitted)
         return PartResult(
-            self.write("verification", model, gain.better, why),
+            self.write("verification", verification, gain.better, why),
             "Fitted to the held-out photographs only, close to the mean of the models shipped for other detectors. A "
             "decision scores 100 points if it finds the target at a right place, -100 points if it finds it at a wrong "
             "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
@@ -68,11 +71,13 @@ class VerificationFit(PartFit):
             )
         return photographs
 
-    def _settings_for(self, photographs: int, evidence: TargetEvidence) -> VerificationConfig:
-        """Return the settings for so many photographs, and for evidence with its thresholds."""
-        assert evidence.thresholds is not None
-        # Evidence from few photographs is less sure of its cells, and then a search must not give up as soon.
-        stop_below = min(self.settings.stop_below, evidence.thresholds.stop_below)
+    def _settings_for(self, photographs: int, model: FovealObservationModel) -> VerificationConfig:
+        """Return the settings for so many photographs, and for a model of searches with its thresholds."""
+        assert model.presence is not None
+        thresholds = model.presence.thresholds
+        assert thresholds is not None
+        # A model of few photographs is less sure of its cells, and then a search must not give up as soon.
+        stop_below = min(self.settings.stop_below, thresholds.stop_below)
         return replace(self.settings, folds=min(self.settings.folds, photographs), stop_below=stop_below)
 
 

@@ -51,7 +51,7 @@ def verification_report(fitted: VerificationInFolds, pictures: str, how: str = I
             *table(chances),
             "",
             "Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
-            f"the evidence decide. Area under the ROC of the final probability: {_figure(area)}.",
+            f"the belief decide. Area under the ROC of the final probability: {_figure(area)}.",
             "",
             *table(_decisions(fitted)),
             "",

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.decision import SAME, settle
@@ -24,6 +23,7 @@ from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.observation.matching import box_iou
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.runs.tables import table
 from semfov.zoom.belief import ZoomBelief

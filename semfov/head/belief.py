@@ -7,12 +7,11 @@ import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, pick
-from semfov.belief.evidence import farther
 from semfov.belief.grid import Grid
-from semfov.belief.observers import SemanticMap, Target
-from semfov.belief.observers.base import Look, Observer, own
-from semfov.belief.observers.gathering import EvidenceLook
+from semfov.belief.observers import SemanticMap, SemanticSearch
+from semfov.belief.observers.base import Look, Observer, farther, own
 from semfov.belief.observers.semantic_map import CellLook
+from semfov.belief.observers.semantic_search import SearchLook
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check
 from semfov.head.views import Views
@@ -22,12 +21,16 @@ _CERTAIN = 1e-6  # probabilities nearer to 0 or 1 fade as this one does
 
 @dataclass(frozen=True)
 class _SceneLook(Look):
-    """The evidence of a look about the cells of a view; the cell `(1,)` of the view and that of the scene, `gaze`."""
+    """The evidence of a look about the cells of a view; the cell `(1,)` of the view and that of the scene, `gaze`.
+
+    `target` is the class 1..K that is searched for, 0 in an exploration.
+    """
 
     pose: int
-    inner: EvidenceLook | CellLook
+    inner: SearchLook | CellLook
     cell: Tensor
     gaze: Tensor
+    target: int
 
     @classmethod
     def join(cls, looks: object) -> "_SceneLook":
@@ -76,7 +79,7 @@ class SceneObserver(Observer):
 
     by_target = True
 
-    def __init__(self, inner: Target | SemanticMap, views: Views, *, prior: float | None = None) -> None:
+    def __init__(self, inner: SemanticSearch | SemanticMap, views: Views, *, prior: float | None = None) -> None:
         super().__init__()
         check(prior is None or 0 < prior < 1, "prior", "a probability between 0 and 1", prior)
         self.inner = inner
@@ -88,7 +91,7 @@ class SceneObserver(Observer):
         check(batch == 1, "batch", "1, as a head has one episode at a time", batch)
         cells = len(self.views.world.scene)
         nothing = like.new_zeros(1, cells)
-        values = like.new_zeros(1, cells, 2 if isinstance(self.inner, Target) else self.inner.components)
+        values = like.new_zeros(1, cells, 2 if self._searches else self.inner.components)
         return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), {})
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
@@ -96,9 +99,12 @@ class SceneObserver(Observer):
         height = self.views.world.size[1]
         pose = int((float(fixation[0, 1]) + 0.5) // height)
         point = fixation - fixation.new_tensor([0, pose * height])
-        inner = self.inner.weigh(detections, point, self.views.view_grid, target)
+        if self._searches and target is None:
+            raise InputError("target: expected a class to search for, got None")
+        inner = self.inner.weigh(detections, point, self.views.view_grid)
         cell = self.views.view_grid.cell_of(point)
-        return _SceneLook(pose, inner, cell, self.views.gaze_cell[self.views.grid.cell_of(fixation)])
+        gaze = self.views.gaze_cell[self.views.grid.cell_of(fixation)]
+        return _SceneLook(pose, inner, cell, gaze, target or 0)
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
         belief = own(belief, SceneBelief, "belief")
@@ -107,12 +113,12 @@ class SceneObserver(Observer):
         pose = look.pose
         values = belief.values
         if not bool(belief.looks):
-            values = self._unseen(look.inner, values)
+            values = self._unseen(look.target, values)
         before = belief.views.get(pose)
         if before is None:
             before = self.inner.start(1, views.view_grid, values)
         view = self.inner.update(before, look.inner)
-        probabilities = views.spread(self._probabilities(view), pose).mT
+        probabilities = views.spread(self._probabilities(view, look.target), pose).mT
         cells = views.visible[pose]
         is_owner = belief.owner[0, cells] == pose
         nearest = torch.minimum(
@@ -154,7 +160,7 @@ class SceneObserver(Observer):
         }
         examined = torch.zeros_like(belief.examined)
         examined[0, self.views.gaze_cell[visited[0]]] = True
-        unseen = self._unseen(look.inner, belief.values)
+        unseen = self._unseen(look.target, belief.values)
         return replace(
             belief,
             values=_faded(belief.values, unseen, keep, about_all=belief.about_all),
@@ -164,26 +170,23 @@ class SceneObserver(Observer):
             views=views,
         )
 
-    def _probabilities(self, view: Belief) -> Tensor:
+    @property
+    def _searches(self) -> bool:
+        """Whether it is about one target, and not a map of all classes."""
+        return isinstance(self.inner, SemanticSearch)
+
+    def _probabilities(self, view: Belief, target: int) -> Tensor:
         """Take the belief about the cells of a view, `(C, cells)`."""
-        if isinstance(self.inner, Target):
-            return torch.cat([view.probability(0), view.chance(0)])
+        if self._searches:
+            return torch.cat([view.probability(target), view.chance(target)])
         return view.class_probabilities()[0].mT
 
-    def _unseen(self, look: EvidenceLook | CellLook, like: Tensor) -> Tensor:
+    def _unseen(self, target: int, like: Tensor) -> Tensor:
         """Compute the values `(1, S, C)` of cells that were never seen."""
-        if isinstance(self.inner, Target) and self.prior is not None:
-            return torch.full_like(like, self.prior)
-        if isinstance(self.inner, SemanticMap):
+        if not self._searches:
             return self.inner.unseen(like).expand_as(like).clone()
-        look = own(look, EvidenceLook, "look")
-        # A look as far from all cells as can be, which shows nothing, tells what the belief is without one.
-        evidence = torch.zeros_like(look.evidence) + self.inner.model.unseen(look.evidence)
-        blank = replace(look, evidence=evidence, distance=torch.ones_like(look.distance), score=0 * look.score)
-        start = self.inner.start(1, self.views.view_grid, like)
-        probabilities = self._probabilities(self.inner.update(start, blank))
-        # The median leaves out the one cell that counts as fixated.
-        return probabilities.median(-1).values.expand_as(like).clone()
+        probability = self.inner.unseen(like)[target] if self.prior is None else self.prior
+        return torch.full_like(like, float(probability))
 
 
 def _faded(values: Tensor, unseen: Tensor, keep: float, *, about_all: bool) -> Tensor:

@@ -80,12 +80,13 @@ class SearchGain(LookGain):
         views: the possible views and fixations.
         foresight: c, weight of the gain in sharpness.
 
-    >>> from semfov.belief.observers import Target
-    >>> from semfov.belief.target_evidence import TargetEvidence
+    >>> from semfov import FovealObservationModel
+    >>> from semfov.belief.observers import SemanticSearch
     >>> from semfov.head import Flat
     >>> from semfov.head.belief import SceneObserver
     >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
-    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    >>> model = FovealObservationModel.identity(["cup", "cat"], [0.2], miss_odds=torch.full((3, 2), 0.1))
+    >>> belief = SceneObserver(SemanticSearch(model), views).start(1, views.grid, torch.zeros(1))
     >>> SearchGain(views)(belief, 0, [0]).shape  # 9 poses, 100 cells in each view
     torch.Size([900])
     """
@@ -202,12 +203,13 @@ class PerSecond(AcquisitionFunction):
         action: the present action (`Views`).
         poses: numbers of the poses that the head may turn to; None takes those whose views tile the scene.
 
-    >>> from semfov.belief.observers import Target
-    >>> from semfov.belief.target_evidence import TargetEvidence
+    >>> from semfov import FovealObservationModel
+    >>> from semfov.belief.observers import SemanticSearch
     >>> from semfov.head import Flat
     >>> from semfov.head.belief import SceneObserver
     >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
-    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    >>> model = FovealObservationModel.identity(["cup", "cat"], [0.2], miss_odds=torch.full((3, 2), 0.1))
+    >>> belief = SceneObserver(SemanticSearch(model), views).start(1, views.grid, torch.zeros(1))
     >>> acquisition = PerSecond(SearchGain(views), Speeds(), action=0)
     >>> values = acquisition(belief, torch.zeros(1, 900, dtype=torch.bool))
     >>> int((values > OUT).sum())  # 4 of the 9 poses tile the scene

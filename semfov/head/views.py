@@ -12,7 +12,7 @@ from semfov.errors import check
 from semfov.head.scenes import World, check_fields
 from semfov.head.speeds import Speeds
 
-_POINTS = 10  # number of cells in a row and in a column of a view, as the shipped evidence was learned on
+_POINTS = 10  # number of cells in a row and in a column of a view, as the shipped models were fitted on
 
 
 class Views:

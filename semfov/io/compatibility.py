@@ -27,17 +27,16 @@ Settings = Mapping[str, Any]
 """Settings of a detector or a sensor as JSON values, by name."""
 
 
-def learned_for(detector: str, growth: float) -> str:
-    """Name the learned evidence that is shipped for a detector with a sensor.
+def searching_for(detector: str) -> str:
+    """Name the observation model, fitted for searches, that is shipped for a detector with the `gradual` sensor.
 
     Args:
         detector: name of the detector.
-        growth: of the sensor's blur.
 
     Returns:
         The name.
     """
-    return f"{detector}-published" if growth == 1 else detector
+    return f"{detector}-search"
 
 
 def trained_for(detector: str, growth: float) -> str:

@@ -19,11 +19,11 @@ FILE = "manifest.json"
 _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
-PARTS = ("observation", "tempering", "evidence", "verification", "windows")
+PARTS = ("observation", "tempering", "search", "verification", "windows")
 """Parts that a folder may hold, in the order in which they are fitted."""
 
-_FORMER_MAP = "map"
-"""Name of the part of its own that was the map in folders of earlier versions."""
+_FORMER = {"map": "map", "evidence": "evidence for targets"}
+"""Parts of folders of earlier versions by name, in words."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
 
@@ -50,7 +50,7 @@ _RECORD = {
     # Further values depend on the sensor, which checks them when it is made.
     "sensor": Object({"name": Text(), "reference": Number(above=0)}, Json(), ("name", "reference")),
     "grid": Array(Number(1, 200), 2),
-    "parts": Object(dict.fromkeys((*PARTS, _FORMER_MAP), _PART)),
+    "parts": Object(dict.fromkeys((*PARTS, *_FORMER), _PART)),
     "training": Object(others=Json()),
 }
 
@@ -105,9 +105,12 @@ class Manifest:
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
         record = _read_record(Path(folder) / FILE)
-        if _FORMER_MAP in record["parts"]:
+        former = [words for name, words in _FORMER.items() if name in record["parts"]]
+        if former:
             warnings.warn(
-                f"{folder}: its map is of an earlier version and is not read; run semfov fit again", stacklevel=2
+                f"{folder}: its {' and its '.join(former)} is of an earlier version and is not read; run semfov fit "
+                "again",
+                stacklevel=2,
             )
         parts = {name: Part(**part) for name, part in record["parts"].items() if name in PARTS}
         for part in parts.values():

@@ -151,9 +151,12 @@ def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
     """
     if (kind.shipped / f"{name}.safetensors").is_file():
         return name
-    names = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))
+    # Models of one purpose have the same ending.
+    ending = name.removeprefix(model) if name.startswith(model) else ""
+    names = sorted(path.stem.removesuffix(ending) for path in kind.shipped.glob(f"*{ending}.safetensors"))
+    detector = name.removesuffix(ending)
     raise InputError(
-        f"detector: no {kind.title} is shipped for {name!r}, only for {', '.join(names)}; without a fit use "
+        f"detector: no {kind.title} is shipped for {detector!r}, only for {', '.join(names)}; without a fit use "
         f"ActivePerception.raw, or fit all models to it with `{fit_command(model)}` or semfov.fit_detector, and load "
         "them with ActivePerception.from_pretrained('mymodels')"
     )

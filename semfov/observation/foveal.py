@@ -1,6 +1,7 @@
 """The foveal observation model: how a detector scores objects of each class at each distance from the fovea."""
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -8,7 +9,6 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.utils.weak import WeakIdKeyDictionary
 
 from semfov.detection.detector import Detector
 from semfov.errors import InputError, check, check_finite, check_shape, check_tensor, lookup, values_known
@@ -16,10 +16,13 @@ from semfov.io import compatibility
 from semfov.io.files import JsonObject
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Field, Number, Schema
-from semfov.observation.dirichlet import floor, log_normaliser
+from semfov.observation.dirichlet import floor
 from semfov.observation.fitting import fit_tables
+from semfov.observation.linear_map import forget, kept_map, linear_map
 from semfov.observation.mle import Method
+from semfov.observation.presence import PRESENCE, Presence, presence_of
 from semfov.observation.statistics import DirichletStatistics
+from semfov.observation.thresholds import THRESHOLDS, thresholds_of, thresholds_record
 
 _MOST_TEMPERING = 100
 _MOST_DISTANCE = 10  # larger ones are taken for pixels: no fixation lies ten longer sides from a box of its image
@@ -61,11 +64,13 @@ class FovealObservationModel(Pretrained):
         exponents: `(N,)`, positive, exponents of the likelihood at each level, in addition to τ; None is 1 at all, as
             published.
         miss_odds: `(K+1, N)`, positive, how probable it is that nothing is detected in a cell of each class, relative
-            to background, whose row is ignored (`Semantic(association="one")`); None takes them from `miss_rate`.
+            to background, whose row is ignored (`SemanticSearch`); None takes them from `miss_rate`.
         refutation: ρ, from 0 to 1, share by which a detection loses weight once a cell that it covers was fixated
-            (`Semantic(association="one")`); 0 is as published.
+            (`SemanticSearch`); 0 is as published.
         cell: m, a and w, positive, by which a look says what a whole cell holds (`semfov.observers.SemanticMap`): the
             odds of a miss, an exponent, and the weight of background. The default is about that of YOLOX-nano.
+        presence: by which the belief says whether the picture holds a class, with the thresholds at which searches
+            decide; None if it was not fitted.
         metadata: JSON values that are saved with the model: `detector` and `sensor` (the settings that it was fitted
             for), `counts`, and further information.
 
@@ -99,8 +104,9 @@ class FovealObservationModel(Pretrained):
             "log_miss": Field(("K+1", "N"), low=-50, high=50, optional=True),
             "refutation": Field((), low=0, high=1, optional=True),
             "log_cell": Field((3,), low=-_MOST_LOG_CELL, high=_MOST_LOG_CELL, optional=True),
+            **PRESENCE,
         },
-        {"classes": CLASSES, "epsilon": Number(above=0, high=1)},
+        {"classes": CLASSES, "epsilon": Number(above=0, high=1), "thresholds": THRESHOLDS},
     )
     edges: Tensor
     tempering: Tensor
@@ -122,6 +128,7 @@ class FovealObservationModel(Pretrained):
         miss_odds: Tensor | None = None,
         refutation: float | Tensor = 0.0,
         cell: Sequence[float] | Tensor = (0.001, 1.0, 0.25),
+        presence: Presence | None = None,
         metadata: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__()
@@ -165,6 +172,11 @@ class FovealObservationModel(Pretrained):
         self.log_miss = None if odds is None else nn.Parameter(odds.log())
         self.refutation = nn.Parameter(rho)
         self.log_cell = nn.Parameter(_checked_log_cell(cell, alpha))
+        if presence is not None:
+            check(isinstance(presence, Presence), "presence", "a Presence or None", type(presence).__name__)
+            known = len(presence.shares)
+            check(known == len(classes), "presence", f"one of {len(classes)} classes", f"one of {known}")
+        self.presence = None if presence is None else deepcopy(presence)
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
@@ -402,7 +414,10 @@ class FovealObservationModel(Pretrained):
 
     def _record(self) -> dict[str, object]:
         """List what a file holds beside tensors."""
-        return {"classes": self.classes, "epsilon": self.epsilon}
+        record: dict[str, object] = {"classes": self.classes, "epsilon": self.epsilon}
+        if self.presence is not None:
+            record["thresholds"] = thresholds_record(self.presence.thresholds)
+        return record
 
     @classmethod
     def _restore(cls, record: JsonObject, tensors: dict[str, Tensor]) -> Self:
@@ -415,6 +430,7 @@ class FovealObservationModel(Pretrained):
             expected=tensors.get("expected"),
             miss_rate=tensors.get("miss_rate"),
             miss_odds=tensors["log_miss"].exp() if "log_miss" in tensors else None,
+            presence=presence_of(tensors, thresholds_of(record.get("thresholds"))),
             metadata=record["metadata"],
         )
         # Files from before these parameters lack them: then they have the paper's values.
@@ -459,65 +475,22 @@ class FovealObservationModel(Pretrained):
             This model.
         """
         # Fused optimisers change parameters without counting it.
-        _KEPT.pop(self.log_alpha, None)
+        forget(self.log_alpha)
         return super().train(mode)
 
     def _linear(self) -> tuple[Tensor, Tensor]:
-        """Compute weights and constants of the log likelihoods (`_linear_map`).
+        """Compute weights and constants of the log likelihoods (`linear_map`).
 
         They are kept in `eval` mode and without gradients.
         """
         parameter = self.log_alpha
         if self.training or (torch.is_grad_enabled() and parameter.requires_grad) or torch.compiler.is_exporting():
-            return _linear_map(self.alpha)
+            return linear_map(self.alpha)
         if torch.compiler.is_compiling():
             # A graph would compute the gamma functions at each call, so that it takes ten times as long.
             weight, constant = torch.ops.semfov.linear_map(parameter)
             return weight, constant
-        return _kept_map(parameter)
-
-
-class FoldedObservationModel(FovealObservationModel):
-    """An observation model stored as a fixed linear map of log scores.
-
-    Its computation graph has no gamma functions, which ONNX lacks. It gives the same calibrated scores as `model`, to
-    the bit. Later training of `model` does not change it.
-
-    Args:
-        model: the observation model to copy.
-
-    >>> model = FovealObservationModel.identity(["cup", "cat"], edges=[0.1, 0.2])
-    >>> FoldedObservationModel(model).calibrate(torch.tensor([0.2, 0.7, 0.1]), torch.tensor(0.15))
-    tensor([0.2000, 0.7000, 0.1000])
-    """
-
-    weight: Tensor
-    constant: Tensor
-
-    def __init__(self, model: FovealObservationModel) -> None:
-        super().__init__(
-            model.alpha,
-            model.edges,
-            model.classes,
-            epsilon=model.epsilon,
-            log_prior=model.log_prior,
-            tempering=float(model.tempering),
-            expected=model.expected_scores(),
-            miss_rate=model.miss_rate,
-            exponents=model.log_exponents.exp(),
-            miss_odds=None if model.log_miss is None else model.log_miss.exp(),
-            refutation=model.refutation,
-            cell=model.log_cell.exp(),
-            metadata=model.metadata,
-        )
-        with torch.no_grad():
-            weight, constant = _linear_map(model.alpha)
-        self.register_buffer("weight", weight)
-        self.register_buffer("constant", constant)
-        self.requires_grad_(False).eval()
-
-    def _linear(self) -> tuple[Tensor, Tensor]:
-        return self.weight, self.constant
+        return kept_map(parameter)
 
 
 def _checked_borders(edges: Sequence[float] | Tensor, like: Tensor) -> Tensor:
@@ -553,44 +526,3 @@ def _table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor
     if name in ("exponents", "miss_odds"):
         check(bool((copied > 0).all()), name, "positive numbers", float(copied.min()))
     return copied
-
-
-def _linear_map(alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Write the log likelihoods as a linear map of log scores, level by level.
-
-    Args:
-        alpha: `(K+1, N, K+1)`.
-
-    Returns:
-        Weights `(N (K+1), K+1)` and constants `(N (K+1),)`.
-    """
-    by_level = alpha.transpose(0, 1)
-    # ln Γ of large parameters is much larger than the differences between likelihoods: compute it in float64.
-    constant = -log_normaliser(by_level.to(torch.float64)).to(alpha.dtype)
-    return (by_level - 1).flatten(0, 1), constant.flatten()
-
-
-_KEPT = WeakIdKeyDictionary()  # linear maps by the parameters they are made of, with the state of these then
-
-
-def _kept_map(log_alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute `_linear_map` of parameters `ln α` once for each of their states, without gradients."""
-    if log_alpha.is_inference():
-        # Such tensors do not count their changes.
-        return _linear_map(log_alpha.exp())
-    state = log_alpha._version, log_alpha.data_ptr()
-    entry: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = _KEPT.get(log_alpha)
-    if entry is None or entry[0] != state:
-        with torch.inference_mode(False), torch.no_grad():
-            entry = (state, _linear_map(log_alpha.exp()))
-        _KEPT[log_alpha] = entry
-    return entry[1]
-
-
-# An operation into which compilation does not look, and whose results a compiled graph may write over.
-_OPERATIONS = torch.library.Library("semfov", "FRAGMENT")
-_OPERATIONS.define("linear_map(Tensor log_alpha) -> (Tensor, Tensor)")
-_OPERATIONS.impl(
-    "linear_map", lambda log_alpha: tuple(map(torch.clone, _kept_map(log_alpha))), "CompositeExplicitAutograd"
-)
-_OPERATIONS.impl("linear_map", lambda log_alpha: _linear_map(log_alpha.exp()), "Meta")

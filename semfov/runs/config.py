@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Protocol
 
 from semfov.belief.grid import Footprint
-from semfov.belief.observers import Association, CellMemory
+from semfov.belief.observers import CellMemory
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.yolo import Runtime
 from semfov.errors import lookup
@@ -18,7 +18,7 @@ from semfov.sensor import SENSORS, Sensor
 from semfov.sensor.named import SensorName
 
 SaliencyModel = Literal["vocus2", "itti-koch", "people"]
-Scores = Literal["raw", "calibrated", "learned", "fitted"]
+Scores = Literal["raw", "calibrated", "learned"]
 
 
 @dataclass(frozen=True)
@@ -170,13 +170,10 @@ class BeliefConfig(Settings):
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
         misses: also update cells in which nothing was detected, with the miss rates of the observation model.
-        association: fuse `each` detection that covers a cell (published), or take at most `one` of a look to show the
-            object of a cell (needs misses).
         model: fitted observation model, by name or file (None: the one shipped for the detector and sensor; for a
             published sensor it is the published one, for others one of our own).
         search_model: observation model fitted through the belief, by name or file (None: the one shipped for the
             detector).
-        target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
         map_model: observation model of the semantic map, by name or file, or a folder of models (None: ours for the
             detector and sensor).
     """
@@ -189,10 +186,8 @@ class BeliefConfig(Settings):
     tempering: Positive = 1.0
     memory: CellMemory = "all"
     misses: bool = False
-    association: Association = "each"
     model: str | None = None
     search_model: str | None = None
-    target_model: str | None = None
     map_model: str | None = None
 
 
@@ -203,11 +198,11 @@ class PolicyConfig(Settings):
     A setting that is null is taken from the `belief` settings of the run.
 
     Args:
-        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient
-            cell), or `target-evidence` (uses the learned evidence for the target).
+        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency`, which fixates the most salient
+            cell.
         scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
-            first; `learned` uses a learned belief, which is the semantic map in explorations and the learned target
-            evidence in searches; `fitted` passes them through an observation model that was fitted through the belief.
+            first; `learned` uses the belief of the agent, with an observation model that was fitted through it: the
+            semantic search in searches (`belief.search_model`), the semantic map in explorations (`belief.map_model`).
         tempering: exponent of the likelihoods.
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
         memory: fuse `all` looks, or keep only the evidence of the `closest` look at each cell.
@@ -217,7 +212,6 @@ class PolicyConfig(Settings):
         samples: number of drawn looks for each class and level of distance, over which `predictive`, `kl`,
             `negative-entropy`, `surprise` and `two-peaks` take the expectation; null takes the look with the expected
             scores, as published. The observation model must be one of the densities of scores (`...-published`).
-        association: fuse `each` detection that covers a cell, or take at most `one` to show the object of a cell.
     """
 
     policy: str
@@ -228,7 +222,6 @@ class PolicyConfig(Settings):
     misses: bool | None = None
     saliency: SaliencyModel | None = None
     samples: Annotated[int, Range(1, 100_000)] | None = None
-    association: Association | None = None
 
 
 @dataclass(frozen=True)

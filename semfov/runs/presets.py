@@ -7,21 +7,23 @@ from types import MappingProxyType
 from typing import get_args
 
 from semfov.belief.grid import Footprint
-from semfov.belief.observers import Association, CellMemory
+from semfov.belief.observers import CellMemory
 from semfov.errors import InputError, check, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
+from semfov.gaze.acquisition.search import TargetPosterior
 from semfov.gaze.acquisition.static import Static, Uniform
 from semfov.gaze.policies import policy_names
 from semfov.runs.config import PolicyConfig, SaliencyModel, Scores
 
-TARGET_EVIDENCE = "target-evidence"
+AGENT = "non-predictive-learned"
+"""Preset of the searches of the agent (`semfov.ActivePerception.recommended`)."""
+
 _SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
 _WORDS = {
     "scores": Scores,
     "footprint": Footprint,
     "memory": CellMemory,
-    "association": Association,
     "saliency": SaliencyModel,
 }
 """Settings with a fixed set of values."""
@@ -36,7 +38,7 @@ _SCORED: tuple[Scores, ...] = ("raw", "calibrated")  # scores that any policy gu
 
 _Presets = dict[str, PolicyConfig]
 
-_OF_THE_MAP = ("tempering", "footprint", "memory", "misses", "association")  # settings of the map of all classes
+_OF_THE_MAP = ("tempering", "footprint", "memory", "misses")  # settings of the map of all classes
 
 
 def presets(task: Task) -> Mapping[str, PolicyConfig]:
@@ -63,19 +65,19 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
 
 def _search_presets(plain: _Presets, salient: _Presets) -> _Presets:
     """Make the presets of searches, of policies and of saliency maps by name."""
-    # The scores do not matter to these: no belief guides them, or one of their own.
-    without_scores = {name: PolicyConfig(name) for name in (Uniform.name, TARGET_EVIDENCE)}
+    # The scores do not matter to these, which no belief guides.
+    without_scores = {Uniform.name: PolicyConfig(Uniform.name)}
     without_scores |= {name: policy for name, policy in plain.items() if not FUNCTIONS[name].by_belief}
     without_scores |= salient
-    without_scores["non-predictive-fitted"] = PolicyConfig("non-predictive", "fitted")
     scored = {name: policy for name, policy in plain.items() if name not in without_scores}
-    learned = {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if FUNCTIONS[name].by_place}
-    raw_and_calibrated = _with_both_scores(scored)
-    named = {"recommended": PolicyConfig(TARGET_EVIDENCE), "published": PolicyConfig("predictive", "calibrated")}
-    for scores in _SCORED:
-        named[f"{_MAXIMUM_A_POSTERIORI}-{scores}"] = raw_and_calibrated[f"non-predictive-{scores}"]
-    named[f"{_MAXIMUM_A_POSTERIORI}-learned"] = without_scores[TARGET_EVIDENCE]
-    return {**without_scores, **learned, **raw_and_calibrated, **named}
+    # Of the learned belief these use the probabilities alone, for which it is fitted.
+    by_chance = [name for name in scored if name == TargetPosterior.name or FUNCTIONS[name].by_place]
+    learned = {f"{name}-learned": PolicyConfig(name, "learned") for name in by_chance}
+    with_scores = {**learned, **_with_both_scores(scored)}
+    named = {"recommended": with_scores[AGENT], "published": with_scores["predictive-calibrated"]}
+    for scores in get_args(Scores):
+        named[f"{_MAXIMUM_A_POSTERIORI}-{scores}"] = with_scores[f"non-predictive-{scores}"]
+    return {**without_scores, **with_scores, **named}
 
 
 def _exploration_presets(plain: _Presets, salient: _Presets) -> _Presets:
@@ -114,16 +116,13 @@ def resolve(choice: str | PolicyConfig, task: Task) -> PolicyConfig:
     """
     if isinstance(choice, str):
         return _preset(choice, task)
-    names = policy_names(task)
-    if task == "search":
-        names = [*names, TARGET_EVIDENCE]
-    lookup(choice.policy, names, "policy")
+    lookup(choice.policy, policy_names(task), "policy")
     _check_words(choice)
     if choice.samples is not None:
         _check_takes_samples(choice, task)
     _check_scores(choice, task)
     # A learned belief is fitted with its own footprint, memory and tempering.
-    if choice.scores in ("learned", "fitted") or choice.policy == TARGET_EVIDENCE:
+    if choice.scores == "learned":
         _check_own_belief(choice)
     return choice
 

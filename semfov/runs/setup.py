@@ -2,15 +2,15 @@
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from semfov.belief import TargetEvidence, Verification
+from semfov.belief import Verification
 from semfov.data import CocoScenes, EmbeddedScenes, Scenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError, check
 from semfov.eye import Eye
-from semfov.io.compatibility import learned_for, trained_for
+from semfov.io.compatibility import searching_for, trained_for
 from semfov.io.files import read_text
 from semfov.io.pretrained import shipped_model
 from semfov.model_folder import ModelFolder
@@ -22,8 +22,6 @@ from semfov.sensor import Foveation, named_sensor
 
 _OPTIONAL = "background", "weights", "classes", "head", "stride", "input_size", "runtime", "logits", "per_class"
 """Settings of a detector that are options of `load_detector` of the same name, given only where they are changed."""
-
-_Learned = TypeVar("_Learned", TargetEvidence, Verification)
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> None:
@@ -125,15 +123,15 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 
-def _growth_of(eye: Eye) -> float:
-    """Find the growth of an eye's fovea, by which shipped models are chosen; they exist only for a `Foveation`."""
+def _fovea_of(eye: Eye) -> Foveation:
+    """Find the fovea of an eye that needs a shipped model; raises `InputError` if it sees through another sensor."""
     sensor = eye.sensor
     if not isinstance(sensor, Foveation):
         raise InputError(
             f"sensor: expected a Foveation, since models are shipped for no other sensor, got {type(sensor).__name__}; "
             "fit models for it (semfov fit), or choose policies that need none"
         )
-    return float(sensor.growth)
+    return sensor
 
 
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
@@ -143,10 +141,11 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     return model.requires_grad_(False)
 
 
-def make_fitted(name: str | None, eye: Eye) -> FovealObservationModel:
-    """Load an observation model that was fitted through the belief: by name, or the one shipped for the eye."""
+def make_searching(name: str | None, eye: Eye) -> FovealObservationModel:
+    """Load an observation model that was fitted to search: by name, or the one shipped for the detector."""
     if name is None:
-        name = shipped_model(FovealObservationModel, f"{observation_name(eye)}-search", "MODEL")
+        _fovea_of(eye)
+        name = shipped_model(FovealObservationModel, searching_for(eye.detector.name), "MODEL")
     return make_observation(name, eye)
 
 
@@ -177,13 +176,14 @@ def observation_name(eye: Eye) -> str:
 
 def _own_model(eye: Eye) -> str:
     """Name our own observation model for a detector and the growth of a fovea."""
-    return shipped_model(FovealObservationModel, trained_for(eye.detector.name, _growth_of(eye)), "MODEL")
+    return shipped_model(FovealObservationModel, trained_for(eye.detector.name, float(_fovea_of(eye).growth)), "MODEL")
 
 
-def make_learned(kind: type[_Learned], name: str | None, eye: Eye) -> _Learned:
-    """Load a learned model by name, or the one shipped for the eye; check that it fits the eye."""
+def make_verification(name: str | None, eye: Eye) -> Verification:
+    """Load the verification of targets by name, or the one shipped for the detector; check that it fits the eye."""
     if name is None:
-        name = shipped_model(kind, learned_for(eye.detector.name, _growth_of(eye)), "MODEL")
-    model = kind.from_pretrained(name)
+        _fovea_of(eye)
+        name = shipped_model(Verification, eye.detector.name, "MODEL")
+    model = Verification.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)

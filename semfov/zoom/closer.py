@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from semfov.belief.prior import Prior
-from semfov.belief.target_evidence import Thresholds
 from semfov.data.inputs import FRAME
 from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
@@ -17,6 +16,7 @@ from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.motion import Motion
 from semfov.observation.matching import box_iou, inside_frame
+from semfov.observation.thresholds import Thresholds
 from semfov.sensor.glimpse import window_around
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from semfov.belief.prior import Prior, PriorLike
-from semfov.belief.target_evidence import Thresholds
 from semfov.decision import FOUND, GO_ON, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
 from semfov.decision.candidates import LookAt
 from semfov.decision.state import DecisionState
 from semfov.episode import Forgetting
 from semfov.motion import Motion
 from semfov.observation.matching import inside_frame
+from semfov.observation.presence import EVEN
+from semfov.observation.thresholds import Thresholds
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, SearchLook
@@ -387,6 +388,8 @@ def decisions_of(
 
 def _prior_of(prior: PriorLike, photograph: PhotographEvidence | None, target: int) -> Prior:
     """Compare the share that was given with that of the fit, which for large pictures is one half."""
-    # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
-    shares = torch.full((target,), 0.5) if photograph is None else photograph.shares
-    return Prior.of(prior, shares, target)
+    if photograph is None:
+        # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
+        return Prior.of(prior, EVEN)
+    shares = photograph.shares
+    return Prior.of(prior, None if shares is None else float(shares[target - 1]))

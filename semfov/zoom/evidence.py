@@ -11,19 +11,19 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.evidence import network
-from semfov.belief.prior import SHARES
-from semfov.belief.target_evidence import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import Settings, check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
+from semfov.observation.presence import SHARES
+from semfov.observation.thresholds import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import USUAL_WINDOW
 from semfov.zoom.hint_maps import CROWD, features, hint_maps, memory_maps, neighbourhood_mean, tapered, through
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.networks import network
 from semfov.zoom.survey import STEPS, Survey
 
 CASE = 10

@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.evidence import network
 from semfov.io.schema import Field, perceptron
 from semfov.zoom.hint_maps import (
     CROWD,
@@ -18,6 +17,7 @@ from semfov.zoom.hint_maps import (
     through,
 )
 from semfov.zoom.hints import Gist
+from semfov.zoom.networks import network
 
 STEPS = 3  # largest number of octaves between a look and the closer looks that are predicted from it
 

@@ -1,10 +1,9 @@
-"""Shared by the tests of learned evidence: random looks."""
+"""Shared by the tests of beliefs: random looks."""
 
 import pytest
 import torch
 
-from semfov import Detections, Grid, TargetEvidence
-from semfov.belief.evidence import Gathered
+from semfov import Detections, Grid
 
 
 @pytest.fixture
@@ -24,44 +23,5 @@ def random_looks():
         mask = torch.arange(most) < torch.randint(1, most + 1, (looks, 1), generator=generator)
         mask[2:3] = False
         return Detections(boxes, (3 * draw(looks, most, components)).softmax(-1), mask)
-
-    return make
-
-
-@pytest.fixture
-def toy_evidence():
-    """A small model of target evidence with random parameters."""
-
-    def make(components=5, widths=(8, 6), seed=1, metadata=None):
-        generator = torch.Generator().manual_seed(seed)
-        model = TargetEvidence(*widths, components=components, metadata=metadata)
-        with torch.no_grad():
-            for parameter in model.parameters():
-                parameter.copy_(0.6 * torch.randn(parameter.shape, generator=generator))
-        return model.eval()
-
-    return make
-
-
-@pytest.fixture
-def gathered():
-    """Random evidence gathered for some episodes and classes; the rows of an episode share their looks."""
-
-    def make(episodes=2, classes=4, cells=24, seed=5, dtype=torch.float64):
-        generator = torch.Generator().manual_seed(seed)
-
-        def draw(*shape):
-            return torch.randn(*shape, generator=generator, dtype=dtype)
-
-        def of_class(values):
-            return values.repeat_interleave(classes, 0)
-
-        rows = episodes * classes
-        nearest = 2 * draw(rows, cells)
-        best, mean = nearest + draw(rows, cells).abs(), draw(rows, cells)
-        distance, looks = of_class(draw(episodes, cells).abs() / 4), of_class(torch.arange(1, episodes + 1).to(dtype))
-        visited = of_class(draw(episodes, cells) > 1)
-        targets = torch.arange(1, classes + 1).repeat(episodes)
-        return Gathered(nearest, best, mean, distance, draw(rows).sigmoid(), looks, visited, targets)
 
     return make

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief.association import one_of, refuted
-from semfov.belief.observers import Semantic
-from semfov.belief.observers.semantic import AssociatedLook
+from semfov.belief.observers import SemanticSearch
+from semfov.belief.observers.semantic_search import SearchLook
 from semfov.fit.through_belief import SearchedLooks, fit_through_belief, landing_loss
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from tests.refusals import refused
 
 GRID = Grid(5, 4, (100, 80))
@@ -70,7 +70,7 @@ def test_the_likelihood_sums_over_what_each_detection_may_show():
 
 def test_the_belief_equals_a_loop_over_cells(looks):
     fom = model().requires_grad_(False)
-    belief = watch(Semantic.searching(fom), looks)
+    belief = watch(SemanticSearch(fom), looks)
     cells, prior = GRID.cell_of(FIXATIONS).tolist(), 1e-5
     offset = torch.cdist(GRID.centres.double(), FIXATIONS.double()) / 100
     for x in range(20):
@@ -102,27 +102,11 @@ def test_the_belief_equals_a_loop_over_cells(looks):
     assert belief.visited[0].nonzero()[:, 0].tolist() == sorted(cells)
 
 
-@given(st.floats(1e-6, 10.0), st.integers(1, 3))
-def test_the_order_of_the_cells_does_not_depend_on_the_prior(prior, target):
-    generator = torch.Generator().manual_seed(7)
-    corner = torch.rand(3, 4, 2, generator=generator, dtype=torch.float64) * 60
-    scores = torch.rand(3, 4, 4, generator=generator, dtype=torch.float64).softmax(-1)
-    seen = Detections(torch.cat([corner, corner + 15], -1), scores, torch.ones(3, 4).bool())
-    fom = model().requires_grad_(False)
-    options = {"footprint": "box_centre", "memory": "closest", "misses": fom, "association": "one"}
-    orders = [
-        watch(Semantic(4, fom, prior=value, **options), seen).probability(target)[0].argsort(stable=True)
-        for value in (0.5, prior)
-    ]
-    chosen = [watch(Semantic(4, fom, prior=value, **options), seen).probability(target)[0] for value in (0.5, prior)]
-    assert torch.allclose(chosen[0][orders[0]], chosen[0][orders[1]], rtol=1e-9)
-
-
 def test_refutation_takes_what_covers_a_fixated_cell(looks):
     """With ρ = 1 a look at a covered cell is like one that shows nothing; with ρ = 0 fixations do not matter."""
     full = Detections(torch.tensor([[[0.0, 0.0, 100.0, 80.0]]]).double(), looks.scores[:1, :1], torch.ones(1, 1).bool())
     nothing = replace(full, mask=torch.zeros(1, 1).bool())
-    sure = Semantic.searching(model(refutation=1.0).requires_grad_(False))
+    sure = SemanticSearch(model(refutation=1.0).requires_grad_(False))
     seen, unseen = (watch(sure, look, FIXATIONS[:1]) for look in (full, nothing))
     torch.testing.assert_close(seen.chance(2), unseen.chance(2))
     # That the search goes on says nothing of what the look shows.
@@ -138,7 +122,7 @@ def test_gradients_flow_through_three_looks(looks):
     # All boxes cover the cell that is fixated first.
     boxes = looks.boxes * torch.tensor([0.0, 0, 1, 1])
     looks = Detections(boxes, looks.scores, torch.ones_like(looks.mask))
-    observer = Semantic.searching(fom)
+    observer = SemanticSearch(fom)
     # The numbers of cells are for maps.
     parameters = {name: value for name, value in fom.named_parameters() if name != "log_cell"}
     names = [*parameters]
@@ -153,7 +137,7 @@ def test_gradients_flow_through_three_looks(looks):
             def forward(self):
                 return watch(observer, looks).chance(2)
 
-        named = {f"observer.observation.{name}": value for name, value in zip(names, values, strict=True)}
+        named = {f"observer.model.{name}": value for name, value in zip(names, values, strict=True)}
         return torch.func.functional_call(Held(), named, ())
 
     values = [parameter.detach().clone().requires_grad_() for parameter in parameters.values()]
@@ -163,11 +147,11 @@ def test_gradients_flow_through_three_looks(looks):
 
 def test_looks_are_joined_and_fade(looks):
     fom = model(torch.float32).requires_grad_(False)
-    observer = Semantic.searching(fom)
+    observer = SemanticSearch(fom)
     seen = Detections(looks.boxes.float(), looks.scores.float(), looks.mask)
     said = observer.weigh(seen, FIXATIONS, GRID)
     few = observer.weigh(Detections(seen.boxes[:1, :2], seen.scores[:1, :2], seen.mask[:1, :2]), FIXATIONS[:1], GRID)
-    together = AssociatedLook.join([few, said[1:]])
+    together = SearchLook.join([few, said[1:]])
     belief = observer.update(observer.start(3, GRID, seen.scores), together)
     for row, part in enumerate((few, said[1:2], said[2:])):
         alone = observer.update(observer.start(1, GRID, seen.scores), part)
@@ -181,9 +165,24 @@ def test_looks_are_joined_and_fade(looks):
         torch.testing.assert_close(getattr(faded, name), 1e-5 + 0.5 * (values - 1e-5))
 
 
-def test_an_association_needs_odds_of_a_miss():
-    refused("misses", lambda: Semantic(4, association="one"))
-    refused("association", lambda: Semantic(4, association="two", misses=model()))
+def test_a_search_needs_odds_of_a_miss(looks):
+    bare = FovealObservationModel.identity(CLASSES, EDGES)
+    refused("miss_rate: expected a model fitted with miss rates", watch, SemanticSearch(bare), looks)
+
+
+def test_the_most_probable_cell_and_all_scores_tell_whether_the_picture_holds_the_target(looks):
+    thresholds = Thresholds(0.7, 0.1)
+    presence = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((3,), 0.5), thresholds)
+    plain, told = (SemanticSearch(model(presence=each).requires_grad_(False)) for each in (None, presence))
+    assert (plain.thresholds, told.thresholds) == (None, thresholds)
+    without, belief = (watch(observer, looks) for observer in (plain, told))
+    assert torch.equal(belief.probability(2), without.probability(2))
+    for target in (1, 2, 3):
+        peak = float(belief.probability(target).max())
+        assert float(without.presence(target)) == pytest.approx(peak)
+        seen = [(scores[:, target] * mask).max() for scores, mask in zip(looks.scores, looks.mask, strict=True)]
+        odds = -0.4 + 0.7 * math.log(peak / (1 - peak)) + 0.2 * sum(math.log(each + 1e-3) for each in seen) / 3
+        assert float(belief.presence(target)) == pytest.approx(1 / (1 + math.exp(-odds)), rel=1e-5)
 
 
 def draw_search(generator, dtype=torch.float32):
@@ -228,7 +227,7 @@ def test_training_through_three_looks_makes_searches_better():
     searches = [draw_search(generator) for _ in range(40)]
     train, others = searches[:20], searches[20:]
     start = FovealObservationModel.identity(CLASSES, EDGES, miss_odds=torch.full((4, 3), 0.3))
-    observer = Semantic.searching(start)
+    observer = SemanticSearch(start)
     before = float(landing(observer, others).detach())
     chosen = [start.log_alpha, start.log_miss, start.log_exponents]
     optimiser = torch.optim.Adam(chosen, lr=0.05)
@@ -271,7 +270,7 @@ def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_f
     state = {name: value.clone() for name, value in start.state_dict().items()}
     fitted = fit_through_belief(start, searches[:20], looks=4, steps=40, batch=4)
     untrained = fit_through_belief(start, searches[:20], looks=4, steps=1, batch=1, rate=1e-9)
-    losses = [float(landing(Semantic.searching(each), searches[20:]).detach()) for each in (untrained, fitted)]
+    losses = [float(landing(SemanticSearch(each), searches[20:]).detach()) for each in (untrained, fitted)]
     torch.testing.assert_close(untrained.miss_odds(torch.zeros(1)).detach(), torch.tensor([[1.0, *[1e-4] * 3]]))
     assert losses[1] < losses[0] - 0.1
     assert all(torch.equal(value, state[name]) for name, value in start.state_dict().items())

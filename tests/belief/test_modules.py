@@ -1,11 +1,11 @@
-"""Evidence and observers as submodules of other modules."""
+"""Verification and observers as submodules of other modules."""
 
 from functools import partial
 
 from semfov.belief import Verification
-from semfov.belief.observers import AnyOf, Semantic, SemanticMap, Target
+from semfov.belief.observers import AnyOf, Semantic, SemanticMap, SemanticSearch
 from tests.base_tester import GraphTester, Host, make_testers
-from tests.small import GRID, detections, evidence, look, model, observing, rand
+from tests.small import GRID, detections, look, model, observing, rand, search_model
 
 
 class TestVerification(GraphTester):
@@ -28,17 +28,6 @@ class LookTester(GraphTester):
         return look()
 
 
-class TestTargetEvidence(LookTester):
-    test_export = None  # traced as a part of AnyOf
-
-    def make(self):
-        return evidence()
-
-    @staticmethod
-    def call(module, scores, boxes, fixation):
-        return module(detections(scores, boxes), fixation, GRID, 2)
-
-
 class ObserverTester(LookTester):
     """An observer's belief about class 2 after the same detections from two fixations."""
 
@@ -56,11 +45,11 @@ class ObserverTester(LookTester):
 
 class TestAnyOf(ObserverTester):
     def make(self):
-        return AnyOf(Target(evidence()), {1: 0.3, 2: 1.0})
+        return AnyOf(SemanticSearch(search_model()), {1: 0.3, 2: 1.0})
 
     def traced(self):
         """All classes have the same graph."""
-        return Host(AnyOf(Target(evidence()), {2: 1.0}), partial(self.call, looks=1))
+        return Host(AnyOf(SemanticSearch(search_model()), {2: 1.0}), partial(self.call, looks=1))
 
 
 class PartTester(ObserverTester):
@@ -72,7 +61,10 @@ class PartTester(ObserverTester):
 globals().update(
     make_testers(
         PartTester,
-        {"Target": lambda: Target(evidence()), "SemanticMap": lambda: SemanticMap(model().requires_grad_(False))},
+        {
+            "SemanticSearch": lambda: SemanticSearch(search_model()),
+            "SemanticMap": lambda: SemanticMap(model().requires_grad_(False)),
+        },
     )
 )
 globals().update(

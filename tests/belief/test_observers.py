@@ -3,13 +3,14 @@
 import pytest
 import torch
 
-from semfov import Detections, FovealObservationModel, Grid, TargetEvidence
+from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import fusion, likelihoods
-from semfov.belief.observers import AnyOf, Semantic, Target
+from semfov.belief.observers import AnyOf, Semantic, SemanticSearch
 from semfov.belief.observers.any_of import class_meant
 from semfov.belief.observers.semantic import SemanticLook
-from semfov.belief.target_evidence import Thresholds
 from semfov.gaze.policies import Policy
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.strategy import Strategy
 from tests.refusals import refused
 
@@ -140,13 +141,24 @@ def test_a_belief_keeps_its_dtype_and_a_look_has_that_of_the_scores(looks, dtype
 WEIGHTS = {1: 1.0, 3: 0.4}
 
 
-@pytest.fixture(params=["evidence", "map"])
+class ByTarget(Semantic):
+    """An observer that weighs looks for one target."""
+
+    by_target = True
+
+
+@pytest.fixture(params=["search", "map", "by target"])
 def inner(request):
-    torch.manual_seed(3)
     if request.param == "map":
         return Semantic(4, tempering=0.25)
-    model = TargetEvidence(8, 6, components=4, thresholds=Thresholds(0.8, 0.1))
-    return Target(model.eval().requires_grad_(False))
+    if request.param == "by target":
+        return ByTarget(4, tempering=0.25)
+    odds = 0.1 + 0.4 * torch.rand(4, 2, generator=torch.Generator().manual_seed(3))
+    presence = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((3,), 0.5), Thresholds(0.8, 0.1))
+    model = FovealObservationModel.identity(
+        ["cup", "cat", "dog"], [0.3], miss_odds=odds, refutation=0.6, presence=presence
+    )
+    return SemanticSearch(model.eval().requires_grad_(False))
 
 
 def believed(observer, looks, target):
@@ -215,9 +227,3 @@ def test_bad_input(inner, looks):
         refused(".", Semantic, 3, **options)
     refused("tempering", likelihoods, looks, FIXATIONS, GRID, tempering=0)
     refused("tempering", Semantic(4, tempering=0).weigh, looks, FIXATIONS, GRID)
-
-
-def test_episodes_are_computed_one_by_one_unless_together_is_set():
-    model = TargetEvidence(4, 4, components=4)
-    for observer, sizes in ((Target(model), [1, 1, 1]), (Target(model, together=True), [3])):
-        assert observer.each(lambda rows: torch.tensor([len(rows)]), torch.zeros(3, 2)).tolist() == sizes

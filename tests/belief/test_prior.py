@@ -9,13 +9,14 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from semfov.belief import Grid
-from semfov.belief.observers import Target
+from semfov.belief.observers import SemanticSearch
 from semfov.belief.prior import Prior, check_share, with_prior
-from semfov.belief.target_evidence import TargetEvidence
 from semfov.detection import Detections
 from semfov.errors import InputError
 from semfov.fit.photographs import measured_shares
 from semfov.gaze.policies import Policy
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.presence import Presence
 from semfov.strategy import Strategy
 from semfov.zoom.evidence import PhotographEvidence
 from tests.refusals import refused
@@ -49,15 +50,16 @@ def test_a_place_keeps_its_share_of_the_picture(place, presence, fitted, share):
 
 
 def test_the_share_of_the_fit_changes_nothing_and_without_one_half_is_assumed():
-    chances, shares = torch.rand(9), torch.tensor([0.5, 0.75])
-    unknown = [Prior.of(None, None, 1), Prior.of("fit", None, 1)]
-    fitted = Prior.of("fit", shares, 2)
+    chances = torch.rand(9)
+    unknown = [Prior.of(None, None), Prior.of("fit", None)]
+    fitted = Prior.of("fit", 0.75)
     for prior in (Prior(), Prior(0.3, 0.3), fitted, *unknown):
         assert prior(chances) is chances
         assert prior.place(chances, chances) is chances
     assert (fitted.assumed, [prior.assumed for prior in unknown]) == (0.75, [None, None])
-    assert Prior.of(0.2, shares, 2) == Prior(0.2, 0.75)
-    usual = Prior.of(None, shares, 2)
+    assert Prior.of(0.2, 0.75) == Prior.of(0.2, 0.75, 0.3) == Prior(0.2, 0.75)
+    assert Prior.of("fit", 0.5, 0.3) == Prior(0.3, 0.5)
+    usual = Prior.of(None, 0.75)
     assert (usual, usual.assumed) == (Prior(0.5, 0.75), 0.5)
     assert usual(0.75) == pytest.approx(0.5)
 
@@ -70,13 +72,23 @@ def test_certain_probabilities_stay():
 def test_bad_input():
     for share in (0, 1, 1.5, -0.1, math.nan, True, "0.2"):
         refused("prior: expected a share above 0 and below 1", check_share, share)
-        refused("prior: expected a share above 0 and below 1", Prior.of, share, torch.tensor([0.5]), 1)
-    refused("prior: expected None for models without the shares of their fit, got 0.2", Prior.of, 0.2, None, 1)
+        refused("prior: expected a share above 0 and below 1", Prior.of, share, 0.5)
+    refused("prior: expected None for models without the share of their fit, got 0.2", Prior.of, 0.2, None)
+
+
+CLASSES = ["person", "bicycle", "car"]
+
+
+def searching(**settings):
+    return FovealObservationModel.identity(CLASSES, [], miss_odds=torch.full((4, 1), 0.3), **settings)
+
+
+PRESENCE = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.tensor([0.5, 0.75, 0.1]))
 
 
 def belief_of(prior):
-    model = TargetEvidence(8, 6, components=4).double().eval().requires_grad_(False)
-    observer, grid = Target(model, prior=prior), Grid(4, 3, (80, 60))
+    model = searching(presence=PRESENCE).double().requires_grad_(False)
+    observer, grid = SemanticSearch(model, prior=prior), Grid(4, 3, (80, 60))
     boxes = torch.tensor([[[5.0, 5, 30, 30]]], dtype=torch.float64)
     scores = torch.tensor([[[0.1, 0.7, 0.1, 0.1]]], dtype=torch.float64)
     seen, fixation = Detections(boxes, scores, torch.ones(1, 1).bool()), torch.tensor([[30.0, 10.0]]).double()
@@ -84,9 +96,7 @@ def belief_of(prior):
 
 
 def test_a_belief_has_the_numbers_of_another_prior():
-    torch.manual_seed(0)
     plain = belief_of(None)
-    torch.manual_seed(0)
     rare = belief_of(Prior(0.1, 0.6))
     for value, before in ((rare.presence(1), plain.presence(1)), (rare.chance(1), plain.chance(1))):
         assert torch.allclose(value, with_prior(before.logit(), 0.1, 0.6).sigmoid())
@@ -95,18 +105,21 @@ def test_a_belief_has_the_numbers_of_another_prior():
     assert torch.allclose(rare.probability(1), expected)
 
 
-def test_a_strategy_reads_the_shares_of_its_evidence():
-    model = TargetEvidence(8, 6, components=4, shares=torch.tensor([0.5, 0.75, 0.1]))
-    strategy = Strategy(Target(model), Policy("non-predictive"))
+def test_a_strategy_changes_a_presence_that_assumes_even_searches():
+    strategy = Strategy(SemanticSearch(searching(presence=PRESENCE)), Policy("non-predictive"))
     changed, prior = strategy.with_prior(0.3, 2)
-    assert prior == Prior(0.3, 0.75)
+    assert prior == Prior(0.3, 0.5)
     assert changed.observer.prior == prior
-    assert strategy.with_prior(None, 2)[1] == Prior(0.5, 0.75)
-    assert strategy.with_prior("fit", 2)[1].changes_nothing
+    assert strategy.with_prior(None, 2)[1] == Prior(0.5, 0.5)
+    assert strategy.with_prior("fit", 2)[1] == Prior(0.75, 0.5)
+    assert strategy.with_prior("fit", 1)[1].changes_nothing
     assert strategy.observer.prior == Prior()
-    several, _, _ = strategy.sought(["person", "bicycle"], ("background", "person", "bicycle", "car"))
+    several, _, _ = strategy.sought(["person", "bicycle"], ("background", *CLASSES))
     with pytest.raises(InputError, match="prior: expected None for a search for any of several classes"):
         several.with_prior(0.3, 2)
+    unfitted = Strategy(SemanticSearch(searching()), Policy("non-predictive"))
+    assert unfitted.with_prior("fit", 2)[1] == Prior(known=False)
+    refused("prior: expected None for models without the share of their fit, got 0.3", unfitted.with_prior, 0.3, 2)
 
 
 def test_measured_shares_maximise_the_penalised_likelihood_of_each_class():
@@ -130,11 +143,3 @@ def test_measured_shares_maximise_the_penalised_likelihood_of_each_class():
 
         shift = minimize_scalar(cost, bounds=(-20, 20), method="bounded", options={"xatol": 1e-8}).x
         assert usual - shift == pytest.approx(float(shares[number].double().logit()), abs=1e-3)
-
-
-def test_a_file_keeps_the_shares(tmp_path):
-    model = TargetEvidence(8, 6, components=4, shares=torch.tensor([0.5, 0.75, 0.1]))
-    model.save(tmp_path / "with.safetensors")
-    assert torch.equal(TargetEvidence.from_pretrained(tmp_path / "with.safetensors").shares, model.shares)
-    TargetEvidence(8, 6, components=4).save(tmp_path / "without.safetensors")
-    assert TargetEvidence.from_pretrained(tmp_path / "without.safetensors").shares is None

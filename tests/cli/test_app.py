@@ -65,7 +65,7 @@ def test_what_the_page_calls_needs_no_gradio_but_for_its_errors(agent, calls, ph
         with pytest.raises(Told, match=r"prior: expected .*a share.* above 0 and below 1"):
             calls.look(path, "red", "search", 3.0, prior)
     assert calls.look(path, "all classes", "find all", 3.0, "1.5")[1]  # which has no use for it
-    with pytest.raises(Told, match=r"prior: expected None for models without the shares of their fit, got 0\.2"):
+    with pytest.raises(Told, match=r"prior: expected None for models without the share of their fit, got 0\.2"):
         calls.look(path, "red", "search", 3.0, " 0.2 ")
     for prior in (" ", " fit "):
         assert calls.look(path, "red", "search", 3.0, prior)[1]

@@ -10,12 +10,12 @@ from torch.nn import functional as F
 
 from semfov import Detections, Grid
 from semfov.belief import DirichletBelief
-from semfov.belief.target_evidence import Thresholds
 from semfov.cli import live
 from semfov.cli.main import main
 from semfov.data.examples import example_scene
 from semfov.data.sources import Picture, Stream
 from semfov.decision import CloseUp, Decision
+from semfov.observation.thresholds import Thresholds
 from semfov.paths import FoveaMoment
 from semfov.paths.fovea import moment_look
 from semfov.viz.live import draw_moment, video, video_suffix

@@ -18,12 +18,12 @@ from pycocotools.coco import COCO
 
 from semfov import read_image
 from semfov.belief import Verification
-from semfov.belief.target_evidence import Thresholds
 from semfov.cli.options import FindOptions, SearchOptions
 from semfov.cli.search import with_target
 from semfov.cli.sources import picture_sources
 from semfov.cli.truth import Truth
 from semfov.data.sources import picture_files
+from semfov.observation.thresholds import Thresholds
 from tests.colours import write_network
 from tests.refusals import unusable
 
@@ -712,7 +712,6 @@ def test_a_head_looks_at_panoramas_and_flat_pictures(run, tmp_path, agent, monke
     [
         "search --target Boats",
         "find --target dog",
-        "search --target boat --agent learned-chain --shifts 1",
         "search --target boat --agent published --sensor published-narrow --shifts 1 --draw scanpath",
     ],
 )

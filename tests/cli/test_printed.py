@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from semfov.belief import Verification
-from semfov.belief.target_evidence import Thresholds
+from semfov.observation.thresholds import Thresholds
 from tests.golden import check_golden, written
 
 COMMANDS = {

@@ -9,11 +9,11 @@ from scipy.ndimage import find_objects, label
 
 from semfov import ActivePerception, Detections, Eye, Foveation
 from semfov.belief.observers import Semantic
-from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
 from semfov.detection import Candidates, Detector
 from semfov.episode import Forgetting
 from semfov.gaze.policies import Policy
+from semfov.observation.thresholds import Thresholds
 from tests.decision.test_rule import Scripted
 from tests.decision.test_verifier import AT, GRID, Closer, FromScore, Told, box_of, look, step
 

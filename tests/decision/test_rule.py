@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid
 from semfov.agents.fovea import _goal_cells
 from semfov.belief.observers import Look, Observer, Semantic
-from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision, conclude, decide
 from semfov.gaze.policies import Policy
+from semfov.observation.thresholds import Thresholds
 from tests.refusals import refused
 from tests.small import Coloured
 

@@ -9,10 +9,10 @@ import torch
 from semfov import ActivePerception, Belief, Detections, Eye, Foveation, Grid, InputError
 from semfov.belief import Verification
 from semfov.belief.observers import Observer, Semantic
-from semfov.belief.target_evidence import Thresholds
 from semfov.decision import CandidateCells, Verifier
 from semfov.detection import Candidates
 from semfov.gaze.policies import Policy
+from semfov.observation.thresholds import Thresholds
 from tests.decision.test_rule import Known, Nothing, Scripted, Square, cells, random_looks
 from tests.refusals import refused
 from tests.small import iou

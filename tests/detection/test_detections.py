@@ -16,6 +16,7 @@ from torchvision.ops import box_iou
 
 from semfov import Detections
 from semfov.detection import Candidates, score_vectors
+from semfov.detection.detections import highest_score
 from semfov.detection.exchange import category_ids
 from tests.refusals import refused
 
@@ -274,3 +275,24 @@ def test_inconsistent_arguments_are_refused_by_name(monkeypatch):
     refused("expected a head with a score for the policy 'own'", score_vectors, candidates([0.5]), "own")
     monkeypatch.setitem(sys.modules, "supervision", None)
     refused("pip install supervision", some().to_supervision)
+
+
+def test_highest_scores_equal_a_loop(device):
+    looks = detections([2, 5, 0, 3], classes=4)
+    every = torch.tensor([2, 0, 4])
+    several = highest_score(looks.to(device), every.to(device))
+    assert several.shape == (4, 3)
+    for look in range(4):
+        for row, target in enumerate(every.tolist()):
+            shown = [float(s[target]) for s, m in zip(looks.scores[look], looks.mask[look], strict=True) if m]
+            assert float(several[look, row]) == max(shown, default=0.0)
+    for target in range(5):
+        one = highest_score(looks.to(device), target)
+        assert one.shape == (4,)
+        assert torch.equal(one, highest_score(looks.to(device), torch.tensor([target], device=device))[:, 0])
+    empty = Detections.empty(3, 4, like=torch.empty(0, dtype=torch.float64, device=device))
+    for target, shape in ((2, (3,)), (every, (3, 3))):
+        none = highest_score(empty, target)
+        assert none.shape == shape
+        assert none.dtype == torch.float64
+        assert not none.any()

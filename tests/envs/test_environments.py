@@ -45,7 +45,7 @@ def test_environments_pass_the_checker_of_gymnasium(world, task, more):
 def test_vectorised_episodes_equal_those_of_gymnasium(sceneries, task):
     """At every reset and every step, with ends of episodes in between."""
     options = {"belief": True, "scenery": sceneries[task]}
-    ours = gymnasium.make_vec(_IDS[task], num_envs=3, together=False, **options)
+    ours = gymnasium.make_vec(_IDS[task], num_envs=3, **options)
     assert isinstance(ours, GazeVectorEnv)
     theirs = SyncVectorEnv([lambda: KINDS[task](**options)] * 3)
     assert ours.observation_space == theirs.observation_space
@@ -56,7 +56,7 @@ def test_vectorised_episodes_equal_those_of_gymnasium(sceneries, task):
 def test_episodes_that_restart_in_the_same_step_equal_those_of_gymnasium(sceneries):
     mode = AutoresetMode.SAME_STEP
     options = {"belief": True, "scenery": sceneries["search"]}
-    ours = GazeVectorEnv("search", 3, together=False, autoreset_mode=mode, **options)
+    ours = GazeVectorEnv("search", 3, autoreset_mode=mode, **options)
     theirs = SyncVectorEnv([lambda: GazeSearch(**options)] * 3, autoreset_mode=mode)
     check_same_episodes(ours, theirs, steps=15)
 
@@ -417,7 +417,7 @@ def test_without_gymnasium_the_error_has_the_install_command(fresh):
 
 
 def test_arguments_of_other_kinds_are_refused_by_name(sceneries, world):
-    vector = GazeVectorEnv("search", 2, together=False, scenery=sceneries["search"])
+    vector = GazeVectorEnv("search", 2, scenery=sceneries["search"])
     vector.reset(seed=0)
     for call, said in (
         (lambda: open_scenery("search", 3), "scenes: expected a folder or `Scenes`"),

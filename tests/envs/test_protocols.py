@@ -65,7 +65,7 @@ def test_searches_equal_the_records_of_the_evaluation(world, policy):
     wanted = [(record["cells"], record["found_at"]) for record in records]
     assert len({found for _, found in wanted}) > 1  # The searches end at different times.
     assert [(cells, found) for cells, found, _ in run_one_at_a_time(GazeSearch(scenery), episodes)] == wanted
-    envs = GazeVectorEnv("search", 5, scenery, together=False, autoreset_mode="Disabled")
+    envs = GazeVectorEnv("search", 5, scenery, autoreset_mode="Disabled")
     assert [(list(ran.cells), ran.found_at) for ran in run_agent(envs, PolicyAgent(envs), episodes)] == wanted
 
 
@@ -83,22 +83,10 @@ def test_explorations_equal_the_records_of_the_evaluation(world, policy):
     ):
         assert cells == path
         assert results == pytest.approx(rates, abs=1e-6)
-    envs = GazeVectorEnv("exploration", 4, scenery, together=False, autoreset_mode="Disabled")
+    envs = GazeVectorEnv("exploration", 4, scenery, autoreset_mode="Disabled")
     for ran, (path, rates) in zip(run_agent(envs, PolicyAgent(envs), episodes), wanted, strict=True):
         assert list(ran.cells) == path
         assert list(ran.results) == pytest.approx(rates, abs=1e-6)
-
-
-def test_beliefs_computed_together_agree_up_to_rounding(sceneries):
-    scenery = sceneries["search"]
-    episodes = all_episodes(scenery)[:7]
-    beliefs = []
-    for together in (False, True):
-        envs = GazeVectorEnv("search", 7, scenery, together=together, belief=True, autoreset_mode="Disabled")
-        envs.reset(options={"episodes": episodes})
-        beliefs.append(envs.step(envs.scenery.shape[1] + envs.action_space.sample() * 0)[0]["belief"])
-    assert beliefs[0] == pytest.approx(beliefs[1], abs=1e-5)
-    assert beliefs[0].std() > 0.01
 
 
 def test_the_policy_agent_accepts_wrapped_environments(sceneries):

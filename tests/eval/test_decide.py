@@ -17,7 +17,7 @@ from tests.small import cells_of
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 
-POLICIES = ["target-evidence", "random gaze", "published belief", "published belief, a detection at the gaze"]
+POLICIES = ["non-predictive-learned", "random gaze", "published belief", "published belief, a detection at the gaze"]
 SCORES = ["one unfoveated pass, highest score", "unfoveated pass and its quarters, highest score"]
 REFERENCES = [*SCORES, *PLAIN, "class frequency"]
 
@@ -52,7 +52,7 @@ def test_run_writes_table_and_records(finished):
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
     places, lands = [*POLICIES, "one unfoveated pass", *PLAIN], POLICIES
-    compared = ["difference to target-evidence", *POLICIES[1:], *REFERENCES]
+    compared = ["difference to non-predictive-learned", *POLICIES[1:], *REFERENCES]
     assert [row[0] for row in rows] == [*POLICIES, *REFERENCES, *places, *compared, *lands]
     assert (finished / "roc.png").stat().st_size > 1000
     assert "6 searches" in text
@@ -69,10 +69,10 @@ def test_without_references_the_agent_searches_as_with_them(finished, tmp_path):
     model = ("--belief.model", "HERE/observation.safetensors")
     out = small_run("eval.decide", tmp_path, *model, "--references", "false", "--rules", "false", "--store", "false")
     nothing = {"tiled": None, "plain": None}
-    agent = [record | nothing for record in records_in(finished) if record["policy"] == "target-evidence"]
+    agent = [record | nothing for record in records_in(finished) if record["policy"] == "non-predictive-learned"]
     assert records_in(out) == agent
     rows = rows_of((out / "decisions.md").read_text())
-    assert [row[0] for row in rows[:3]] == ["target-evidence", SCORES[0], "class frequency"]
+    assert [row[0] for row in rows[:3]] == ["non-predictive-learned", SCORES[0], "class frequency"]
 
 
 def test_plain_rules_are_regressions_in_folds_of_scenes():
@@ -169,11 +169,11 @@ def test_table_matches_hand_calculations(monkeypatch):
 
 def test_the_table_counts_closer_looks_and_shows_nothing_as_a_dash():
     agent = [
-        record("target-evidence", present, "found", 0.9, 4, right_place=present, closer=2 - present)
+        record("non-predictive-learned", present, "found", 0.9, 4, right_place=present, closer=2 - present)
         for present in (1, 0)
     ]
-    alone = [{**each, "policy": "target-evidence, no closer looks", "looks": 2, "closer": 0} for each in agent]
+    alone = [{**each, "policy": "non-predictive-learned, no closer looks", "looks": 2, "closer": 0} for each in agent]
     text = decision_summary([*agent, *alone], "sensed")
-    assert "Closer looks count as looks; target-evidence makes 1.50 of them in a search." in text
+    assert "Closer looks count as looks; non-predictive-learned makes 1.50 of them in a search." in text
     assert (share(1, 8), share(0, 3), share(0, 0)) == ("12.5", "0.0", "-")
     assert (mean_or_dash([1, 2]), mean_or_dash([0.125], 2), mean_or_dash([])) == ("1.5", "0.12", "-")

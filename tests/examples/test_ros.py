@@ -14,9 +14,9 @@ import semfov
 from examples import ros_messages as ros
 from semfov import Detections, InputError
 from semfov.belief.observers import Semantic
-from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision
 from semfov.gaze.policies import Policy
+from semfov.observation.thresholds import Thresholds
 from tests.examples.messages import KINDS, plain
 from tests.refusals import refused
 from tests.small import Coloured, Sure

@@ -122,7 +122,7 @@ def test_the_agent_finds_a_target_by_the_head(head, robot):
     torch.manual_seed(0)
     eye = semfov.Eye(semfov.Foveation(100.0, growth=2.0), Coloured(("red", "green", "blue"), (416, 312)))
     model = semfov.FovealObservationModel.identity(["red", "green", "blue"], [0.2])
-    agent = semfov.HeadAgent(eye, semfov.TargetEvidence(components=4), model).eval().requires_grad_(False)
+    agent = semfov.HeadAgent(eye, model, model).eval().requires_grad_(False)
     path = agent.explore(head(), ExploreSettings(passes=24))
     assert len(robot.goals) == 24
     regions = [path.places(look, 0.5)[0] for look in range(24)]

@@ -24,17 +24,17 @@ from eval.search import main as search
 from eval.search.run import SearchConfig
 from semfov import ActivePerception, DataError, EmbeddedScenes, FovealObservationModel, InputError
 from semfov.belief import Verification
-from semfov.belief.observers import Semantic, SemanticMap, Target
+from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.cli.main import main as command
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.fit.detector import _check_photographs, _config_of, _seconds_of_looks, _with_classes
 from semfov.fit.detector_report import Difference
-from semfov.fit.evidence import FitSearchConfig
 from semfov.fit.folder import FITS as PART_FITS
 from semfov.fit.folder_report import thin_classes
 from semfov.fit.looking import Looking
 from semfov.fit.part import PartInputs, PartResult
 from semfov.fit.protocols import choose_classes
+from semfov.fit.search import FitSearchConfig
 from semfov.fit.searches import SearchEnd
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.thresholds import choose_thresholds
@@ -90,13 +90,13 @@ def test_the_folder_describes_its_models(home):
     assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
     assert manifest.sensor["sigma"] == 60
     assert manifest.sensor["growth"] == 1
-    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "windows"]
+    assert list(manifest.parts) == ["observation", "tempering", "search", "verification", "windows"]
     assert manifest.training["photographs"] == 20
     assert manifest.training["held_out"] == 5
     for name, part in manifest.parts.items():
         assert "held-out photographs" in part.why, (name, part.why)
         assert (part.file is None) == (name in ("tempering", "windows"))
-    thresholds = semfov.TargetEvidence.from_pretrained(home / "models/evidence.safetensors").thresholds
+    thresholds = FovealObservationModel.from_pretrained(home / "models/search.safetensors").presence.thresholds
     assert 0.49 < thresholds.confirm <= 0.9  # few searches to choose it from
     text = (home / "models/report.md").read_text()
     assert f"counts as found from a probability of {thresholds.confirm:.2f} on" in text
@@ -121,7 +121,7 @@ def test_the_agent_of_the_folder_finds_the_target(home):
     assert agent.classes[1:] == CLASSES
     assert (agent.columns, agent.rows) == (4, 4)
     assert not any(parameter.requires_grad for parameter in agent.parameters())
-    assert isinstance(agent.searching.observer, Target if folder.used("evidence") else Semantic)
+    assert isinstance(agent.searching.observer, SemanticSearch if folder.used("search") else Semantic)
     assert isinstance(agent.exploring.observer, SemanticMap)
     image = photograph_with(2, (7, 0))
     assert 12 in agent.search(image, "blue", start=3, shifts=15).cells.tolist()
@@ -150,16 +150,16 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
     (home / "ids.txt").write_text("0 4 8 12 16")
     out = home / "search"
     options = [
-        "--models", str(home / "models"), "--policies", "[non-predictive-raw, target-evidence]", "--data.min_instances",
-        "0", "--data.ids", str(home / "ids.txt"), "--protocol.shifts", "15", "--workers", "1", "--scanpaths", "0",
-        "--out", str(out), "--cache", str(home / "cache"),
+        "--models", str(home / "models"), "--policies", "[non-predictive-raw, non-predictive-learned]",
+        "--workers", "1", "--data.min_instances", "0", "--data.ids", str(home / "ids.txt"), "--protocol.shifts", "15",
+        "--scanpaths", "0", "--out", str(out), "--cache", str(home / "cache"),
     ]  # fmt: skip
     assert search([*data(home), *options]) == 0
     lines = (out / "summary.csv").read_text().splitlines()
     rows = [line.split(",") for line in lines if line.startswith("all") or "all targets" in line]
     performance = {(row[1], int(row[2])): float(row[3]) for row in rows}
-    report = (home / "models/report.md").read_text().split("## Target evidence")[1]
-    for name, policy in (("fitted", "target-evidence"), ("raw", "non-predictive-raw")):
+    report = (home / "models/report.md").read_text().split("## Search model")[1]
+    for name, policy in (("fitted", "non-predictive-learned"), ("raw", "non-predictive-raw")):
         row = next(line for line in report.splitlines() if line.startswith(f"| {name} "))
         shares = [float(cell.split("±")[0]) for cell in row.split("|")[2:5]]
         assert shares == pytest.approx([100 * performance[policy, n] for n in (1, 5, 15)], abs=0.051)
@@ -169,7 +169,7 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 FITS = {
     "observation": "observation.fit_published",
     "tempering": "tempering.hit_rates",
-    "evidence": "evidence_part.fit_evidence",
+    "search": "search_part.fit_search",
     "verification": "verification_part.fit_in_folds",
     "windows": "windows_part._fit_mosaics",
 }
@@ -196,7 +196,7 @@ def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("part", "lost"), [("verification", "model"), ("evidence", "record")])
+@pytest.mark.parametrize(("part", "lost"), [("verification", "model"), ("search", "record")])
 def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, lost):
     """As after a killed run: finished parts are read, and the missing one is fitted with the same result."""
     shutil.copytree(home / "models", tmp_path / "models")
@@ -245,7 +245,7 @@ def test_a_moved_network_is_found_next_to_the_folder_or_can_be_given(home, tmp_p
     assert agent.eye.detector.classes == CLASSES
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors", "verification.safetensors"])
+@pytest.mark.parametrize("name", ["manifest.json", "search.safetensors", "verification.safetensors"])
 def test_a_changed_file_is_refused(home, tmp_path, name):
     folder = copy_models(home, tmp_path)
     content = (folder / name).read_bytes()
@@ -271,11 +271,11 @@ def test_a_part_that_does_not_improve_is_not_used(home, tmp_path):
     folder = copy_models(home, tmp_path)
     rewrite_manifest(folder, used=True)
     agent = ActivePerception.from_pretrained(folder)
-    assert isinstance(agent.searching.observer, Target)
+    assert isinstance(agent.searching.observer, SemanticSearch)
     assert isinstance(agent.exploring.observer, SemanticMap)
     assert agent.exploring.policy.name == "closer-look"
     given = SearchConfig(models=folder, policies=("recommended", "random"))
-    assert with_models(given).policies == ("target-evidence", "random")
+    assert with_models(given).policies == ("non-predictive-learned", "random")
     rewrite_manifest(folder, used=False)
     agent = ActivePerception.from_pretrained(folder)
     observer = agent.searching.observer
@@ -286,8 +286,8 @@ def test_a_part_that_does_not_improve_is_not_used(home, tmp_path):
     assert agent.searching.policy.name == "non-predictive"
     # Maps take raw scores, where these were better, without another part.
     assert isinstance(agent.exploring.observer, SemanticMap)
-    given = SearchConfig(models=folder, policies=("recommended", "target-evidence"))
-    assert with_models(given).policies == ("non-predictive-raw", "target-evidence")
+    given = SearchConfig(models=folder, policies=("recommended", "non-predictive-learned"))
+    assert with_models(given).policies == ("non-predictive-raw", "non-predictive-learned")
     (explored,) = with_models(ExploreConfig(models=folder, policies=("recommended",))).policies
     assert (explored.policy, explored.scores) == ("closer-look", "learned")
 
@@ -339,11 +339,11 @@ def test_the_agent_of_the_folder_looks_closely_at_a_target(home, tmp_path):
     assert agent.search(image, "blue", start=3, shifts=15, closer=0).closer == ()
 
 
-def test_without_verification_or_evidence_the_agent_decides_without_closer_looks(home, tmp_path):
+def test_without_verification_or_a_model_of_searches_the_agent_decides_without_closer_looks(home, tmp_path):
     folder = copy_models(home, tmp_path)
     rewrite_manifest(folder, used=True)
     known = Manifest.read(folder).parts
-    for unused in ("verification", "evidence"):
+    for unused in ("verification", "search"):
         rewrite_manifest(folder, used=True)
         rewrite_manifest(folder, **{unused: replace(known[unused], used=False)})
         agent = ActivePerception.from_pretrained(folder)
@@ -361,18 +361,18 @@ def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_p
     out = tmp_path / "decide"
     assert decide([*data(home), *given, "--out", str(out), "--cache", str(home / "cache")]) == 0
     records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
-    assert any(record["closer"] > 0 for record in records if record["policy"] == "target-evidence")
+    assert any(record["closer"] > 0 for record in records if record["policy"] == "non-predictive-learned")
     assert {record["closer"] for record in records if "no closer looks" in record["policy"]} == {0}
 
 
-def test_without_the_target_evidence_no_verification_is_fitted(home, tmp_path, monkeypatch):
+def test_without_a_model_of_searches_no_verification_is_fitted(home, tmp_path, monkeypatch):
     config = FitDetectorConfig(model=home / "colours.onnx", columns=4, rows=4, holdout=4, out=tmp_path)
     scenes = EmbeddedScenes(("dog", "boat"), count=8)
     inputs = PartInputs(config, SimpleNamespace(scenes=scenes))
-    inputs.results["evidence"] = PartResult(Part("evidence.safetensors", "0", False, "not better"), "")
+    inputs.results["search"] = PartResult(Part("search.safetensors", "0", False, "not better"), "")
     forbid(monkeypatch, "verification")
     fitted = VerificationFit(inputs).fit()
-    assert fitted.part == Part(None, None, False, "not fitted, since the agent does not use the target evidence")
+    assert fitted.part == Part(None, None, False, "not fitted, since the agent does not use the model of searches")
 
 
 def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_left_out(home, tmp_path, monkeypatch):
@@ -406,10 +406,10 @@ def test_decisions_are_scored_by_photograph():
 
 def test_experiments_take_their_settings_from_the_folder(home):
     folder = home / "models"
-    config = with_models(SearchConfig(models=folder, policies=("target-evidence", "predictive-calibrated")))
+    config = with_models(SearchConfig(models=folder, policies=("non-predictive-learned", "predictive-calibrated")))
     assert config.detector.name == str(folder / "../colours.onnx")
     assert (config.sensor.sigma, config.sensor.growth, config.belief.columns) == (60, 1, 4)
-    assert config.belief.target_model == str(folder / "evidence.safetensors")
+    assert config.belief.search_model == str(folder / "search.safetensors")
     assert config.belief.model == str(folder / "observation.safetensors")
     assert with_models(SearchConfig()) == SearchConfig()
     moved = SearchConfig(models=folder, detector=DetectorConfig(name="elsewhere.onnx"))
@@ -423,7 +423,7 @@ def test_policies_that_need_a_missing_part_are_left_out_or_refused(home, tmp_pat
     rewrite_manifest(folder, observation=Part(None, None, False, "too few detections"))
     kept = with_models(SearchConfig(models=folder)).policies
     assert "predictive-raw" not in kept
-    assert {"random", "non-predictive-raw", "target-evidence"} <= set(kept)
+    assert {"random", "non-predictive-raw", "non-predictive-learned"} <= set(kept)
     named = SearchConfig(models=folder, policies=(PolicyConfig("non-predictive", "calibrated"),))
     refused("lacks: too few detections", with_models, named)
     refused(r"observation model, got .* without; fit one: semfov fit", ActivePerception.published, folder)
@@ -608,6 +608,17 @@ def test_the_map_of_an_earlier_version_is_noted(home, tmp_path):
     assert agent.exploring.policy.name == "random"
 
 
+def test_what_guided_the_searches_of_an_earlier_version_is_noted(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    known = Manifest.read(folder)
+    others = {name: part for name, part in known.parts.items() if name != "search"}
+    replace(known, parts={**others, "evidence": known.parts["search"]}).write(folder)
+    with pytest.warns(UserWarning, match="models: its evidence for targets is of an earlier version and is not read"):
+        agent = ActivePerception.from_pretrained(folder)
+    assert isinstance(agent.searching.observer, Semantic)
+    assert agent.verification is None
+
+
 @pytest.mark.slow
 def test_fitting_from_python_returns_the_agent_of_the_folder(home, tmp_path):
     torch.set_num_threads(1)
@@ -620,7 +631,7 @@ def test_fitting_from_python_returns_the_agent_of_the_folder(home, tmp_path):
     assert Manifest.read(tmp_path / "out").training["photographs"] == 6
     # Three training steps hardly improve on raw scores; the agent uses only the parts that improved.
     folder = ModelFolder(tmp_path / "out")
-    assert isinstance(agent.searching.observer, Target) == folder.used("evidence")
+    assert isinstance(agent.searching.observer, SemanticSearch) == folder.used("search")
     assert agent.exploring.policy.name == "closer-look"
 
 

@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, Foveation, TargetEvidence
+from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, FovealObservationModel, Foveation
 from semfov.belief import Verification
-from semfov.belief.observers import Semantic, Target
-from semfov.belief.target_evidence import Thresholds
+from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.fit.searches import SearchEnd, _PhotographSearch, open_photographs, photograph_searches
 from semfov.fit.verification import (
     _LEVELS,
@@ -31,6 +30,8 @@ from semfov.fit.verification import (
 from semfov.fit.verification_part import _SHIPPED
 from semfov.gaze.policies import Policy
 from semfov.io.storage import read
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.store import cell_store, look_everywhere
 from tests.refusals import unusable
 from tests.small import CLASSES, Blobs
@@ -109,15 +110,16 @@ def test_the_prior_is_the_mean_of_the_shipped_models():
         torch.testing.assert_close(tensor, (files[0][name] + files[1][name]) / 2)
 
 
-def examined_in(seen, evidence, config):
+def examined_in(seen, searching, config):
     """Closer looks at the most evident places of photographs."""
-    return examine(photograph_searches(seen, evidence, config.looks, "looking"), config.folds)
+    return examine(photograph_searches(seen, searching, config.looks, "looking"), config.folds)
 
 
-def verified_in(seen, models, evidence, config):
+def verified_in(seen, models, searching, config):
     """The searches of photographs with all their closer looks."""
     limits = Thresholds(1.0, config.stop_below, config.place)
-    return verify(photograph_searches(seen, evidence, config.looks, "verifying"), models, limits, evidence.thresholds)
+    searches = photograph_searches(seen, searching, config.looks, "verifying")
+    return verify(searches, models, limits, searching.presence.thresholds)
 
 
 def searched(present, places, ends, presence, looks):
@@ -161,13 +163,16 @@ SOUGHT = VerificationConfig(columns=4, rows=3, max_target_area=1.0)
 
 
 def opened(detector, store=None):
-    """Three embedded scenes with classes to search for, and the evidence of an untrained model."""
+    """Three embedded scenes with classes to search for, and a model that searches them."""
     eye = Eye(Foveation(9.0), detector, reference=64.0).requires_grad_(False)
     scenes = EmbeddedScenes(CLASSES, count=3)
-    torch.manual_seed(0)
-    evidence = TargetEvidence(4, 4, components=4).eval().requires_grad_(False)
+    presence = Presence(torch.tensor(0.5), torch.tensor([1.0, 0.0]), torch.full((3,), 0.5), Thresholds(0.7, 0.01))
+    odds = torch.full((4, 3), 0.1)
+    searching = FovealObservationModel.identity(
+        CLASSES, [0.2, 0.5], miss_odds=odds, refutation=0.9, presence=presence
+    ).requires_grad_(False)
     kept = None if store is None else cell_store(store, eye.settings(), 4, 3, len(CLASSES) + 1)
-    return open_photographs(eye, scenes, [0, 1, 2], SOUGHT, store=kept), evidence
+    return open_photographs(eye, scenes, [0, 1, 2], SOUGHT, store=kept), searching
 
 
 @pytest.fixture
@@ -176,28 +181,28 @@ def seen():
 
 
 def test_looks_from_a_store_equal_those_of_the_eye(tmp_path):
-    live, evidence = opened(Limited())
+    live, searching = opened(Limited())
     eye, scenes = live[0].eye, live[0].scenes
     store = cell_store(tmp_path, eye.settings(), 4, 3, len(CLASSES) + 1)
     for each in live:
         image, digest = partial(lambda index: scenes[index].image[None], each.index), partial(scenes.digest, each.index)
         look_everywhere(eye, image, each.grid, store, digest)
-    seen = steps_of(live, evidence)
+    seen = steps_of(live, searching)
     eye.detector.most = eye.detector.passes  # no further look
     for one, other in zip(
-        seen, steps_of(open_photographs(eye, scenes, [0, 1, 2], SOUGHT, store=store), evidence), strict=True
+        seen, steps_of(open_photographs(eye, scenes, [0, 1, 2], SOUGHT, store=store), searching), strict=True
     ):
         torch.testing.assert_close(one.belief.probability(1), other.belief.probability(1))
 
 
-def steps_of(photographs, evidence):
+def steps_of(photographs, searching):
     """All looks of all searches of photographs."""
-    searches = (_PhotographSearch(each, sought, evidence, 5) for each in photographs for sought in each.targets)
+    searches = (_PhotographSearch(each, sought, searching, 5) for each in photographs for sought in each.targets)
     return [step for search in searches for step in search.steps]
 
 
 def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
-    live, evidence = seen
+    live, searching = seen
     sought = SimpleNamespace(**{**vars(SOUGHT), "classes": 1, "absent": 0})
     few, many = (open_photographs(live[0].eye, live[0].scenes, [0, 1, 2], sought, spare=n) for n in (0, 1))
     config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
@@ -205,23 +210,23 @@ def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
         assert [each.target for each in other.targets if not each.spare] == [each.target for each in one.targets]
         assert all(not each.present for each in other.targets if each.spare)
     assert any(each.spare for photograph in many for each in photograph.targets)
-    first, second = examined_in(few, evidence, config), examined_in(many, evidence, config)
+    first, second = examined_in(few, searching, config), examined_in(many, searching, config)
     assert torch.equal(first.features, second.features)
-    searches = list(verified_in(many, 2 * [shipped_mean()], evidence, config))
+    searches = list(verified_in(many, 2 * [shipped_mean()], searching, config))
     assert [each.spare for each in searches] == [each.spare for photograph in many for each in photograph.targets]
 
 
 @pytest.mark.parametrize("confirm", [0.5, 0.7])
 def test_searches_end_as_those_of_an_agent(seen, confirm):
     """The agent looks by itself and with other code, with closer looks and without."""
-    found, evidence = seen
-    evidence.thresholds = Thresholds(0.55, 0.3, 0.3)
+    found, searching = seen
+    searching.presence.thresholds = Thresholds(0.55, 0.3, 0.3)
     model = shipped_mean()
     config = VerificationConfig(columns=4, rows=3, looks=6, folds=2, stop_below=0.1, place=0.1)
     model.thresholds = Thresholds(confirm, config.stop_below, config.place)
-    searching, exploring = (Target(evidence), Policy("non-predictive")), (Semantic(4), Policy("random"))
-    agent = ActivePerception(found[0].eye, searching, exploring, verification=model, grid=(4, 3)).eval()
-    searches = iter(verified_in(found, [model, model], evidence, config))
+    search, explore = (SemanticSearch(searching), Policy("non-predictive")), (Semantic(4), Policy("random"))
+    agent = ActivePerception(found[0].eye, search, explore, verification=model, grid=(4, 3)).eval()
+    searches = iter(verified_in(found, [model, model], searching, config))
     ends = []
     for photograph in found:
         image = photograph.scenes[photograph.index].image
@@ -255,21 +260,21 @@ def test_classes_are_present_and_absent_as_the_goal_says(seen):
 
 
 def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
-    found, evidence = seen
+    found, searching = seen
     config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
-    known = examined_in(found, evidence, config)
+    known = examined_in(found, searching, config)
     assert known.features.shape == (len(known.right), 7)
     assert set(known.fold.tolist()) == {0, 1}
     # A place can only be right in a photograph that holds the target.
     assert bool((known.present | ~known.right).all())
     models = [fit_to_closer_looks(known, known.fold != fold) for fold in (0, 1)]
-    searches = list(verified_in(found, models, evidence, config))
+    searches = list(verified_in(found, models, searching, config))
     assert len(searches) == sum(len(photograph.targets) for photograph in found)
     for each in searches:
         assert len(each.places) == len(each.ends) <= 2
         assert list(each.ends) == sorted(each.ends)
         assert each.looks >= max(each.ends, default=1)
-    unusable("got only one kind", fit_in_folds, [], evidence, config)
+    unusable("got only one kind", fit_in_folds, [], searching, config)
 
 
 class Limited(Blobs):
@@ -289,10 +294,10 @@ class Limited(Blobs):
 def all_of(detector, store):
     """Examine and verify the embedded scenes."""
     config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
-    found, evidence = opened(detector, store)
-    known = examined_in(found, evidence, config)
+    found, searching = opened(detector, store)
+    known = examined_in(found, searching, config)
     return known, list(
-        verified_in(found, [fit_to_closer_looks(known, known.fold != fold) for fold in (0, 1)], evidence, config)
+        verified_in(found, [fit_to_closer_looks(known, known.fold != fold) for fold in (0, 1)], searching, config)
     )
 
 

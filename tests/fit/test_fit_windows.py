@@ -12,7 +12,6 @@ from semfov import ActivePerception, EmbeddedScenes
 from semfov.agents import ZoomAgent
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import WindowEpisode, WindowTask
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data import Annotation, Scene
 from semfov.data.mosaics import Mosaics
@@ -32,6 +31,7 @@ from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou, right_boxes
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import DataConfig
 from semfov.runs.progress import WholeBar
 from semfov.settings import DecisionSettings, FindSettings

@@ -16,7 +16,6 @@ from semfov import (
     Foveation,
     Grid,
     InputError,
-    TargetEvidence,
     observers,
     policies,
 )
@@ -55,16 +54,18 @@ def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
 
 @pytest.mark.parametrize("task", ["search", "exploration"])
 def test_policies_with_equal_settings_of_the_belief_have_equal_observers(task, model):
-    models = {"observation": model, "evidence": TargetEvidence(components=3), "map": model}
-    models["fitted"] = model
+    models = {"observation": model, "search": model, "map": model}
     seen = {}
     for name in presets(task):
         plain = resolve(name, task)
-        own = policy_looking._by_evidence(plain, task) or plain.scores in ("learned", "fitted")
-        for policy in (plain,) if own else (plain, replace(plain, tempering=0.5), replace(plain, misses=True)):
+        for policy in (
+            (plain,)
+            if plain.scores == "learned"
+            else (plain, replace(plain, tempering=0.5), replace(plain, misses=True))
+        ):
             observer = strategy(policy, task, **models).observer
             look = type(observer), repr(observer), [id(part) for part in observer.children()]
-            assert seen.setdefault(_belief_settings(policy, task), look) == look
+            assert seen.setdefault(_belief_settings(policy), look) == look
     assert 3 < len(seen) < 3 * len(presets(task))
 
 
@@ -82,7 +83,7 @@ def test_policies_that_do_not_depend_on_the_belief_value_cells_alike_for_any(nam
 
 
 def test_prediction_calibration_and_misses_need_an_observation_model(model):
-    every = {"evidence": TargetEvidence(components=3), "map": model, "observation": model}
+    every = {"search": model, "map": model, "observation": model}
 
     def needs_model(belief, *choices, task="search"):
         asked = set()
@@ -92,7 +93,7 @@ def test_prediction_calibration_and_misses_need_an_observation_model(model):
         return "observation" in asked
 
     soft = PolicyConfig("non-predictive", footprint="soft")
-    assert not needs_model(None, "random", "target-evidence", "vocus2", "non-predictive-raw", soft)
+    assert not needs_model(None, "random", "recommended", "vocus2", "non-predictive-raw", soft)
     assert not needs_model(None, "random-raw", "closer-look-raw", "itti-koch-raw", "recommended", task="exploration")
     assert needs_model(None, PolicyConfig("non-predictive", misses=True))
     assert needs_model(None, "random", "non-predictive-calibrated")
@@ -110,24 +111,24 @@ def test_prediction_calibration_and_misses_need_an_observation_model(model):
 def test_models_are_loaded_by_the_names_in_the_settings(monkeypatch):
     monkeypatch.setattr(policy_looking, "make_observation", lambda name, eye: ("observation", name))
     monkeypatch.setattr(policy_looking, "make_map", lambda name, eye: ("map", name))
-    monkeypatch.setattr(policy_looking, "make_learned", lambda kind, name, eye: (kind, name))
-    belief = BeliefConfig(model="mine", target_model="sought", map_model="everything")
-    assert [_load(name, belief, SimpleNamespace()) for name in ("observation", "evidence", "map")] == [
+    monkeypatch.setattr(policy_looking, "make_searching", lambda name, eye: ("search", name))
+    belief = BeliefConfig(model="mine", search_model="sought", map_model="everything")
+    assert [_load(name, belief, SimpleNamespace()) for name in ("observation", "search", "map")] == [
         ("observation", "mine"),
-        (TargetEvidence, "sought"),
+        ("search", "sought"),
         ("map", "everything"),
     ]
 
 
-def test_a_run_has_the_models_that_its_policies_need(monkeypatch, tmp_path):
+def test_a_run_has_the_models_that_its_policies_need(model, monkeypatch, tmp_path):
     looked = SearchConfig(policies=("random",), data=DataConfig(limit=1, min_instances=0), cache=tmp_path)
     monkeypatch.setattr("semfov.fit.looking.make_eye", lambda detector, sensor: Eye(Foveation(9.0), Blobs()))
-    monkeypatch.setattr(policy_looking, "_load", lambda name, belief, eye: TargetEvidence(components=4))
+    monkeypatch.setattr(policy_looking, "_load", lambda name, belief, eye: model)
     assert not any(SearchRun(looked).models)
-    guided = (PolicyConfig("target-evidence", saliency="vocus2"), "random")
+    guided = (PolicyConfig("non-predictive", "learned", saliency="vocus2"), "random")
     models = SearchRun(replace(looked, policies=guided)).models
     assert models.observation is models.map is None
-    assert isinstance(models.evidence, TargetEvidence)
+    assert models.search is model
     for config in (SearchConfig, ExploreConfig):
         with pytest.raises(InputError, match="policies: expected at least one"):
             SearchRun(config(policies=()))
@@ -159,11 +160,10 @@ def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
     assert strategy("closer-look-raw", "exploration", fovea=0.07).policy.fovea == 0.07
 
 
-def test_target_evidence_brings_its_own_belief_and_saliency_keeps_that_of_the_run(model):
-    evidence = TargetEvidence(4, 4)
-    sought = strategy("target-evidence", evidence=evidence)
-    assert isinstance(sought.observer, observers.Target)
-    assert sought.observer.model is evidence
+def test_learned_scores_bring_their_own_belief_and_saliency_keeps_that_of_the_run(model):
+    sought = strategy("recommended", search=model)
+    assert isinstance(sought.observer, observers.SemanticSearch)
+    assert sought.observer.model is model
     assert sought.policy.name == "non-predictive"
     made = strategy(PolicyConfig("saliency", "calibrated", saliency="vocus2"), "exploration", observation=model)
     assert made.policy.name == "saliency"
@@ -192,12 +192,12 @@ def test_saliency_replaces_a_policy_or_is_combined_with_it(rows):
 
 
 @pytest.mark.parametrize("name", ["foveal-hit", "place-information", "entropy-limit", "ideal-observer"])
-def test_policies_that_need_a_target_position_work_with_learned_evidence(model, name):
-    """The belief is that of `target-evidence`, and the policy searches for the position that it estimates."""
-    evidence = TargetEvidence(4, 4, components=3)
-    made = strategy(PolicyConfig(name, "learned"), observation=model, evidence=evidence)
-    assert isinstance(made.observer, observers.Target)
-    assert made.observer.model is evidence
+def test_policies_that_need_a_target_position_work_with_the_learned_belief(model, name):
+    """The belief is that of the agent, and the policy searches for the position that it estimates."""
+    sought = FovealObservationModel.identity(["cup", "cat"], [0.2], miss_odds=torch.full((3, 2), 0.3))
+    made = strategy(PolicyConfig(name, "learned"), observation=model, search=sought)
+    assert isinstance(made.observer, observers.SemanticSearch)
+    assert made.observer.model is sought
     assert made.policy.name == name
     belief = made.observer.start(2, GRID, torch.zeros(()))
     visited = torch.zeros(2, 12, dtype=torch.bool)

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from torch import nn
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
-from semfov.fit.examples import _Exploratory
 from semfov.gaze import Viewer
 from semfov.gaze.acquisition import FUNCTIONS, AcquisitionFunction
 from semfov.gaze.choice import Greedy, Softmax, drawn_from, select_fixation, soft_fixation
@@ -26,49 +25,20 @@ def noise_from(seed):
     return lambda shift, episodes: torch.rand(len(episodes), 9, generator=generator)
 
 
-@pytest.mark.parametrize("astray", [0.0, 0.3, 1.0])
-def test_the_given_share_of_fixations_is_random(astray):
-    count = 20_000
-    values, visited = torch.zeros(count, 9), torch.zeros(count, 9, dtype=torch.bool)
-    values[:, 4] = 1
-    visited[:, 7] = True
-    fixation, cell = _Exploratory(noise_from(0), astray)(0, torch.arange(count), values, visited, CENTRES)
-    assert torch.equal(fixation, CENTRES[cell])
-    counts = torch.bincount(cell, minlength=9)
-    # Random fixations are uniform over unvisited cells, the best one included; within five standard deviations.
-    share = torch.full((9,), astray / 8)
-    share[4] += 1 - astray
-    share[7] = 0
-    deviation = (count * share * (1 - share)).clamp(min=0).sqrt()
-    assert bool(((counts - count * share).abs() <= 5 * deviation).all())
-
-
-@given(st.integers(0, 10_000), st.floats(0, 1))
-def test_a_visited_cell_is_never_chosen(seed, astray):
+@given(st.integers(0, 10_000))
+def test_a_visited_cell_is_never_chosen(seed):
     generator = torch.Generator().manual_seed(seed)
     values, visited = torch.rand(6, 9, generator=generator), torch.rand(6, 9, generator=generator) < 0.7
     left = ~visited.all(-1)
     before = values.clone()
-    _, cell = _Exploratory(noise_from(seed), astray)(0, torch.arange(6), values, visited, CENTRES)
+    _, cell = Greedy(noise_from(seed))(0, torch.arange(6), values, visited, CENTRES)
     assert not visited[left].gather(1, cell[left, None]).any()
     assert torch.equal(values, before)
 
 
-def test_without_random_fixations_the_choice_is_greedy():
-    values, noise = torch.rand(50, 9).mul(4).round(), torch.rand(50, 9)
-    visited = torch.rand(50, 9) < 0.3
-    got, expected = (
-        make(0, torch.arange(50), values, visited, CENTRES)[1]
-        for make in (_Exploratory(lambda *_: noise, 0.0), Greedy(lambda *_: noise))
-    )
-    assert torch.equal(got, expected)
-
-
 def test_no_gradient_flows_through_a_choice():
     values = torch.rand(3, 9, requires_grad=True)
-    fixation, _ = _Exploratory(noise_from(2), 0.5)(
-        0, torch.arange(3), values, torch.zeros(3, 9, dtype=torch.bool), CENTRES
-    )
+    fixation, _ = Greedy(noise_from(2))(0, torch.arange(3), values, torch.zeros(3, 9, dtype=torch.bool), CENTRES)
     assert not fixation.requires_grad
 
 

@@ -111,7 +111,7 @@ DIRICHLET = ("kl", "negative-entropy", "surprise", "two-peaks")
     ("task", "policy", "scores", "expected"),
     [
         *(("exploration", policy, "learned", "expected 'raw' or 'calibrated' for policy") for policy in DIRICHLET),
-        *(("search", policy, "learned", ".*") for policy in ("random", "non-predictive", "target-evidence")),
+        *(("search", policy, "learned", ".*") for policy in ("random", "predictive", "neighbourhood")),
     ],
 )
 def test_policies_refuse_scores_of_another_belief(task, policy, scores, expected):

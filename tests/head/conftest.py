@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from semfov import Eye, FovealObservationModel, Foveation, TargetEvidence
+from semfov import Eye, FovealObservationModel, Foveation
+from semfov.observation.presence import Presence
 from tests.small import Tiles
 
 
@@ -18,10 +19,13 @@ def eye():
 
 @pytest.fixture
 def models():
-    torch.manual_seed(0)
+    classes = ["red", "green", "blue"]
+    odds = torch.tensor([[1.0, 1], [0.1, 0.3], [0.15, 0.2], [0.2, 0.35]])
+    presence = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((3,), 0.5))
+    search = FovealObservationModel.identity(classes, [0.2], miss_odds=odds, refutation=0.6, presence=presence)
     # Its map is in doubt about cells without detections, so that some looks in a view pay.
-    observation = FovealObservationModel.identity(["red", "green", "blue"], [0.2], cell=(0.4, 1.0, 1.0))
-    return TargetEvidence(components=4).requires_grad_(False), observation.requires_grad_(False)
+    observation = FovealObservationModel.identity(classes, [0.2], cell=(0.4, 1.0, 1.0))
+    return search.requires_grad_(False), observation.requires_grad_(False)
 
 
 @pytest.fixture

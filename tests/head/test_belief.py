@@ -12,8 +12,8 @@ from torch.nn import functional as F
 
 from eval.head.run import _rests_on
 from eval.head.scan import Scan
-from semfov import EmbeddedScenes, Panorama, TargetEvidence, rollout
-from semfov.belief.observers import SemanticMap, Target
+from semfov import Detections, EmbeddedScenes, Panorama, rollout
+from semfov.belief.observers import SemanticMap, SemanticSearch
 from semfov.gaze.acquisition.accuracy import _CORRECTED
 from semfov.gaze.choice import Given
 from semfov.head import ExploreGain, Flat, Panoramas, PerSecond, SearchGain, Speeds
@@ -50,12 +50,13 @@ def pose_ahead(views):
 
 def test_belief_about_one_view_equals_that_of_an_eye_without_a_head(views, eye, models):
     """Cells of the scene have the values of the observer of a single picture, at their place in the view."""
-    evidence = models[0]
     pose = pose_ahead(views)
     cells = [33, 66, 52]
-    belief = episode(views, eye, SceneObserver(Target(evidence), views), [pose * 100 + c for c in cells], 3)[-1]
+    belief = episode(views, eye, SceneObserver(SemanticSearch(models[0]), views), [pose * 100 + c for c in cells], 3)[
+        -1
+    ]
     image = views.world.view(views.poses[pose])[0][None]
-    inner, view = Target(evidence), eye.open(image)
+    inner, view = SemanticSearch(models[0]), eye.open(image)
     alone = inner.start(1, views.view_grid, image)
     for cell in cells:
         point = views.view_grid.centres[cell][None]
@@ -67,7 +68,7 @@ def test_belief_about_one_view_equals_that_of_an_eye_without_a_head(views, eye, 
         at = at.clamp(0, 9)
         low = at.floor().clamp(max=8).long()
         share = at - low
-        table = alone.present.view(10, 10)
+        table = alone.probability(3).view(10, 10)
         rows = [(1 - share[0]) * table[low[1] + k, low[0]] + share[0] * table[low[1] + k, low[0] + 1] for k in (0, 1)]
         expected = (1 - share[1]) * rows[0] + share[1] * rows[1]
         assert float(belief.probability(3)[0, shown[number]]) == pytest.approx(float(expected), abs=1e-5)
@@ -77,7 +78,7 @@ def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
     pose = pose_ahead(views)
     other = int((views.poses - torch.tensor([30.0, 0, 60])).abs().sum(-1).argmin())
     actions = [pose * 100 + 50, other * 100 + 59, pose * 100 + 59]
-    beliefs = episode(views, eye, SceneObserver(Target(models[0]), views), actions, 1)
+    beliefs = episode(views, eye, SceneObserver(SemanticSearch(models[0]), views), actions, 1)
     scene = len(views.world.scene)
     distances = torch.full((len(views.poses), scene), torch.inf)
     for count, (belief, action) in enumerate(zip(beliefs, actions, strict=True), 1):
@@ -98,7 +99,7 @@ def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
 
 def test_cells_that_were_never_seen_have_the_prior(views, eye, models):
     pose = pose_ahead(views)
-    belief = episode(views, eye, SceneObserver(Target(models[0]), views, prior=0.07), [pose * 100 + 55], 1)[0]
+    belief = episode(views, eye, SceneObserver(SemanticSearch(models[0]), views, prior=0.07), [pose * 100 + 55], 1)[0]
     unseen = belief.owner[0] < 0
     assert unseen.any()
     assert (belief.probability(1)[0, unseen] == 0.07).all()
@@ -112,7 +113,7 @@ def test_turning_the_world_turns_the_belief(eye, models, panorama):
         views = Views(Panorama(turned, (64, 48)))
         yaw = 0.0 if turned is panorama else -180.0
         pose = int((views.poses - torch.tensor([yaw, 0, 60])).abs().sum(-1).argmin())
-        belief = episode(views, eye, SceneObserver(Target(models[0]), views), [pose * 100 + 37], 3)[0]
+        belief = episode(views, eye, SceneObserver(SemanticSearch(models[0]), views), [pose * 100 + 37], 3)[0]
         beliefs.append(belief.probability(3).view(30, 60))
     torch.testing.assert_close(beliefs[0].roll(30, -1), beliefs[1], atol=1e-4, rtol=0)
 
@@ -126,7 +127,9 @@ def neighbours(views, cell):
 
 def test_search_gain_equals_brute_force(views, eye, models):
     pose = pose_ahead(views)
-    belief = episode(views, eye, SceneObserver(Target(models[0]), views), [pose * 100 + 55, pose * 100 + 12], 2)[-1]
+    belief = episode(
+        views, eye, SceneObserver(SemanticSearch(models[0]), views), [pose * 100 + 55, pose * 100 + 12], 2
+    )[-1]
     gains = SearchGain(views, 0.7)(belief, pose, range(len(views)))
     chance, fovea = belief.probability(2)[0], 100 / 640
     beside = int((views.gaze_cell == views.gaze_cell[pose * 100 + 55] + 1).nonzero()[0, 0])
@@ -147,7 +150,7 @@ def test_search_gain_equals_brute_force(views, eye, models):
 def test_the_gaze_leaves_an_object_whose_most_probable_cell_was_fixated(views, models):
     """And goes on to a neighbour that is more probable than what was fixated; also across the seam."""
     gain = SearchGain(views, 0.0)
-    start = SceneObserver(Target(models[0]), views, prior=0.01).start(1, views.grid, torch.zeros(1))
+    start = SceneObserver(SemanticSearch(models[0]), views, prior=0.01).start(1, views.grid, torch.zeros(1))
     for cell in (60 * 15 + 30, 60 * 15):
         blob = neighbours(views, cell)
         values = torch.full_like(start.values, 0.01)
@@ -164,7 +167,7 @@ def test_the_gaze_leaves_an_object_whose_most_probable_cell_was_fixated(views, m
 def test_gain_per_second_by_hand(views, eye, models):
     pose = pose_ahead(views)
     here = pose * 100 + 55
-    belief = episode(views, eye, SceneObserver(Target(models[0]), views), [here], 2)[-1]
+    belief = episode(views, eye, SceneObserver(SemanticSearch(models[0]), views), [here], 2)[-1]
     gain, speeds = SearchGain(views), Speeds()
     visited = torch.zeros(1, len(views.grid), dtype=torch.bool)
     gains = gain(belief, pose, range(len(views)))
@@ -184,7 +187,11 @@ def test_the_head_stays_if_turning_is_expensive_and_turns_if_it_is_cheap(views, 
 
     def turned(speeds):
         views.world.speeds = speeds
-        observer, gain, start = SceneObserver(Target(models[0]), views), SearchGain(views), pose_ahead(views) * 100 + 55
+        observer, gain, start = (
+            SceneObserver(SemanticSearch(models[0]), views),
+            SearchGain(views),
+            pose_ahead(views) * 100 + 55,
+        )
         steps = look_around(
             views, live(eye, views), observer, lambda action: PerSecond(gain, speeds, action), start,
             target=1, passes=6,
@@ -223,7 +230,7 @@ def test_what_was_seen_fades_by_the_seconds_that_pass(views, eye, models, model)
     """By hand: log odds, or logarithms of all classes, of cells that the later looks do not show."""
     views.world.rate = 0.2
     speeds = views.world.speeds
-    inner = Target(models[0]) if model == 0 else SemanticMap(models[1])
+    inner = SemanticSearch(models[0]) if model == 0 else SemanticMap(models[1])
     observer = SceneObserver(inner, views, prior=None if model else 0.03)
     order = [pose_ahead(views), views.tiling[1][5]]
     steps = look_around(
@@ -250,7 +257,7 @@ def test_what_was_seen_fades_by_the_seconds_that_pass(views, eye, models, model)
 def test_a_still_head_that_forgets_believes_what_an_eye_without_a_head_does(views, eye, models):
     """Cells at the middles of the view's own, by the stream's formula of forgetting."""
     views.world.rate = 0.5
-    pose, inner = pose_ahead(views), Target(models[0])
+    pose, inner = pose_ahead(views), SemanticSearch(models[0])
     steps = look_around(
         views, live(eye, views), SceneObserver(inner, views), lambda action: Scan(_NoGain(views), [pose], 1, action),
         pose * 100 + 44, target=3, passes=4,
@@ -268,7 +275,7 @@ def test_a_still_head_that_forgets_believes_what_an_eye_without_a_head_does(view
 
 
 def test_a_scan_goes_through_its_poses_in_order(views, eye, models):
-    observer, gain = SceneObserver(Target(models[0]), views), SearchGain(views)
+    observer, gain = SceneObserver(SemanticSearch(models[0]), views), SearchGain(views)
     order = [5, 9, 30]
     steps = look_around(
         views, live(eye, views), observer, lambda action: Scan(gain, order, 2, action), 555, target=1, passes=8
@@ -277,7 +284,7 @@ def test_a_scan_goes_through_its_poses_in_order(views, eye, models):
 
 
 def test_seconds_of_a_path_add_up_those_of_its_movements(views, eye, models):
-    observer, gain, speeds = SceneObserver(Target(models[0]), views), SearchGain(views), Speeds()
+    observer, gain, speeds = SceneObserver(SemanticSearch(models[0]), views), SearchGain(views), Speeds()
     found = look_around(
         views, live(eye, views), observer, lambda action: PerSecond(gain, speeds, action), 555,
         target=1, duration=3.0,
@@ -432,9 +439,11 @@ def test_windows_beyond_a_picture_and_several_episodes_are_refused(views, models
     refused("pose: expected a window inside 64 × 48 pixels", flat.look_at, (-16.0, 0.0), 20.0)
     refused("field: expected a window inside the picture", flat.poses, 60.0)
     refused("fields: expected", Views, flat, (30.0, 20.0))
-    observer = SceneObserver(Target(models[0]), views)
+    observer = SceneObserver(SemanticSearch(models[0]), views)
     refused("batch: expected 1, as a head has one episode at a time", observer.start, 2, views.grid, torch.zeros(1))
-    refused("prior: expected a probability", SceneObserver, Target(models[0]), views, prior=1.5)
+    refused("prior: expected a probability", SceneObserver, SemanticSearch(models[0]), views, prior=1.5)
+    nothing = Detections.empty(1, 3)
+    refused("target: expected a class to search for, got None", observer.weigh, nothing, torch.zeros(1, 2), views.grid)
 
 
 CLASSES = ("person", "dog", "boat")
@@ -555,9 +564,9 @@ def test_durations_of_movements_follow_the_main_sequence_and_settling():
         assert float(slow.duration(*moved) - plain.duration(*moved)) == pytest.approx(later)
 
 
-def test_turns_within_the_dead_zone_are_not_made():
+def test_turns_within_the_dead_zone_are_not_made(models):
     views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
-    belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    belief = SceneObserver(SemanticSearch(models[0]), views).start(1, views.grid, torch.zeros(1))
     every = range(len(views))
     for dead_zone in (0.0, 15.0, 25.0):
         gain = PerSecond(SearchGain(views), Speeds(dead_zone=dead_zone), 55, every)

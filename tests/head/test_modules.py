@@ -5,19 +5,24 @@ from functools import cache
 import torch
 
 from semfov import Eye, Foveation, HeadAgent
-from semfov.belief.observers import SemanticMap, Target
+from semfov.belief.observers import SemanticMap, SemanticSearch
 from semfov.head import ExploreGain, Panorama, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
 from semfov.head.views import Views
 from semfov.settings import ExploreSettings
 from tests.base_tester import BaseTester
-from tests.small import Blobs, detections, evidence, look, model, rand
+from tests.small import Blobs, detections, look, model, rand, search_model
 
 
 @cache
 def views():
     """All looks at a small panorama."""
     return Views(Panorama(rand(3, 60, 120), (64, 48)))
+
+
+def searcher():
+    """An observer of searches in the small panorama."""
+    return SceneObserver(SemanticSearch(search_model().requires_grad_(False)), views())
 
 
 class SceneTester(BaseTester):
@@ -37,7 +42,7 @@ class SceneTester(BaseTester):
 
 class TestSceneObserver(SceneTester):
     def make(self):
-        return SceneObserver(Target(evidence()), views())
+        return searcher()
 
     @staticmethod
     def call(module, scores, boxes):
@@ -50,7 +55,7 @@ class TestSearchGain(SceneTester):
 
     @staticmethod
     def call(module, scores, boxes):
-        belief = SceneTester.seen(SceneObserver(Target(evidence()), views()), scores, boxes)
+        belief = SceneTester.seen(searcher(), scores, boxes)
         return module(belief, 0, range(len(views())))
 
 
@@ -70,7 +75,7 @@ class TestPerSecond(SceneTester):
 
     @staticmethod
     def call(module, scores, boxes):
-        belief = SceneTester.seen(SceneObserver(Target(evidence()), views()), scores, boxes)
+        belief = SceneTester.seen(searcher(), scores, boxes)
         return module(belief, torch.zeros(1, len(views().grid), dtype=torch.bool))
 
 
@@ -78,7 +83,7 @@ class TestHeadAgent(BaseTester):
     on_cpu = True
 
     def make(self):
-        return HeadAgent(Eye(Foveation(20.0), Blobs()), evidence(), model()).eval().requires_grad_(False)
+        return HeadAgent(Eye(Foveation(20.0), Blobs()), search_model(), model()).eval().requires_grad_(False)
 
     def inputs(self):
         return (rand(3, 60, 120),)

@@ -6,13 +6,14 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from semfov import DataError, DirichletStatistics, FovealObservationModel, InputError, TargetEvidence
+from semfov import DataError, DirichletStatistics, FovealObservationModel, InputError
 from semfov.belief import Verification
-from semfov.belief.target_evidence import Thresholds
 from semfov.io import storage
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Schema, Text, is_number, is_plain
 from semfov.io.storage import read_tensors, write_tensors
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.zoom import GlimpseEvidence
 from tests.refusals import refused, unusable
 
@@ -25,8 +26,12 @@ def observation():
     return FovealObservationModel.identity(CLASSES, [0.2], **settings)
 
 
-def evidence():
-    return TargetEvidence(3, 2, components=3, thresholds=Thresholds(0.83, 0.05), metadata=METADATA)
+def searching():
+    presence = Presence(
+        torch.tensor(-0.5), torch.tensor([0.75, 0.125]), torch.tensor([0.25, 0.5]), Thresholds(0.83, 0.05)
+    )
+    odds = torch.full((3, 2), 0.125)
+    return FovealObservationModel.identity(CLASSES, [0.2], miss_odds=odds, refutation=0.5, presence=presence)
 
 
 def glimpses():
@@ -52,7 +57,7 @@ def seeded(make):
     return made
 
 
-EVERY = (observation, evidence, glimpses, verification)
+EVERY = (observation, searching, glimpses, verification)
 MODELS = {make.__name__: seeded(make) for make in EVERY}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 

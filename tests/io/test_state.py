@@ -7,7 +7,8 @@ import torch
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, InputError, TargetEvidence
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, InputError
+from semfov.belief import Verification
 from semfov.io.state import without_settings
 from semfov.sensor import LogPolar, MultiScaleFovea
 from tests.small import Blobs, Coloured, agent
@@ -65,7 +66,7 @@ def test_learned_settings_are_no_obstacle():
 
 
 def test_files_and_digests_hold_tensors_alone(tmp_path):
-    for kind, name in ((TargetEvidence, "yolov3-tiny-growth-2"), (FovealObservationModel, "yolov3-tiny")):
+    for kind, name in ((Verification, "verification"), (FovealObservationModel, "observation")):
         files = sorted(kind.shipped.glob("*.safetensors"))
         model = kind.from_pretrained(files[0])
         model.save(tmp_path / f"{name}.safetensors")

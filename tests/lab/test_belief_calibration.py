@@ -1,6 +1,7 @@
 """Calibration of beliefs along searches: sums against loops over cells, beliefs step by step, missing models."""
 
 import math
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -10,29 +11,19 @@ from eval.calibration.beliefs import BANDS, CELL_GROUPS, COUNTS, BeliefCalibrati
 from eval.calibration.beliefs_report import _add_up, _curves, _landing_table, _pooled, write_belief_report
 from eval.calibration.sums import AddedSums
 from eval.search.run import SearchConfig
-from semfov import FovealObservationModel, InputError, TargetEvidence, rollout
-from semfov.belief.observers import Semantic, SemanticMap, Target
+from semfov import FovealObservationModel, InputError, rollout
+from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.episode import StoredLooks
 from semfov.fit.protocols import choose_classes
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
+from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
 from semfov.runs.scene_run import finish
 from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.setup import make_eye
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 
 BELIEFS = ["raw", "calibrated", "tempered", "learned", "semantic map"]
-
-
-def write_models(folder):
-    """Save untrained models that fit the default eye."""
-    settings = make_eye(DetectorConfig(), SensorConfig()).settings()
-    with torch.random.fork_rng():
-        torch.manual_seed(1)
-        TargetEvidence(8, 6, metadata=settings).save(folder / "target.safetensors")
-    return {"target_model": str(folder / "target.safetensors"), "map_model": "yolox-nano"}
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +31,7 @@ def config(tmp_path_factory):
     folder = tmp_path_factory.mktemp("beliefs")
     return SearchConfig(
         data=DataConfig(limit=2, max_target_area=0.5),
-        belief=BeliefConfig(columns=4, rows=3, **write_models(folder)),
+        belief=BeliefConfig(columns=4, rows=3),
         protocol=ProtocolConfig(shifts=COUNTS[-1] - 1),
         cache=folder / "cache",
         out=folder / "out",
@@ -60,7 +51,7 @@ def probabilities_along(run, target, path, detections, grid):
         "raw": Semantic(81),
         "calibrated": Semantic(81, model),
         "tempered": Semantic(81, tempering=0.5),
-        "learned": Target(run.models.evidence),
+        "learned": SemanticSearch(run.models.search),
         "semantic map": SemanticMap(run.models.map),
     }
     probabilities = {}
@@ -91,7 +82,9 @@ def test_sums_match_beliefs_updated_step_by_step(run):
             looks = StoredLooks(detections, grid, torch.tensor([target]))
             with torch.inference_mode():
                 choice = Greedy(drawn_from(noise))
-                steps = rollout(looks, Target(run.models.evidence), TargetPosterior(target), start, choice, most=15)
+                steps = rollout(
+                    looks, SemanticSearch(run.models.search), TargetPosterior(target), start, choice, most=15
+                )
                 path = [int(step.cell) for step in steps]
                 probabilities = probabilities_along(run, target, path, detections, grid)
             # The search ends after 12 looks, when every cell has been fixated.
@@ -133,7 +126,9 @@ def test_sums_match_beliefs_updated_step_by_step(run):
 
 @pytest.mark.slow
 def test_a_belief_is_left_out_when_its_model_is_not_shipped(config, run, tmp_path, monkeypatch):
-    monkeypatch.setattr(TargetEvidence, "shipped", tmp_path)
+    for name in ("yolox-nano", "yolox-nano-sharp"):
+        shutil.copy(FovealObservationModel.shipped / f"{name}.safetensors", tmp_path)
+    monkeypatch.setattr(FovealObservationModel, "shipped", tmp_path)
     bare = BeliefCalibrationRun(replace(config, belief=BeliefConfig(columns=4, rows=3), out=tmp_path))
     assert list(bare.observers) == [*BELIEFS[:3], "semantic map"]
     assert bare.guide == "tempered"
@@ -141,7 +136,7 @@ def test_a_belief_is_left_out_when_its_model_is_not_shipped(config, run, tmp_pat
     finish(bare, "believing")
     text, written = write_belief_report(bare)
     assert all(path.stat().st_size > 200 for path in written)
-    assert "Left out because no fitted model is shipped: learned (detector: no model of target evidence is" in text
+    assert "Left out because no fitted model is shipped: learned (detector: no observation model is" in text
     assert "The tempered belief guides the gaze" in text
     with pytest.raises(InputError, match="unknown observation model 'mine'"):
         BeliefCalibrationRun(replace(config, belief=replace(config.belief, map_model="mine")))

@@ -9,18 +9,18 @@ from hypothesis import strategies as st
 from torchvision.ops import box_iou
 
 from eval.decide.run import DecideConfig, DecisionRun, landing, overlap, quarters, sharp_place
-from semfov import DataError, Detections, DirichletBelief, FovealObservationModel, Grid, InputError, TargetEvidence
-from semfov.belief.observers import Semantic, Target
-from semfov.belief.target_evidence import Thresholds
+from semfov import DataError, Detections, DirichletBelief, FovealObservationModel, Grid, InputError
+from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.decision import OUTCOMES, conclude, decide
 from semfov.episode import StoredLooks, rollout
 from semfov.fit.protocols import choose_classes
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Policy
-from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
+from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
 from semfov.runs.seeds import generator_for, noise_for
-from semfov.runs.setup import make_eye
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 
@@ -28,19 +28,12 @@ AT = Thresholds(0.5, 0.375)
 FUSED = ["calibrated belief", "calibrated belief, a detection at the gaze"]
 
 
-def write_evidence(path, thresholds, seed=2):
-    """Save an untrained model that fits the default eye; with large weights, some searches find or give up."""
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        model = TargetEvidence(
-            8, 6, thresholds=thresholds, metadata=make_eye(DetectorConfig(), SensorConfig()).settings()
-        )
-        for network in (model.look, model.read, model.judge):
-            for layer in (network[0], network[2], network[4]):
-                torch.nn.init.normal_(layer.weight, std=1.2 / layer.in_features**0.5)
-        torch.nn.init.normal_(model.prior)
+def write_model(path, thresholds):
+    """Save the shipped model of searches with other thresholds, at which some searches find or give up."""
+    model = FovealObservationModel.from_pretrained("yolox-nano-search")
+    model.presence = Presence(torch.tensor(0.5), torch.tensor([0.5, 0.0]), torch.full((80,), 0.5), thresholds)
     model.save(path)
-    return path
+    return str(path)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +45,7 @@ def folder(tmp_path_factory):
 def config(folder):
     return DecideConfig(
         data=DataConfig(limit=3, max_target_area=0.5),
-        belief=BeliefConfig(columns=4, rows=3, target_model=str(write_evidence(folder / "model.safetensors", AT))),
+        belief=BeliefConfig(columns=4, rows=3, search_model=write_model(folder / "model.safetensors", AT)),
         protocol=ProtocolConfig(shifts=6),
         cache=folder / "cache",
         out=folder / "out",
@@ -87,7 +80,7 @@ def test_quarters_cover_every_pixel_once():
 @pytest.mark.slow
 def test_a_run_compares_gaze_and_beliefs_at_the_given_thresholds(config):
     run = DecisionRun(replace(config, confirm=0.6))
-    assert list(run.compared) == ["target-evidence", "random gaze", *FUSED]
+    assert list(run.compared) == ["non-predictive-learned", "random gaze", *FUSED]
     assert run.thresholds == Thresholds(0.6, AT.stop_below)
 
 
@@ -103,14 +96,14 @@ def detects_at_the_gaze(step, grid, target, least=0.5):
 
 @pytest.mark.slow
 def test_records_match_searches_run_step_by_step(run):
-    outcomes, evidence = set(), run.models.evidence
+    outcomes = set()
     for index in range(3):
         records, seconds = run.outcomes(index)
         assert set(seconds) == {"look", "search"}
         annotation, grid, scene = run.scenes.annotation(index), run.grid(index), run.scenes.ids[index]
         targets = choose_classes(run.scenes, index, annotation, 1, 0.5, 0)
         assert [(r["target"], r["policy"]) for r in records] == [
-            (target, policy) for target in targets for policy in ("target-evidence", "random gaze", *FUSED)
+            (target, policy) for target in targets for policy in ("non-predictive-learned", "random gaze", *FUSED)
         ]
         assert [r["present"] for r in records] == [True] * 4 + [False] * 4
         detections, sharp = run.detections(index), run.eye.detector(run.scenes[index].image[None])
@@ -126,7 +119,7 @@ def test_records_match_searches_run_step_by_step(run):
             start = torch.randint(12, (1,), generator=generator_for("start", 0, scene, target))
             noise = noise_for(run.config.protocol, 12, scene, target, 0)[None]
             acquisition = Uniform() if record["policy"] == "random gaze" else TargetPosterior(target)
-            observer, at_the_gaze = Target(evidence), record["policy"] == FUSED[1]
+            observer, at_the_gaze = SemanticSearch(run.models.search), record["policy"] == FUSED[1]
             if record["policy"] in FUSED:
                 model = run.models.observation
                 observer, acquisition = Semantic(81, model), Policy("predictive", model)(target, grid)
@@ -163,15 +156,15 @@ def test_records_match_searches_run_step_by_step(run):
 
 
 def test_a_model_without_thresholds_still_decides(config, folder):
-    path = write_evidence(folder / "none.safetensors", None)
-    run = DecisionRun(replace(config, belief=replace(config.belief, target_model=str(path))))
+    path = write_model(folder / "none.safetensors", None)
+    run = DecisionRun(replace(config, belief=replace(config.belief, search_model=path)))
     records, _ = run.outcomes(0)
     assert len(records) == 8
 
 
 def test_the_published_belief_is_left_out_without_an_observation_model(config, monkeypatch):
     monkeypatch.setattr(FovealObservationModel, "shipped", config.out / "none")
-    assert list(DecisionRun(config).compared) == ["target-evidence", "random gaze"]
+    assert list(DecisionRun(config).compared) == ["non-predictive-learned", "random gaze"]
     named = replace(config, belief=replace(config.belief, model="nowhere.safetensors"))
     with pytest.raises((InputError, DataError), match="nowhere"):
         DecisionRun(named)

@@ -37,15 +37,16 @@ def test_policies_of_a_run_are_named_by_their_labels(config):
     assert run.policies == {
         "random": PolicyConfig("random"),
         "non-predictive-raw, tempering 0.25, footprint box_centre": central,
-        "target-evidence": PolicyConfig("target-evidence"),
+        "non-predictive-learned": PolicyConfig("non-predictive", "learned"),
     }
     assert list(run.strategies) == list(run.policies)
-    assert run.candidate("target-evidence", 0).strategy is run.strategies["target-evidence"]
+    assert run.candidate("non-predictive-learned", 0).strategy is run.strategies["non-predictive-learned"]
     refused("did you mean 'random'", run.candidate, "randm", 0)
 
 
 def test_a_run_has_one_store_for_each_saliency_model(config):
-    calibrated, sought = replace(GUIDED, scores="calibrated"), PolicyConfig("target-evidence", saliency="itti-koch")
+    calibrated = replace(GUIDED, scores="calibrated")
+    sought = PolicyConfig("non-predictive", "learned", saliency="itti-koch")
     run = SearchRun(replace(config, policies=("vocus2", "random", GUIDED, sought, calibrated)))
     assert list(run.saliency_stores) == ["vocus2", "itti-koch"]
     explored = ExploreConfig(data=config.data, belief=config.belief, cache=config.cache, out=config.out)
@@ -76,7 +77,7 @@ def test_the_key_changes_only_with_settings_that_affect_outcomes(config):
     ):
         assert SearchRun(replace(config, **same)).key == key
     others = [
-        {"policies": ("random", "target-evidence")},
+        {"policies": ("random", "non-predictive-learned")},
         {"policies": (PolicyConfig("random", tempering=0.25),)},
         {"policies": ("vocus2",)},
         {"policies": ("vocus2",), "saliency": SaliencyConfig(reduction="mean")},
@@ -167,7 +168,7 @@ def test_the_page_of_an_exploration_run_shows_episodes_as_recorded(settings):
         assert values[each["next"]] == pytest.approx(values.max(), rel=1e-3)
 
 
-SOUGHT = "target-evidence"
+SOUGHT = "non-predictive-learned"
 SEMANTIC = (
     "non-predictive-raw",
     PolicyConfig("predictive", "calibrated", tempering=0.25, memory="closest"),
@@ -232,7 +233,7 @@ def test_a_replayed_semantic_search_has_the_original_beliefs_and_values(run, sea
                 torch.testing.assert_close(path.posterior[shift], belief.probability(record["cue"])[0])
 
 
-def test_a_replayed_search_by_target_evidence_also_has_the_recommended_map(run, searched):
+def test_a_replayed_search_by_the_learned_belief_also_has_the_recommended_map(run, searched):
     records, steps = searched[SOUGHT]
     looks, grid = run.detections(0), run.grid(0)
     mapper = SemanticMap(FovealObservationModel.from_pretrained(run.eye.detector.name))

@@ -28,7 +28,7 @@ from eval.zoom.objects import (
 from eval.zoom.orders import in_order, quad_tree, shuffled
 from eval.zoom.report import recall_and_precision, recall_cells
 from eval.zoom.run import ZoomConfig, ZoomRun
-from semfov import FovealObservationModel, TargetEvidence
+from semfov import FovealObservationModel
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Detections, Objects
 from semfov.head.views import Views
@@ -73,9 +73,10 @@ def config(request, tmp_path, monkeypatch):
     monkeypatch.setattr("semfov.runs.setup.load_detector", lambda name, **options: Tiles())
     monkeypatch.setattr("eval.head.run.make_scenes", lambda data, classes: NoiseScenes())
     torch.manual_seed(0)
-    evidence = TargetEvidence(components=4).requires_grad_(False)
-    observation = FovealObservationModel.identity(["red", "green", "blue"], [0.2]).requires_grad_(False)
-    monkeypatch.setattr("eval.head.run.make_learned", lambda kind, name, eye: evidence)
+    classes = ["red", "green", "blue"]
+    searching = FovealObservationModel.identity(classes, [0.2], miss_odds=torch.full((4, 2), 0.3)).requires_grad_(False)
+    observation = FovealObservationModel.identity(classes, [0.2]).requires_grad_(False)
+    monkeypatch.setattr("eval.head.run.make_searching", lambda name, eye: searching)
     monkeypatch.setattr("eval.head.run.make_map", lambda name, eye: observation)
     return HeadConfig(
         scene=request.param,

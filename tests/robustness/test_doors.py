@@ -12,7 +12,6 @@ from PIL import Image
 import semfov
 from semfov import (
     ActivePerception,
-    TargetEvidence,
     WindowEye,
     ZoomAgent,
     as_image,
@@ -20,6 +19,7 @@ from semfov import (
     read_image,
     words,
 )
+from semfov.belief import Verification
 from semfov.data.classes import _SYNONYMS, class_index
 from semfov.data.large import open_large
 from semfov.decision import Decision
@@ -468,11 +468,6 @@ def test_records_of_agents_are_compared_as_people_are(agent):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda: ActivePerception.recommended(sigma=50),
-            "sigma: models are shipped for 100 pixels on an image of 640 pixels, got 50",
-        ),
-        (lambda: ActivePerception.recommended(growth=3), "growth: models are shipped for 1 and 2, got 3"),
         (lambda: ActivePerception.recommended(grid=(0, 10)), "grid: expected a whole number from 1"),
         (lambda: ActivePerception.recommended(grid=10), r"grid: expected \(columns, rows\), got 10"),
         (lambda: ActivePerception.recommended("yolo"), "unknown detector 'yolo'; did you mean 'yolov3'"),
@@ -489,7 +484,7 @@ def test_invalid_arguments_of_presets_are_refused_with_the_remedy(call, message)
 
 def test_learned_models_accept_only_grids_of_similar_size():
     """A grid may have from half to twice the columns and rows that a model was fitted on."""
-    model = TargetEvidence.from_pretrained("yolov3-tiny")
+    model = Verification.from_pretrained("yolov3-tiny")
     settings = {"detector": model.metadata["detector"], "sensor": model.metadata["sensor"]}
     for grid in ((10, 10), (20, 20), (5, 5), (16, 12)):
         model.check_compatible(settings, grid)

@@ -41,7 +41,7 @@ def test_sensor_and_observation_model_load_without_detector_weights():
 
 
 AGENTS = {
-    "recommended": ({"grid": (6, 5)}, observers.Target, "non-predictive", "closer-look"),
+    "recommended": ({"grid": (6, 5)}, observers.SemanticSearch, "non-predictive", "closer-look"),
     "published": ({"search": "predictive"}, observers.Semantic, "predictive", "kl"),
     "raw": ({"sensor": "published-narrow"}, observers.Semantic, "non-predictive", "random"),
 }
@@ -59,7 +59,7 @@ def test_agents_are_those_of_the_package(kind):
 
 
 def test_the_recommended_agent_is_the_default():
-    assert type(load("agent").searching.observer) is observers.Target
-    kinds = "recommended, published, learned_chain, raw"
+    assert type(load("agent").searching.observer) is observers.SemanticSearch
+    kinds = "recommended, published, raw"
     with pytest.raises(semfov.InputError, match=f"kind: expected {kinds}, got 'best'"):
         load("agent", kind="best")

@@ -16,7 +16,7 @@ from semfov.gaze.acquisition.base import Task
 from semfov.gaze.policies import policy_names
 from semfov.runs.command import run_command
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig, SensorConfig
-from semfov.runs.presets import _WORDS, TARGET_EVIDENCE, label, presets, resolve
+from semfov.runs.presets import _WORDS, label, presets, resolve
 from semfov.runs.setup import make_eye, make_observation, make_scenes, observation_name
 from tests.refusals import refused, unusable
 
@@ -131,11 +131,11 @@ def test_ids_that_are_missing_or_cannot_be_read_are_named(photographs):
 TASKS = get_args(Task)
 ALIASES = {
     "search": {
-        "recommended": "target-evidence",
+        "recommended": "non-predictive-learned",
         "published": "predictive-calibrated",
         "maximum-a-posteriori-raw": "non-predictive-raw",
         "maximum-a-posteriori-calibrated": "non-predictive-calibrated",
-        "maximum-a-posteriori-learned": "target-evidence",
+        "maximum-a-posteriori-learned": "non-predictive-learned",
     },
     "exploration": {"recommended": "closer-look-learned", "published": "kl-calibrated"},
 }
@@ -161,11 +161,7 @@ def test_names_give_policy_scores_and_saliency():
     assert resolve("itti-koch-calibrated", "exploration") == PolicyConfig(
         "saliency", "calibrated", saliency="itti-koch"
     )
-    assert resolve("non-predictive-fitted", "search") == PolicyConfig("non-predictive", "fitted")
-    refused("policy", resolve, "non-predictive-fitted", "exploration")
-    fitted = PolicyConfig("non-predictive", "fitted", tempering=0.5)
-    refused("tempering", resolve, fitted, "search")
-    assert resolve("recommended", "search") == PolicyConfig("target-evidence")
+    assert resolve("recommended", "search") == PolicyConfig("non-predictive", "learned")
     assert resolve("recommended", "exploration") == PolicyConfig("closer-look", "learned")
     assert resolve("published", "search") == PolicyConfig("predictive", "calibrated")
     assert resolve("published", "exploration") == PolicyConfig("kl", "calibrated")
@@ -174,7 +170,7 @@ def test_names_give_policy_scores_and_saliency():
 @pytest.mark.parametrize("task", TASKS)
 def test_every_policy_has_a_preset_with_its_name(task):
     made = {preset.policy for preset in presets(task).values()}
-    assert made == {*policy_names(task), *[TARGET_EVIDENCE] * (task == "search")}
+    assert made == {*policy_names(task)}
     for name, preset in presets(task).items():
         assert resolve(name, task) == resolve(preset, task) == preset
     for name in presets(task):
@@ -210,7 +206,7 @@ def test_labels_list_the_differences_from_a_preset():
 def test_unknown_names_and_settings_are_refused_with_a_suggestion():
     for choice, task, suggested in [
         ("predicitve-raw", "search", "predictive-raw"),
-        ("target-evidenc", "search", "target-evidence"),
+        ("non-predictive-lerned", "search", "non-predictive-learned"),
         ("recomended", "exploration", "recommended"),
         ("random", "exploration", "random-raw"),
         (PolicyConfig("predictiv"), "search", "predictive"),
@@ -224,7 +220,7 @@ def test_unknown_names_and_settings_are_refused_with_a_suggestion():
             refused(f"did you mean '{suggested}'", call, choice, task)
     for task, settings, told in [
         ("search", {"policy": "kl"}, "policy"),
-        ("exploration", {"policy": "target-evidence"}, "policy"),
+        ("exploration", {"policy": "non-predictive"}, "policy"),
         *((task, {"policy": "saliency"}, "^saliency: .*vocus2, itti-koch") for task in TASKS),
         *(
             ("exploration", {"policy": "kl", "tempering": wrong}, "^tempering: expected a number above 0")
@@ -232,11 +228,11 @@ def test_unknown_names_and_settings_are_refused_with_a_suggestion():
         ),
         # Without scores in use, its label would be the same as with raw scores.
         ("search", {"policy": "random", "scores": "calibrated"}, "^scores: .*'random'"),
-        ("search", {"policy": "target-evidence", "scores": "calibrated"}, "^scores: .*'target-evidence'"),
+        ("search", {"policy": "predictive", "scores": "learned"}, "^scores: .*'predictive'"),
         ("search", {"policy": "saliency", "scores": "calibrated", "saliency": "vocus2"}, "^scores: .*'saliency'"),
         # It has a belief of its own, not the map.
         *(
-            ("search", {"policy": "target-evidence", name: value}, f"^{name}: .*'target-evidence'")
+            ("search", {"policy": "non-predictive", "scores": "learned", name: value}, f"^{name}: .*'learned'")
             for name, value in (("tempering", 0.25), ("footprint", "soft"), ("memory", "all"), ("misses", True))
         ),
     ]:

@@ -192,7 +192,11 @@ def test_a_deleted_store_file_is_written_identically_with_more_threads(config):
 
 
 def test_a_policy_given_twice_is_refused(config):
-    for policies in (("random", "random"), ("random", PolicyConfig("random")), ("recommended", "target-evidence")):
+    for policies in (
+        ("random", "random"),
+        ("random", PolicyConfig("random")),
+        ("recommended", "non-predictive-learned"),
+    ):
         with pytest.raises(InputError, match=r"^policies: expected each policy once, got '.*' 2 times"):
             SearchRun(replace(config, policies=policies))
 

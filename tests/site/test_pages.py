@@ -98,9 +98,9 @@ def test_names_are_linked_where_they_are_names(names):
     text = "[`Foveation`](x.md), ``Foveation`` and Foveation"
     assert names.link(text) == text
     inside = set()
-    text = names.link("`semfov.fit.evidence.evidence_objective`", inside)
-    assert text == "[`semfov.fit.evidence.evidence_objective`][semfov.fit.evidence.evidence_objective]"
-    assert inside == {"semfov.fit.evidence.evidence_objective"}
+    text = names.link("`semfov.fit.through_belief.landing_loss`", inside)
+    assert text == "[`semfov.fit.through_belief.landing_loss`][semfov.fit.through_belief.landing_loss]"
+    assert inside == {"semfov.fit.through_belief.landing_loss"}
     module = "semfov.observation.dirichlet"
     assert docstring("see `entropy`", names, module) == "see [`entropy`][semfov.observation.dirichlet.entropy]"
     assert docstring("see `entropy`", names, module, {"entropy"}) == "see `entropy`"

@@ -11,12 +11,12 @@ import torch
 
 from semfov import Detections, WindowEye, ZoomAgent
 from semfov.belief.prior import Prior
-from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
 from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
 from semfov.motion import Motion
+from semfov.observation.thresholds import Thresholds
 from semfov.settings import FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty

@@ -13,7 +13,6 @@ from scipy.stats import nbinom
 from torch.nn import functional as F
 
 from semfov import Detections, EmbeddedScenes, Objects, WindowEye, ZoomAgent
-from semfov.belief.target_evidence import Thresholds
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.decision import OUTCOMES, settle
@@ -24,6 +23,7 @@ from semfov.fit.windows_decisions import WindowSearches, fit_judge, judge_search
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import calibration_error
 from semfov.observation.matching import right_boxes
+from semfov.observation.thresholds import Thresholds
 from semfov.paths import ZoomPath
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice

@@ -248,7 +248,7 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, p
 
 @pytest.mark.parametrize("kind", ["closely", "plain", "slices"])
 def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, picture, kind, one_thread):
-    """With closer looks, each of which takes a frame, without them, and without learned evidence."""
+    """With closer looks, each of which takes a frame, without them, and without fitted models."""
     model = {"closely": evidence(), "plain": GlimpseEvidence(3), "slices": None}[kind]
     agent = ZoomAgent(WindowEye(detector), model).eval()
     path = agent.search(picture, "red")

@@ -5,15 +5,14 @@ import torch
 from torch.nn import functional
 from torch.nn.functional import poisson_nll_loss
 
-from semfov.belief.evidence import neighbourhood_peak
-from semfov.belief.evidence import network as small_network
 from semfov.errors import InputError
 from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts, _WindowResult, fit_survey
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.hint_maps import neighbourhood_mean, through
+from semfov.zoom.hint_maps import neighbourhood_mean, neighbourhood_peak, through
 from semfov.zoom.hints import Gist
 from semfov.zoom.looks import Window, half_steps
+from semfov.zoom.networks import network as small_network
 from semfov.zoom.survey import Survey
 from train.fit_zoom import judge_survey
 

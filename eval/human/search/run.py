@@ -22,6 +22,7 @@ from semfov.fit.protocols import Trial, run_episodes
 from semfov.gaze.acquisition.base import Task
 from semfov.io.ranges import Count, Positive, Range
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
+from semfov.runs.presets import AGENT
 from semfov.runs.results import ResultRecord
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Settings
@@ -73,7 +74,7 @@ class PeopleSearchConfig(ComparedConfig):
     screen: ScreenConfig = field(default_factory=ScreenConfig)
     belief: BeliefConfig = field(default_factory=lambda: BeliefConfig(columns=32, rows=24))
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=9))
-    policies: tuple[str | PolicyConfig, ...] = ("non-predictive-raw", "predictive-calibrated", "target-evidence")
+    policies: tuple[str | PolicyConfig, ...] = ("non-predictive-raw", "predictive-calibrated", AGENT)
     bandwidth: Positive = 100.0
     bootstrap: Annotated[int, Range(2, 10_000)] = 200
     out: Path = Path("runs/human_search")

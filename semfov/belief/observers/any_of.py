@@ -9,9 +9,9 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer, own
-from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_number
+from semfov.observation.thresholds import Thresholds
 
 TargetLike = str | int | Sequence[str | int] | Mapping[str, float] | Mapping[int, float]
 """A class by name or index 1..K; several, of which any will do; or several with the probability that each is meant."""

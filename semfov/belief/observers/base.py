@@ -1,5 +1,7 @@
 """Base classes of observers, which turn looks into a belief."""
 
+import math
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -10,11 +12,13 @@ from torch import Tensor, nn
 
 from semfov.belief.belief import Belief, with_fields
 from semfov.belief.grid import Grid
-from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
+from semfov.observation.thresholds import Thresholds
 
 _Kind = TypeVar("_Kind")
+
+_REACH = 1 / 6  # distance, in longer sides of the image, over which a faded look counts as farther by a factor e
 
 
 class Look:
@@ -187,3 +191,16 @@ def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
             "observer"
         )
     return value
+
+
+def farther(keep: float) -> float:
+    """Compute by how much farther the closest look is when a share of its evidence is left.
+
+    Args:
+        keep: the share.
+
+    Returns:
+        The increase of its distance, in longer sides of the image: 1/6 for each factor e.
+    """
+    # Evidence that has faded to nothing is very far away, not infinitely: a distance of infinity is no look at all.
+    return -math.log(max(keep, sys.float_info.min)) * _REACH

@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
-from semfov.belief.evidence import farther
 from semfov.belief.fusion import RULES
 from semfov.belief.grid import Grid
 from semfov.belief.likelihood import likelihoods
-from semfov.belief.observers.base import Look, Observer, own
+from semfov.belief.observers.base import Look, Observer, farther, own
 from semfov.detection.detections import Detections
 from semfov.observation.foveal import FovealObservationModel
 

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from semfov import FovealObservationModel, TargetEvidence
-from semfov.belief.target_evidence import Thresholds
+from semfov import FovealObservationModel
 from semfov.data.fixations import Fixations, write_table
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import DetectorConfig, SensorConfig
 from semfov.runs.setup import make_eye
 from semfov.zoom import GlimpseEvidence
@@ -26,7 +27,6 @@ NETWORK = ("--detector.name", "HERE/colours.onnx")
 PHOTOGRAPHS = ("--data.root", "HERE/photographs", "--data.annotations", "HERE/photographs/instances.json",
                "--data.min_instances", "0", "--data.limit", "4")  # fmt: skip
 GRID = ("--belief.columns", "3", "--belief.rows", "2")
-TRAINED = ("--columns", "3", "--rows", "2", "--looks", "3", "--holdout", "2", "--steps", "4", "--batch", "2")
 MODEL = "colours.safetensors"
 
 
@@ -61,12 +61,14 @@ def write_material(folder: Path) -> None:
     settings = make_eye(DetectorConfig(str(network)), SensorConfig()).settings()
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        thresholds = Thresholds(0.6, 0.3)
-        TargetEvidence(4, 4, components=4, thresholds=thresholds, metadata=settings).save(folder / "target.safetensors")
         GlimpseEvidence(3).save(folder / "zoom.safetensors")
         alpha, rates = 0.5 + torch.rand(4, 3, 4), torch.full((4, 3), 0.3)
         model = FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=rates, metadata=settings)
         model.save(folder / "observation.safetensors")
+        model.presence = Presence(
+            torch.tensor(0.0), torch.tensor([1.0, 0.0]), torch.full((3,), 0.5), Thresholds(0.6, 0.3)
+        )
+        model.save(folder / "search.safetensors")
     (folder / "people").mkdir()
     draw, viewed, record = np.random.default_rng(0), [], {}
     for number in range(4):
@@ -117,7 +119,7 @@ COMMANDS = {
         ),
     ),
     "eval.decide": Command(
-        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--belief.target_model", "HERE/target.safetensors",
+        settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--belief.search_model", "HERE/search.safetensors",
                   "--protocol.shifts", "3"),
         files=("episodes.jsonl", "decisions.md"),
         others=("manifest.json", "config.yaml", "roc.png"),
@@ -128,8 +130,7 @@ COMMANDS = {
     ),
     "eval.chain": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, *GRID, "--belief.model", "HERE/observation.safetensors",
-                  "--belief.target_model", "HERE/target.safetensors", "--protocol.starts", "1",
-                  "--protocol.shifts", "3", "--steps", "2", "--looks", "2"),
+                  "--protocol.starts", "1", "--protocol.shifts", "3", "--steps", "2", "--looks", "2"),
         files=("records.jsonl", "chain.md"),
         others=("search.safetensors", "fold-0.safetensors"),
         parts="out/fold-*/parts/*.sqlite",
@@ -144,7 +145,7 @@ COMMANDS = {
     "eval.calibration": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "1", "--grid", "[3,2]", "--target_area", "0.5",
                   "--model", "HERE/observation.safetensors",
-                  "--target_model", "HERE/target.safetensors", "--map_model", "HERE/observation.safetensors"),
+                  "--search_model", "HERE/search.safetensors", "--map_model", "HERE/observation.safetensors"),
         files=("beliefs.md", "beliefs.csv", "beliefs.json"),
         others=("calibration.md", "config.yaml", "manifest.json", "reliability.png", "beliefs.png"),
     ),
@@ -199,7 +200,8 @@ COMMANDS = {
         same={"other shards": ("--shard", "3")},
     ),
     "train.fit_search": Command(
-        settings=(*NETWORK, *PHOTOGRAPHS, *TRAINED, "--max_target_area", "0.5"),
+        settings=(*NETWORK, *PHOTOGRAPHS, "--model", "HERE/observation.safetensors", "--columns", "3", "--rows", "2",
+                  "--looks", "3", "--holdout", "2", "--steps", "4", "--max_target_area", "0.5"),
         files=(MODEL, "judged.json", "report.md"),
         parts="cache/looks/*/*/*.safetensors",
         refused=(
@@ -209,7 +211,7 @@ COMMANDS = {
     ),
     "train.fit_verification": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--columns", "3", "--rows", "2", "--looks", "3", "--folds", "2",
-                  "--target_model", "HERE/target.safetensors"),
+                  "--search_model", "HERE/search.safetensors"),
         files=(MODEL, "judged.json", "report.md"),
         parts="cache/searches/*/*/*.safetensors",
         workers=False,
@@ -228,7 +230,7 @@ COMMANDS = {
         settings=("HERE/colours.onnx", *PHOTOGRAPHS, "--data.limit", "8", "--columns", "3", "--rows", "2",
                   "--holdout", "4", "--steps", "4", "--fixations", "2",
                   "--sensor.sigma", "60", "--sensor.growth", "1"),
-        files=("evidence.safetensors", "observation.safetensors"),
+        files=("search.safetensors", "observation.safetensors"),
         others=("manifest.json", "report.md", "search.png"),
         parts="cache/looks/*/*/*.safetensors",
         refused=(

@@ -1,4 +1,4 @@
-"""The part of a model folder that guides searches: target evidence, compared with raw scores."""
+"""The part of a model folder that guides searches: an observation model fitted to them, compared with raw scores."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,20 +10,22 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Semantic
-from semfov.belief.observers.target import Target
-from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.data.scene import legal_targets
 from semfov.decision import OUTCOMES, confirms, decide
 from semfov.episode import Step, StoredLooks
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, curves_figure, curves_table, section
-from semfov.fit.evidence import FitSearchConfig, fit_evidence, judge_evidence, make_examples
 from semfov.fit.part import PartFit, PartInputs, PartResult
+from semfov.fit.presence import thresholds_of_searches
 from semfov.fit.protocols import choose_searches, episodes_of, run_episodes, search_steps
+from semfov.fit.search import FitSearchConfig, fit_search, search_photographs, search_report
 from semfov.fit.thresholds import SUREST, SUREST_OF_FEW
 from semfov.gaze.policies import Policy
 from semfov.metrics.episodes import FloatArray, cumulative_performance
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.runs.seeds import noise_for
 from semfov.runs.tables import mean_or_dash, share
@@ -51,62 +53,75 @@ class _Decision(NamedTuple):
     looks: int
 
 
-class EvidenceFit(PartFit):
-    """Train the target evidence, and choose its thresholds."""
+class SearchFit(PartFit):
+    """Fit the odds of a miss and the presence, and choose thresholds."""
 
     settings: FitSearchConfig
 
     def __init__(self, inputs: PartInputs) -> None:
         super().__init__(inputs)
-        self.settings = inputs.settings(FitSearchConfig, absent=inputs.absent)
+        self.settings = inputs.settings(FitSearchConfig)
+        photographs = len(self.run.scenes)
         judged = len(inputs.judged)
         self.tasks = {
-            "describing looks": 0.05 * len(self.run.scenes),
-            "training": 0.1 * self.settings.steps,
-            "describing others": 0.05 * len(self.inputs.held_out),
-            "searching": judged,
+            "reading looks": 0.05 * photographs,
+            "fitting through the belief": 0.3 * self.settings.steps,
+            "searching": 0.1 * photographs,
+            "searching for more": 0.2 * len(inputs.held_out),
+            "comparing": judged,
             "deciding": judged,
         }
 
     def fit(self) -> PartResult:
-        """Train, and compare searches and their decisions with those of raw scores."""
-        fitted = fit_evidence(self.settings, self.run)
+        """Fit, and compare searches and their decisions with those of raw scores."""
+        # Held-out photographs choose the thresholds, and judge.
+        fitted = fit_search(self._start(), self.settings, self.run, hold_out=True)
         model = fitted.model
-        model.thresholds = self._thresholds(model)
+        presence = model.presence
+        assert presence is not None
+        presence.thresholds = thresholds = self._thresholds(model, presence)
         strategies = self._strategies(model)
         curves = self._curves(strategies)
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
         gain, why = self._compare(curves)
         rules: dict[str, _Rule] = {
-            "fitted": partial(_decide_by_evidence, thresholds=model.thresholds),
+            "fitted": partial(_decide_by_belief, thresholds=thresholds),
             "raw": _decide_by_score,
         }
         decisions = self._decisions({name: (strategies[name], rule) for name, rule in rules.items()})
         report = "\n".join(
             [
                 self._report_on_curves(curves),
-                _report_on_decisions(decisions, model.thresholds),
-                fitted.report,
+                _report_on_decisions(decisions, thresholds),
+                search_report(fitted.judged, presence, fitted.trained, fitted.held_out),
             ]
         )
         save_figure(curves_figure(curves, "search"), self.config.out / "search.png")
-        return PartResult(self.write("evidence", model, gain.better, why), report, ["search.png"])
+        return PartResult(self.write("search", model, gain.better, why), report, ["search.png"])
 
-    def _thresholds(self, model: TargetEvidence) -> Thresholds:
+    def _start(self) -> FovealObservationModel:
+        """Take the observation model of the folder; where raw scores are better, the one that leaves them unchanged."""
+        fitted = self.inputs.model("observation")
+        if isinstance(fitted, FovealObservationModel):
+            return fitted
+        return FovealObservationModel.identity(self.run.scenes.classes, self.config.sensor.level_edges())
+
+    def _thresholds(self, model: FovealObservationModel, presence: Presence) -> Thresholds:
         """Choose thresholds on held-out photographs with many absent classes, for a precise share of alarms."""
         config = self.settings
-        absent = max(config.classes, min(_MOST_ABSENT, _ABSENT // len(self.inputs.held_out)))
-        examples = make_examples(self.run, replace(config, absent=absent), self.inputs.held_out)
-        expected_alarms = config.false_alarms * int((~examples.goal.any(-1)).sum())
+        held_out = self.inputs.held_out
+        absent = max(config.absent, min(_MOST_ABSENT, _ABSENT // len(held_out)))
+        more = replace(config, absent=absent)
+        searches = search_photographs(model, self.run, more, held_out, title="searching for more")
+        expected_alarms = config.false_alarms * int((~searches.there).sum())
         bounds = replace(config, surest=SUREST_OF_FEW if expected_alarms < _FEW_ALARMS else SUREST)
-        _, thresholds = judge_evidence(bounds, model, examples, Grid(*config.cells, config.cells))
-        return thresholds
+        return thresholds_of_searches(presence, searches, bounds)
 
-    def _strategies(self, model: TargetEvidence) -> dict[str, Strategy]:
+    def _strategies(self, model: FovealObservationModel) -> dict[str, Strategy]:
         """Make the strategies that are compared: with the fitted model, with raw scores, and with tempered ones."""
         strategies = {
-            "fitted": Strategy(Target(model), Policy("non-predictive")),
+            "fitted": Strategy(SemanticSearch(model), Policy("non-predictive")),
             "raw": Strategy(Semantic(self.inputs.components), Policy("non-predictive")),
             "fused": Strategy(self.inputs.semantic, Policy("non-predictive")),
         }
@@ -119,7 +134,7 @@ class EvidenceFit(PartFit):
         run = self.run
         protocol = self.inputs.protocol
         curves: dict[str, list[FloatArray]] = {name: [] for name in strategies}
-        for index in track(self.inputs.judged, "searching", "scene"):
+        for index in track(self.inputs.judged, "comparing", "scene"):
             targets = legal_targets(run.scenes.annotation(index), self.settings.max_target_area)
             episodes = episodes_of(run.scenes, index, *run.cells, protocol, targets)
             if not episodes:
@@ -188,7 +203,7 @@ class EvidenceFit(PartFit):
         )
 
 
-def _decide_by_evidence(step: Step, target: int, grid: Grid, *, thresholds: Thresholds) -> Tensor:
+def _decide_by_belief(step: Step, target: int, grid: Grid, *, thresholds: Thresholds) -> Tensor:
     """Decide by the belief of the fitted model."""
     return decide(step, target, thresholds)
 

@@ -1,0 +1,294 @@
+"""The observer of searches: the paper's belief about all classes, with misses, and one detection for each cell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from semfov.belief.association import one_of, refuted
+from semfov.belief.belief import Belief, DirichletBelief, pick
+from semfov.belief.fusion import RULES
+from semfov.belief.grid import Footprint, Grid
+from semfov.belief.likelihood import likelihoods
+from semfov.belief.observers.base import Look, Observer, farther, own
+from semfov.belief.prior import Prior, PriorLike, with_prior
+from semfov.detection.detections import Detections, highest_score
+from semfov.errors import check
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.presence import EVEN, LEAST_SCORE, Presence, presence_facts
+from semfov.observation.thresholds import Thresholds
+
+_LEAST = 1e-6  # of the likelihood of background, by which the others are divided
+_WEAK = 1e-5  # ε, the Dirichlet parameter of a prior that one look outweighs
+_BY_DETECTION = ("ratio", "weight", "covered")  # tensors with a row for each detection
+
+
+@dataclass(frozen=True)
+class SearchLook(Look):
+    """Likelihoods of a batch of looks, of which one detection may show the object of a cell.
+
+    Attributes:
+        ratio: likelihood of the classes given each detection, relative to background, `(B, L, K+1)`.
+        weight: how well each detection fits each cell, `(B, L, X·Y)`.
+        covered: the cells under each detection, `(B, L, X·Y)`.
+        distance: from the fixation to each cell, `(B, X·Y)`, in longer sides of the image.
+        fixated: the fixated cell, `(B,)`.
+        log_score: logarithm of the highest score of each class, `(B, K+1)`.
+    """
+
+    ratio: Tensor
+    weight: Tensor
+    covered: Tensor
+    distance: Tensor
+    fixated: Tensor
+    log_score: Tensor
+
+    @classmethod
+    def join(cls, looks: Sequence[Self]) -> Self:
+        """Concatenate several batches of looks, padded to the largest number of detections."""
+        detections = max(look.ratio.shape[-2] for look in looks)
+
+        def joined(name: str) -> Tensor:
+            values = [getattr(look, name) for look in looks]
+            if name in _BY_DETECTION:
+                values = [pad(value, (0, 0, 0, detections - value.shape[-2])) for value in values]
+            return torch.cat(values)
+
+        return cls(*(joined(field.name) for field in fields(cls)))
+
+
+@dataclass(frozen=True)
+class SearchBelief(DirichletBelief):
+    """A Dirichlet belief of a search, which goes on only if it has not fixated its target.
+
+    Attributes:
+        following: `(B, X·Y, K+1)`, Dirichlet parameters given that no fixated cell holds the target (`chance`); `beta`
+            are those given the looks alone.
+        visited: `(B, X·Y)` boolean, the fixated cells.
+        log_score: `(B, K+1)`, sum over the looks of the logarithm of the highest score of each class.
+        looks: `(B,)`, number of looks.
+        covers: whether all cells under a detection have its weight, so that their probabilities are made true, too
+            (`Presence.of_cells`).
+        calibration: by which it says whether the picture holds a class; None takes the most probable cell.
+        prior: how often the target is there.
+    """
+
+    following: Tensor = None  # type: ignore[assignment]
+    visited: Tensor = None  # type: ignore[assignment]
+    log_score: Tensor = None  # type: ignore[assignment]
+    looks: Tensor = None  # type: ignore[assignment]
+    covers: bool = False
+    calibration: Presence | None = None
+    prior: Prior = field(default_factory=Prior)
+
+    def probability(self, target: int | Tensor) -> Tensor:
+        fitted = self._true(super().probability(target))
+        if self.prior.changes_nothing:
+            return fitted
+        return self.prior.place(fitted, self._fitted_presence(target)[:, None])
+
+    def chance(self, target: int | Tensor) -> Tensor:
+        fitted = pick(self.following, torch.as_tensor(target)) / self.following.sum(-1)
+        return self.prior(self._true(fitted))
+
+    def _true(self, probability: Tensor) -> Tensor:
+        """Make the probabilities of cells true, where the fit knows how."""
+        return self.calibration.of_cells(probability) if self.covers and self.calibration is not None else probability
+
+    def presence(self, target: int | Tensor) -> Tensor:
+        if self.calibration is None:
+            return self.prior(self._fitted_presence(target))
+        return with_prior(self._log_odds(self.calibration, target), self.prior.share, self.prior.fitted).sigmoid()
+
+    def _fitted_presence(self, target: int | Tensor) -> Tensor:
+        """Compute the probability that the image holds the target, by the prior of the fit, `(B,)`."""
+        if self.calibration is None:
+            return super().probability(target).amax(-1)
+        return self._log_odds(self.calibration, target).sigmoid()
+
+    def _log_odds(self, calibration: Presence, target: int | Tensor) -> Tensor:
+        """Compute the log odds that the image holds the target: 0 before the first look, and where all has faded."""
+        return self.looks.clamp(max=1) * calibration(self.facts(target))
+
+    def facts(self, target: int | Tensor) -> Tensor:
+        """Give what the probability of presence depends on (`semfov.observation.presence.presence_facts`).
+
+        Args:
+            target: as for `probability`.
+
+        Returns:
+            `(B, 2)`.
+        """
+        mean = pick(self.log_score, torch.as_tensor(target)) / self.looks.clamp(min=torch.finfo(self.looks.dtype).tiny)
+        return presence_facts(super().probability(target), mean)
+
+
+class SemanticSearch(Observer):
+    r"""A Dirichlet belief about all classes in every cell, with one likelihood for each cell and look.
+
+    The detector missed the object of a cell, with odds m that depend on the distance d, or one of the detections l
+    shows it (`semfov.belief.association`), with the weight w, which is 1 in the cell of its box's centre:
+
+    .. math:: \lambda_k(x) = m_k(d) + \sum_l w_l(x) \, \frac{p(S_l \mid k, d_l)}{p(S_l \mid 0, d_l)},
+              \qquad \lambda_0(x) = 1
+
+    Kaplan's rule (`semfov.fusion.kaplan`) fuses it with a prior ε = 1e-5 of every class, which one look outweighs. The
+    closest look at a cell counts, because looks at a static scene are not independent.
+
+    A search goes on only if it has not fixated its target. For the next fixation (`Belief.chance`) a detection that
+    covers a fixated cell therefore loses the share ρ of its weight, the model's `refutation`. Whether the picture holds
+    the target at all is told by its most probable cell and the scores of all looks (`semfov.observation.Presence`).
+
+    Args:
+        model: calibrates the scores, and has the odds of a miss, ρ, and the calibration of presence, if it was fitted.
+        prior: how often the target is there; None: in half of the pictures.
+        footprint: rule for the weight w of a detection in each cell (`Grid.footprint`): a gaze lands best in the cell
+            of its centre, `box_centre`; `overlap` tells for each cell whether it holds the target.
+
+    >>> model = FovealObservationModel.identity(["cup", "cat"], [0.2], miss_odds=torch.full((3, 2), 0.1))
+    >>> observer, grid = SemanticSearch(model), Grid(2, 1, (10, 10))
+    >>> seen = Detections(torch.tensor([[[0.0, 0, 4, 4]]]), torch.tensor([[[0.2, 0.7, 0.1]]]), torch.ones(1, 1).bool())
+    >>> belief = observer(observer.start(1, grid, torch.zeros(1)), seen, torch.tensor([[2.0, 2.0]]), grid)
+    >>> belief.probability(1).detach()  # of a cup in each cell
+    tensor([[0.7059, 0.0833]])
+    """
+
+    def __init__(
+        self,
+        model: FovealObservationModel,
+        *,
+        prior: Prior | None = None,
+        footprint: Footprint = "box_centre",
+    ) -> None:
+        super().__init__()
+        check(isinstance(model, FovealObservationModel), "model", "a FovealObservationModel", type(model).__name__)
+        check(prior is None or isinstance(prior, Prior), "prior", "a Prior (`with_prior` takes a share)", prior)
+        self.model = model
+        self.footprint: Footprint = footprint
+        self.prior = Prior() if prior is None else prior
+
+    def with_prior(self, prior: PriorLike, target: int) -> Self:
+        """Assume another share of searches whose target is there.
+
+        Args:
+            prior: the share (`Prior.of`).
+            target: class 1..K that is searched for.
+
+        Returns:
+            An observer with the same model.
+        """
+        presence = self.model.presence
+        fitted = None if presence is None else EVEN
+        usual = None if presence is None else float(presence.shares[target - 1])
+        known = Prior.of(prior, fitted, usual)
+        return type(self)(self.model, prior=known, footprint=self.footprint)
+
+    @property
+    def components(self) -> int:
+        """K + 1, number of classes with background."""
+        return len(self.model.classes) + 1
+
+    @property
+    def thresholds(self) -> Thresholds | None:
+        """Thresholds of the model."""
+        return None if self.model.presence is None else self.model.presence.thresholds
+
+    def start(self, batch: int, grid: Grid, like: Tensor) -> SearchBelief:
+        """Begin with the same small parameter for every class in every cell."""
+        beta = like.new_full((batch, len(grid), self.components), _WEAK)
+        visited = torch.zeros_like(beta[..., 0], dtype=torch.bool)
+        return SearchBelief(
+            beta,
+            following=beta,
+            visited=visited,
+            log_score=beta.new_zeros(batch, self.components),
+            looks=beta.new_zeros(batch),
+            covers=self.footprint == "overlap",
+            calibration=self.model.presence,
+            prior=self.prior,
+        )
+
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SearchLook:
+        """Compute the likelihoods of the detections, relative to background, the same for every target."""
+        likelihood = likelihoods(detections, fixation, grid, self.model)
+        ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
+        weight = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
+        covered = grid.footprint(detections.boxes) * detections.mask[..., None]
+        highest = highest_score(detections, torch.arange(self.components)).to(ratio)
+        return SearchLook(
+            ratio,
+            weight,
+            covered,
+            grid.distance(fixation).to(ratio),
+            grid.cell_of(fixation),
+            (highest + LEAST_SCORE).log(),
+        )
+
+    def unseen(self, like: Tensor) -> Tensor:
+        """Compute the probabilities of all classes in a cell as far away as can be, in which nothing was detected.
+
+        Args:
+            like: a tensor of the device and the precision of the result.
+
+        Returns:
+            `(K+1,)`, background first.
+        """
+        odds = self.model.miss_odds(like.new_ones(())).to(like)
+        probability = odds / odds.sum()
+        if self.footprint != "overlap" or self.model.presence is None:
+            return probability
+        return self.model.presence.of_cells(probability)
+
+    def update(self, belief: Belief, look: Look) -> SearchBelief:
+        """Fuse a look in each episode: given the looks alone, and for the next fixation."""
+        old = own(belief, SearchBelief, "belief")
+        seen = own(look, SearchLook, "look")
+        visited = old.visited.scatter(1, seen.fixated[:, None], True)
+        weight = seen.weight.to(old.beta)
+        share = self.model.refutation.clamp(0, 1).to(old.beta)
+        remaining = refuted(weight, seen.covered.to(old.beta), visited, share)
+        is_closer = (seen.distance < old.closest)[..., None]
+        return replace(
+            old,
+            beta=torch.where(is_closer, self._fuse(seen, weight), old.beta),
+            following=torch.where(is_closer, self._fuse(seen, remaining), old.following),
+            visited=visited,
+            log_score=old.log_score + seen.log_score.to(old.beta),
+            looks=old.looks + 1,
+            closest=torch.minimum(old.closest, seen.distance),
+        )
+
+    def _fuse(self, look: SearchLook, weight: Tensor) -> Tensor:
+        """Fuse the prior with a look, in which all detections and a miss are alternatives.
+
+        Args:
+            look: the look of each episode.
+            weight: how well each detection fits each cell, `(B, L, X·Y)`.
+
+        Returns:
+            Dirichlet parameters, `(B, X·Y, K+1)`.
+        """
+        odds = self.model.miss_odds(look.distance).to(weight)
+        likelihood = one_of(look.ratio.to(weight), weight, odds)
+        return RULES["kaplan"](torch.full_like(odds, _WEAK), likelihood / likelihood.amax(-1, keepdim=True))
+
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> SearchBelief:
+        r"""Move the Dirichlet parameters towards the prior, and the closest looks away.
+
+        .. math:: \beta \leftarrow \beta_0 + k (\beta - \beta_0)
+        """
+        old = own(belief, SearchBelief, "belief")
+        if keep == 1:
+            return old
+        return replace(
+            old,
+            beta=_WEAK + keep * (old.beta - _WEAK),
+            following=_WEAK + keep * (old.following - _WEAK),
+            visited=visited,
+            log_score=keep * old.log_score,
+            looks=keep * old.looks,
+            closest=old.closest + farther(keep),
+        )

@@ -1,0 +1,156 @@
+"""Fit whether a picture holds a class, and the thresholds of decisions, to what the beliefs of searches say."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.errors import DataError
+from semfov.fit.logistic import logistic_regression
+from semfov.fit.thresholds import Bounds, choose_thresholds
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.episodes import area_under_roc
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
+
+COUNTED = (1, 3, 5, 8, 12)
+"""Numbers of looks after which a belief counts in the fits of searches."""
+
+_RIDGE = 1e-3
+
+
+@dataclass(frozen=True)
+class BeliefsOfSearches:
+    """What the beliefs of E searches say after each of n looks; no search ends before the last one.
+
+    Attributes:
+        facts: `(2, n, E)`, what the probability of presence depends on (`semfov.observation.presence.presence_facts`).
+        place: `(n, E)`, probability of the fixated cell that is nearly as probable as any (`place_known`); 0 for none.
+        hit_chance: `(n, E)`, largest probability of a cell that was not fixated, given that no fixated one holds it.
+        on_target: `(n, E)` boolean, whether the gaze has reached the target.
+        there: `(E,)` boolean, whether the photograph holds the target.
+        photograph: `(E,)`, number of the photograph.
+        target: `(E,)`, class 1..K.
+    """
+
+    facts: Tensor
+    place: Tensor
+    hit_chance: Tensor
+    on_target: Tensor
+    there: Tensor
+    photograph: Tensor
+    target: Tensor
+
+    def __len__(self) -> int:
+        return len(self.there)
+
+    def __getitem__(self, chosen: Tensor) -> "BeliefsOfSearches":
+        """Select searches."""
+        return BeliefsOfSearches(*(getattr(self, field.name)[..., chosen] for field in fields(self)))
+
+    @classmethod
+    def join(cls, parts: Sequence["BeliefsOfSearches"]) -> "BeliefsOfSearches":
+        """Put the searches of several photographs together."""
+        return cls(*(torch.cat([getattr(part, field.name) for part in parts], -1) for field in fields(cls)))
+
+    @property
+    def counted(self) -> list[int]:
+        """Numbers of looks after which the beliefs count in the fit, as many as there are."""
+        return [number for number in COUNTED if number <= len(self.place)]
+
+
+def fit_presence(searches: BeliefsOfSearches, shares: Tensor, bounds: Bounds) -> Presence:
+    """Fit the presence by logistic regression, and choose the thresholds of decisions.
+
+    How often searches for a class were drawn with their target in the photograph says nothing of the belief: its log
+    odds are given to the regression, which fits what remains.
+
+    Args:
+        searches: searches of photographs.
+        shares: `(K,)`, by class, shares of these searches whose target is there.
+        bounds: shares of wrong decisions within which the thresholds are chosen.
+
+    Returns:
+        The presence with its thresholds.
+
+    Raises:
+        DataError: all searches have their target in the photograph, or none has.
+    """
+    _check_both_kinds(searches)
+    counted = torch.tensor(searches.counted) - 1
+    facts = searches.facts[:, counted].flatten(1).mT.double()
+    answers = searches.there.repeat(len(counted))
+    known = shares[searches.target - 1].double().logit().repeat(len(counted))
+    times = torch.full_like(known, 1 / len(counted))  # all looks of a search are one case
+    weight = torch.zeros(2)
+    kept = [0, 1]  # numbers of the facts that count
+    while True:
+        offset, *weights = logistic_regression(facts[:, kept], answers, times=times, known=known, ridge=_RIDGE)
+        if not weights or min(weights) >= 0:
+            break
+        # A surer cell, or a higher score, must not speak against the class: few searches may say so by chance.
+        del kept[weights.index(min(weights))]
+    weight[kept] = torch.tensor(weights)
+    presence = Presence(torch.tensor(offset), weight, shares).requires_grad_(False)
+    presence.thresholds = thresholds_of_searches(presence, searches, bounds)
+    return presence
+
+
+@torch.no_grad()
+def thresholds_of_searches(presence: Presence, searches: BeliefsOfSearches, bounds: Bounds) -> Thresholds:
+    """Choose the thresholds of decisions on searches.
+
+    Args:
+        presence: tells how probably a photograph holds the class.
+        searches: searches of photographs.
+        bounds: shares of wrong decisions within which the thresholds are chosen.
+
+    Returns:
+        The thresholds.
+    """
+    probability = presence(searches.facts.movedim(0, -1)).sigmoid()
+    return choose_thresholds(bounds, probability, searches.place, searches.hit_chance, searches.there)
+
+
+@torch.no_grad()
+def judge_presence(presence: Presence, searches: BeliefsOfSearches) -> list[dict[str, float]]:
+    """Measure a presence on searches of other photographs, with the shares of the fit as the prior.
+
+    Args:
+        presence: fitted to searches of some photographs.
+        searches: searches of others.
+
+    Returns:
+        After each number of looks that counts: `looks`; `found`, the share of the targets that the gaze has reached;
+        `area`, area under the ROC of the presence; `ece`, its expected calibration error; and `nll`, its mean negative
+        log likelihood.
+
+    Raises:
+        DataError: all searches have their target in the photograph, or none has.
+    """
+    _check_both_kinds(searches)
+    rows = []
+    for looks in searches.counted:
+        log_odds = presence(searches.facts[:, looks - 1].mT) + presence.shares[searches.target - 1].logit()
+        probability = log_odds.sigmoid()
+        rows.append(
+            {
+                "looks": looks,
+                "found": float(searches.on_target[looks - 1, searches.there].double().mean()),
+                "area": area_under_roc(probability, searches.there),
+                "ece": float(calibration_error(probability, searches.there)),
+                "nll": float(F.binary_cross_entropy_with_logits(log_odds, searches.there.to(log_odds))),
+            }
+        )
+    return rows
+
+
+def _check_both_kinds(searches: BeliefsOfSearches) -> None:
+    """Raise `DataError` unless the photographs of some searches hold the class, and those of others lack it."""
+    if searches.there.all() or not searches.there.any():
+        raise DataError(
+            "data: expected photographs that hold a class to search for, and others that lack it, got only one kind; "
+            "give more photographs"
+        )

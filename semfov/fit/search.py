@@ -1,0 +1,334 @@
+"""Fit an observation model for searches: the odds of a miss through the belief, then presence and thresholds."""
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from semfov.belief.observers import SemanticSearch
+from semfov.belief.observers.base import own
+from semfov.belief.observers.semantic_search import SearchBelief
+from semfov.data.scene import Scenes
+from semfov.decision import place_known
+from semfov.episode import Step, StoredLooks, rollout
+from semfov.errors import DataError, check
+from semfov.fit.logistic import logistic_regression
+from semfov.fit.looking import Looking
+from semfov.fit.presence import COUNTED, BeliefsOfSearches, fit_presence, judge_presence
+from semfov.fit.protocols import choose_searches, numbers_drawn
+from semfov.fit.settings import FitOnCellsConfig
+from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
+from semfov.fit.training import Fit, split, training_of
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.choice import Greedy, drawn_from
+from semfov.io.ranges import Count, Positive, Range, Share, Whole
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.presence import Presence
+from semfov.runs.config import DataConfig, ProtocolConfig
+from semfov.runs.progress import track
+from semfov.runs.setup import make_scenes
+from semfov.runs.tables import table
+
+_SURE = 1e-6  # probabilities nearer to 0 or 1 count as this far from them
+_RIDGE = 1e-3
+
+
+@dataclass(frozen=True)
+class FitSearchConfig(FitOnCellsConfig):
+    """Fit an observation model for searches.
+
+    Args:
+        drawn: photographs whose classes tell how often a class is there where it is searched for (None: those of the
+            fit, which may be few for that).
+        model: observation model to start from, by name or file (None: the one for the detector and the sensor).
+        holdout: one in every n photographs is held out for the evaluation.
+        looks: number of looks in a search.
+        steps: number of steps of the fit through the belief; 0 keeps the odds of a miss of `model`.
+        classes: maximum number of present classes to search for in each photograph.
+        absent: maximum number of absent classes to search for in each photograph.
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
+        surest: upper limit of that threshold, even if more false alarms result.
+        lost: maximum share of the targets that may be missed because their cell is not certain enough, and maximum
+            further share that may be missed because the search gives up.
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
+    drawn: DataConfig | None = None
+    model: str | None = None
+    holdout: Annotated[int, Range(2, 10**9)] = 5
+    looks: Annotated[int, Range(2, 10_000)] = 12
+    steps: Whole = 150
+    classes: Count = 2
+    absent: Count = 4
+    max_target_area: Positive = 0.2
+    false_alarms: Share = 0.015
+    surest: Share = 1.0
+    lost: Share = 0.02
+    out: Path = Path("runs/fit_search")
+
+
+def fit_search(
+    start: FovealObservationModel, config: FitSearchConfig, run: Looking, *, hold_out: bool = False
+) -> Fit[FovealObservationModel]:
+    """Fit odds of a miss, presence and thresholds to photographs, and evaluate them on held-out ones.
+
+    Args:
+        start: the observation model to start from.
+        config: settings of searches, fit and thresholds.
+        run: the photographs and their stored looks.
+        hold_out: whether presence and thresholds, too, are fitted without the held-out photographs; otherwise they are
+            fitted to all, once they are evaluated.
+
+    Returns:
+        The model with its report. Its odds of a miss are fitted to the photographs that are not held out.
+
+    Raises:
+        DataError: the photographs have no class to search for, or too few to hold some out.
+        InputError: `start` has no odds of a miss to keep.
+    """
+    check_start(start, config)
+    model = _with_odds_of_a_miss(start, config, run).requires_grad_(False)
+    searches = search_photographs(model, run, config, range(len(run.scenes)))
+    held_out = split(searches.photograph, config.holdout)
+    drawn = run.scenes if config.drawn is None else make_scenes(config.drawn, run.scenes.classes)
+    shares = shares_drawn(drawn, config, config.absent)
+    presence = fit_presence(searches[~held_out], shares, config)
+    judged = judge_presence(presence, searches[held_out])
+    model.presence = presence if hold_out else fit_presence(searches, shares, config)
+    with torch.no_grad():
+        model.presence.place.copy_(fit_places(model, run, config))
+    # Of searches for as many absent classes as present ones, which have their target in half of all cases.
+    model.presence.shares.copy_(shares_drawn(drawn, config, None))
+    model.metadata |= {**run.eye.settings(), **training_of(config, run.scenes, "model", "drawn")}
+    trained = int((~held_out).sum())
+    tested = int(held_out.sum())
+    return Fit(model, judged, trained, tested, search_report(judged, model.presence, trained, tested))
+
+
+def check_start(start: FovealObservationModel, config: FitSearchConfig) -> None:
+    """Raise `InputError` unless a fit that keeps the odds of a miss of its model has some."""
+    expected = "a model with odds of a miss where steps is 0, such as yolox-nano-search"
+    check(config.steps > 0 or start.log_miss is not None, "model", expected, "one without")
+
+
+def _with_odds_of_a_miss(
+    start: FovealObservationModel, config: FitSearchConfig, run: Looking
+) -> FovealObservationModel:
+    """Fit the odds of a miss of a copy to the photographs that are not held out, or keep those of the model."""
+    if config.steps == 0:
+        return deepcopy(start)
+    training = [looks for index, looks in looks_with_targets(run, config).items() if index % config.holdout]
+    record = {"looks": config.looks, "steps": config.steps, "photographs": len(training)}
+    return fit_through_belief(start, training, looks=config.looks, steps=config.steps, seed=config.seed, search=record)
+
+
+def shares_drawn(scenes: Scenes, config: FitSearchConfig, absent: int | None) -> Tensor:
+    """Compute the share of the searches for each class whose target is there; half a search for and against is added.
+
+    Args:
+        scenes: the photographs.
+        config: how classes are drawn.
+        absent: largest number of absent classes in each photograph (None: as many as present ones).
+
+    Returns:
+        The shares, `(K,)`.
+    """
+    there, missing = numbers_drawn(scenes, config.classes, config.max_target_area, absent)
+    return ((there + 0.5) / (there + missing + 1)).float()
+
+
+def looks_with_targets(run: Looking, config: FitSearchConfig) -> dict[int, SearchedLooks]:
+    """List the stored looks at photographs with the classes that may be searched for.
+
+    Args:
+        run: the photographs and their stored looks.
+        config: the largest targets.
+
+    Returns:
+        The looks by the number of the photograph; photographs without such a class are left out.
+    """
+    searched = {}
+    for index in track(range(len(run.scenes)), "reading looks", "photograph"):
+        grid = run.grid(index)
+        annotation = run.scenes.annotation(index)
+        looks = searches_of(annotation, run.detections(index), grid.centres, grid, config.max_target_area)
+        if looks is not None:
+            searched[index] = looks
+    return searched
+
+
+def search_photographs(
+    model: FovealObservationModel,
+    run: Looking,
+    config: FitSearchConfig,
+    photographs: Sequence[int],
+    *,
+    title: str = "searching",
+) -> BeliefsOfSearches:
+    """Search photographs for present and for absent classes, where these are most probable.
+
+    Args:
+        model: the observation model, with its odds of a miss.
+        run: the photographs and their stored looks.
+        config: numbers of classes and looks, and seed.
+        photographs: numbers of those that are searched.
+        title: title of the progress bar.
+
+    Returns:
+        The beliefs after each look.
+
+    Raises:
+        DataError: there is nothing to search for.
+    """
+    found = []
+    for index in track(photographs, title, "photograph"):
+        beliefs = _search_photograph(model, run, config, index)
+        if beliefs is not None:
+            found.append(beliefs)
+    if not found:
+        raise DataError("data: expected photographs with a class to search for, got none; raise max_target_area")
+    return BeliefsOfSearches.join(found)
+
+
+class _SideBySide(NamedTuple):
+    """Searches of a photograph for several classes, side by side, with all their looks.
+
+    Attributes:
+        targets: `(E,)`, the classes.
+        goal: `(E, X·Y)` boolean, the cells that hold each.
+        steps: the looks, each of E searches.
+    """
+
+    targets: Tensor
+    goal: Tensor
+    steps: list[Step]
+
+
+@torch.inference_mode()
+def _search_side_by_side(
+    observer: SemanticSearch, run: Looking, config: FitSearchConfig, index: int
+) -> _SideBySide | None:
+    """Search a photograph for all its classes; None if there is no class to search for."""
+    grid = run.grid(index)
+    looks = min(config.looks, len(grid))
+    protocol = ProtocolConfig(shifts=looks - 1, seed=config.seed)
+    drawn = choose_searches(run.scenes, index, grid, protocol, config.classes, config.max_target_area, config.absent)
+    if not drawn:
+        return None
+    targets = torch.tensor([search.target for search in drawn])
+    steps = rollout(
+        StoredLooks(run.detections(index), grid, targets),
+        observer,
+        lambda episodes, _: TargetPosterior(targets[episodes]),
+        torch.cat([search.start for search in drawn]),
+        Greedy(drawn_from(torch.cat([search.noise for search in drawn]))),
+        most=looks,
+    )
+    return _SideBySide(targets, torch.stack([search.goal for search in drawn]), list(steps))
+
+
+@torch.inference_mode()
+def _search_photograph(
+    model: FovealObservationModel, run: Looking, config: FitSearchConfig, index: int
+) -> BeliefsOfSearches | None:
+    """Search a photograph for all its classes side by side; None if there is no class to search for."""
+    searched = _search_side_by_side(SemanticSearch(model), run, config, index)
+    if searched is None:
+        return None
+    targets, goal, steps = searched
+    facts, place, hit_chance, on_target = zip(*(_facts(step, targets, goal) for step in steps), strict=True)
+    return BeliefsOfSearches(
+        torch.stack(facts, 1),
+        torch.stack(place),
+        torch.stack(hit_chance),
+        torch.stack(on_target),
+        there=goal.any(-1),
+        photograph=torch.full((len(targets),), index),
+        target=targets,
+    )
+
+
+@torch.inference_mode()
+def fit_places(model: FovealObservationModel, run: Looking, config: FitSearchConfig) -> Tensor:
+    """Fit the two numbers that make the probabilities of cells true, where all cells under a detection have its weight.
+
+    Args:
+        model: the observation model, with its odds of a miss.
+        run: the photographs and their stored looks.
+        config: numbers of classes and looks, and seed; as many absent classes are searched for as present ones.
+
+    Returns:
+        Offset and slope of the log odds, `(2,)` (`Presence.of_cells`).
+    """
+    plain = deepcopy(model)
+    plain.presence = None
+    observer = SemanticSearch(plain, footprint="overlap")
+    log_odds: list[Tensor] = []
+    holds: list[Tensor] = []
+    for index in track(range(len(run.scenes)), "looking at cells", "photograph"):
+        searched = _search_side_by_side(observer, run, replace(config, absent=config.classes), index)
+        if searched is None:
+            continue
+        targets, goal, steps = searched
+        for number, step in enumerate(steps, 1):
+            if number in COUNTED:
+                probability = step.belief.probability(targets).double().clamp(_SURE, 1 - _SURE)
+                log_odds.append(probability.logit().flatten())
+                holds.append(goal.flatten())
+    if not log_odds:
+        return torch.tensor([0.0, 1.0])
+    return torch.tensor(logistic_regression(torch.cat(log_odds)[:, None], torch.cat(holds), ridge=_RIDGE))
+
+
+def _facts(step: Step, targets: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Read what E beliefs say after a look, as fields of `BeliefsOfSearches`, `(2, E)` and `(E,)` each."""
+    belief = own(step.belief, SearchBelief, "belief")
+    cells = belief.probability(targets)
+    visited = step.visited
+    place = cells.masked_fill(~visited, 0).amax(-1) * place_known(cells, visited)
+    hit_chance = belief.chance(targets).masked_fill(visited, 0).amax(-1)
+    return belief.facts(targets).mT, place, hit_chance, (visited & goal).any(-1)
+
+
+def search_report(judged: Sequence[dict[str, float]], presence: Presence, trained: int, held_out: int) -> str:
+    """Report the evaluation, the presence and its thresholds as Markdown.
+
+    Args:
+        judged: measures on held-out searches (`judge_presence`).
+        presence: the presence of the model.
+        trained: number of searches that the evaluated one was fitted to.
+        held_out: number of searches that it was evaluated on.
+
+    Returns:
+        The report.
+    """
+    thresholds = presence.thresholds
+    assert thresholds is not None
+    cell, score = presence.weight.tolist()
+    rows = [["looks", "gaze on target, %", "area under ROC", "ECE", "NLL"]]
+    for row in judged:
+        figures = (f"{row[name]:.3f}" for name in ("area", "ece", "nll"))
+        rows.append([str(int(row["looks"])), f"{100 * row['found']:.1f}", *figures])
+    return "\n".join(
+        [
+            f"Fitted to {trained} searches for present and for absent classes, and evaluated on {held_out} searches of "
+            "held-out photographs. The table shows how often the gaze has reached the target; how well the probability "
+            "of presence tells present from absent classes; its expected calibration error (ECE), and its negative log "
+            "likelihood (NLL).",
+            "",
+            *table(rows),
+            "",
+            f"Presence: logit P = {float(presence.offset):.2f} + {cell:.2f} logit of the most "
+            f"probable cell + {score:.2f} mean ln of the highest scores.",
+            "",
+            f"Thresholds: the target counts as found if the probability of its presence is at least "
+            f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search gives up "
+            f"if no other cell has a probability of at least {thresholds.stop_below:.3f}.",
+            "",
+        ]
+    )

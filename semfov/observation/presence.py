@@ -1,0 +1,146 @@
+"""Whether a picture holds a class, from the belief about its cells."""
+
+import torch
+from torch import Tensor, nn
+
+from semfov.errors import check, check_finite, check_tensor
+from semfov.io.schema import Field
+from semfov.observation.thresholds import Thresholds
+
+SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
+"""Schema of the shares, by class, of the searches of a fit whose target was there, in the file of a model."""
+
+PRESENCE = {
+    "presence.offset": Field((), low=-1e3, high=1e3, optional=True),
+    "presence.weight": Field((2,), low=-1e3, high=1e3, optional=True),
+    "presence.shares": SHARES,
+    "presence.place": Field((2,), low=-1e3, high=1e3, optional=True),
+}
+"""Schema of a `Presence` in the file of a model."""
+
+EVEN = 0.5
+"""Share of the searches whose target is there that a `Presence` assumes."""
+
+LEAST_SCORE = 1e-3
+"""Score that is added to the highest one of a look before its logarithm is taken."""
+
+_SURE = 1e-6  # probabilities nearer to 0 or 1 count as this far from them
+
+
+def presence_facts(probability: Tensor, log_score: Tensor) -> Tensor:
+    """Put together what a `Presence` reads of a belief about a class.
+
+    Args:
+        probability: `(..., X·Y)`, of the class in each cell.
+        log_score: `(...)`, mean over the looks of the logarithm of the highest score of the class (`LEAST_SCORE`).
+
+    Returns:
+        `(..., 2)`.
+    """
+    peak = probability.amax(-1).clamp(_SURE, 1 - _SURE)
+    return torch.stack([peak.logit(), log_score], -1)
+
+
+class Presence(nn.Module):
+    r"""Probability that a picture holds a class, from the most probable cell, and from the scores of all looks.
+
+    .. math:: \operatorname{logit} P(t) = a + b \operatorname{logit} \max_x P(t \in x)
+              + \frac{c}{n} \sum_{i=1}^n \ln \bigl(\max_l s_{lt}^{(i)} + 0.001\bigr)
+
+    A cell takes the closest look alone; the last term, over the detections l of each look i, keeps what all of them
+    saw. It assumes that the target is in half of the pictures (`EVEN`), whatever the class. Two further numbers make
+    the probability of a cell true (`of_cells`), where all cells under a detection have its weight:
+
+    .. math:: \operatorname{logit} P'(t \in x) = a_x + b_x \operatorname{logit} P(t \in x)
+
+    Args:
+        offset: a, `()`.
+        weight: b and c, `(2,)`.
+        shares: `(K,)`, by class, shares of the searches of the fit whose target was there.
+        thresholds: thresholds at which searches decide; None if none were chosen.
+        place: :math:`a_x` and :math:`b_x`, `(2,)`; None leaves the probabilities of cells as they are.
+
+    Raises:
+        InputError: a shape does not fit, or a number is not finite.
+
+    >>> presence = Presence(torch.tensor(0.0), torch.tensor([0.5, 0.0]), torch.full((2,), 0.5))
+    >>> facts = presence_facts(torch.tensor([[0.9, 0.1]]), torch.tensor([-1.0]))
+    >>> presence(facts).detach().sigmoid()  # less sure than the cell
+    tensor([0.7500])
+    """
+
+    shares: Tensor
+
+    def __init__(
+        self,
+        offset: Tensor,
+        weight: Tensor,
+        shares: Tensor,
+        thresholds: Thresholds | None = None,
+        *,
+        place: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        place = torch.tensor([0.0, 1.0]).to(shares) if place is None else place
+        for name, values in (("offset", offset), ("weight", weight), ("shares", shares), ("place", place)):
+            check_tensor(values, name)
+            check(values.is_floating_point(), name, "a floating-point tensor", values.dtype)
+        check(offset.ndim == 0, "offset", "shape ()", tuple(offset.shape))
+        check(tuple(weight.shape) == (2,), "weight", "shape (2,)", tuple(weight.shape))
+        check(tuple(place.shape) == (2,), "place", "shape (2,)", tuple(place.shape))
+        check(shares.ndim == 1, "shares", "shape (K,)", tuple(shares.shape))
+        for name, values in (("offset", offset), ("weight", weight), ("shares", shares), ("place", place)):
+            check_finite(values, name)
+        are_shares = bool(((shares > 0) & (shares < 1)).all())
+        check(are_shares, "shares", "numbers above 0 and below 1", shares.tolist())
+        check(thresholds is None or isinstance(thresholds, Thresholds), "thresholds", "Thresholds or None", thresholds)
+        self.offset = nn.Parameter(offset.detach().clone())
+        self.weight = nn.Parameter(weight.detach().clone())
+        self.place = nn.Parameter(place.detach().clone())
+        self.register_buffer("shares", shares.detach().clone())
+        self.thresholds = thresholds
+
+    def forward(self, facts: Tensor) -> Tensor:
+        """Compute the log odds that the picture holds the class.
+
+        Args:
+            facts: `(..., 2)` (`presence_facts`).
+
+        Returns:
+            `(...)`, differentiable in the facts and the three numbers.
+        """
+        return self.offset.to(facts) + facts @ self.weight.to(facts)
+
+    def of_cells(self, probability: Tensor) -> Tensor:
+        """Make the probabilities of cells true, where all cells under a detection have its weight.
+
+        Args:
+            probability: `(...)`, of the class in each cell.
+
+        Returns:
+            `(...)`.
+        """
+        offset, slope = self.place.to(probability)
+        return (offset + slope * probability.clamp(_SURE, 1 - _SURE).logit()).sigmoid()
+
+
+def presence_of(tensors: dict[str, Tensor], thresholds: Thresholds | None) -> Presence | None:
+    """Make the `Presence` of the tensors of a file, which may lack it.
+
+    Args:
+        tensors: those of the file, by name (`PRESENCE`).
+        thresholds: the thresholds of the file.
+
+    Returns:
+        The presence; None where the file has none.
+
+    Raises:
+        InputError: it has only some of them.
+    """
+    needed = ("presence.offset", "presence.weight", "presence.shares")
+    found = [name for name in PRESENCE if name in tensors]
+    if not found:
+        return None
+    check(all(name in found for name in needed), "presence", f"all of {', '.join(needed)}", ", ".join(found))
+    offset, weight, shares = (tensors[name] for name in needed)
+    return Presence(offset, weight, shares, thresholds, place=tensors.get("presence.place"))

@@ -1,0 +1,9 @@
+"""Small networks that read what looks at windows show."""
+
+from torch import nn
+
+
+def network(inputs: int, width: int, outputs: int = 1) -> nn.Sequential:
+    """Make a network with two hidden layers of `width` units."""
+    hidden = nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
+    return nn.Sequential(*hidden, nn.Linear(width, outputs))
