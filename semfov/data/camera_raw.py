@@ -21,6 +21,8 @@ def check_no_raw(path: str | PathLike[str], name: str) -> None:
         name: of the picture, for the message.
     """
     photometrics: list[int] = []
+    if not Path(path).is_file():
+        return  # a pipe would be waited for; it is refused where it is read
     # What is no TIFF, or is damaged, is refused where it is decoded.
     with suppress(Exception), Path(path).open("rb") as file:
         photometrics = _photometrics_of(file)
