@@ -67,6 +67,7 @@ class SearchFit(PartFit):
             "reading looks": 0.05 * photographs,
             "fitting through the belief": 0.3 * self.settings.steps,
             "searching": 0.1 * photographs,
+            "looking at cells": 0.1 * photographs,
             "searching for more": 0.2 * len(inputs.held_out),
             "comparing": judged,
             "deciding": judged,

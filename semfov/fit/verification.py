@@ -147,6 +147,8 @@ def fit_in_folds(
     closer_looks = examine(first, config.folds)
     if closer_looks is None:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
+    if closer_looks.present.all() or not closer_looks.present.any():
+        raise DataError("data: expected closer looks in photographs that hold the target and in others, got one kind")
     folds = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(config.folds)]
     model = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
     again = photograph_searches(photographs, searching, config.looks, "verifying")
@@ -168,7 +170,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
         folds: number of folds of the pictures.
 
     Returns:
-        The closer looks; None if no place is right, or none is wrong, and if all pictures hold the target, or none.
+        The closer looks; None if no place is right, or none is wrong.
     """
     features: list[Tensor] = []
     right: list[bool] = []
@@ -182,14 +184,9 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
             right.append(search.right(box))
             present.append(search.present)
             fold.append(search.picture % folds)
-    if _is_one_kind(right) or _is_one_kind(present):
+    if len({*right}) < 2:
         return None
     return CloserLooks(torch.stack(features), torch.tensor(right), torch.tensor(present), torch.tensor(fold))
-
-
-def _is_one_kind(answers: Sequence[bool]) -> bool:
-    """Tell whether all answers are the same."""
-    return len({*answers}) < 2
 
 
 def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:

@@ -62,7 +62,8 @@ def _small_picture(uri: str) -> str:
     """Draw a picture that is given as the data URI of a JPEG, reduced, since the page may have hundreds."""
     from PIL import Image
 
-    with Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))) as picture:
+    content = io.BytesIO(base64.b64decode(uri.partition(",")[2]))  # which the page has encoded itself
+    with Image.open(content, formats=("JPEG",)) as picture:
         picture.thumbnail((_SIDE, _SIDE))
         width, height = picture.size
         file = io.BytesIO()

@@ -57,7 +57,7 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
     assert "horse: absent" in lines[-1]
     assert any("closely" in line for line in lines)
     (left, top), (right, bottom) = scene.boxes[:, :2].amin(0).tolist(), scene.boxes[:, 2:].amax(0).tolist()
-    for x, line in zip(places[:14], lines, strict=False):
+    for x, line in zip(places[:13], lines, strict=False):  # as long as more than one column shows it
         column, row = map(int, re.search(r"most likely at cell \((\d), (\d)\)", line).groups())
         # The most likely cell overlaps the annotated box, which moves with the view.
         assert left - x < 32 * (column + 1)

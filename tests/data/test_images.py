@@ -165,7 +165,7 @@ def test_a_process_that_reads_a_photograph_imports_few_formats_and_reads_the_oth
         )
         told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         assert told.split(") ")[0] == "(3, 16, 24"
-        assert told.endswith("False\n") == (kind in ("jpg", "png", "bmp"))
+        assert told.endswith("False\n") == (kind in ("jpg", "png", "bmp", "tif"))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 700), (20000, 3)])

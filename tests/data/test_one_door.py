@@ -9,7 +9,7 @@ import semfov
 
 PACKAGE = Path(semfov.__file__).parent
 READERS = {  # where others' readers are called
-    "PIL.Image.open": {"data/images.py"},
+    "PIL.Image.open": {"data/images.py", "report/overview.py"},  # the latter opens what a page has encoded
     "rasterio.open": {"data/gdal.py"},
     "tifffile.TiffFile": {"data/rasters.py", "data/tiff.py", "data/proportion.py"},
     "cv2.VideoCapture": {"data/sources.py"},

@@ -10,7 +10,7 @@ from torchvision.ops import batched_nms, nms
 from semfov import Objects, merge_boxes
 from semfov.detection import Candidates, Detections, Selection, letterbox
 from semfov.detection.crops import merge_crops
-from semfov.detection.objects import _survivors, merge_looks
+from semfov.detection.objects import merge_looks, survivors
 from semfov.detection.selection import select, suppress
 from tests.refusals import refused
 from tests.small import Fixed, area, shared
@@ -259,7 +259,7 @@ def test_wrong_arguments_are_refused_by_name():
 
 
 @pytest.mark.parametrize("count", [1, 2, 12, 60])
-def test_survivors_are_those_of_removing_one_box_after_the_other(count):
+def testsurvivors_are_those_of_removing_one_box_after_the_other(count):
     lengths = set()
     for seed in range(20):
         generator = np.random.default_rng(seed)
@@ -270,7 +270,7 @@ def test_survivors_are_those_of_removing_one_box_after_the_other(count):
         for box in range(count):
             if not any(one in stays and other == box for one, other in zip(better, worse, strict=True)):
                 stays.append(box)
-        assert _survivors(count, better, worse).tolist() == stays
+        assert survivors(count, better, worse).tolist() == stays
         lengths.add(len(stays))
     assert (len(lengths) > 1) == (count > 1)
 

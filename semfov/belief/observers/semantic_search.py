@@ -153,7 +153,7 @@ class SemanticSearch(Observer):
     >>> seen = Detections(torch.tensor([[[0.0, 0, 4, 4]]]), torch.tensor([[[0.2, 0.7, 0.1]]]), torch.ones(1, 1).bool())
     >>> belief = observer(observer.start(1, grid, torch.zeros(1)), seen, torch.tensor([[2.0, 2.0]]), grid)
     >>> belief.probability(1).detach()  # of a cup in each cell
-    tensor([[0.7059, 0.0833]])
+    tensor([[0.6923, 0.0833]])
     """
 
     def __init__(
