@@ -173,6 +173,7 @@ def _report(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what the lines below say
+        warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say
         reader = reader_of(path, arguments.get("columns"))
         records = _records(reader, path, arguments, sizes)
     if sizes is not None and "picture" in arguments:  # a single one is compared with what was looked at in it

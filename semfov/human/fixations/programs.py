@@ -34,7 +34,7 @@ _OTHER_UNITS = (
 
 # How a name ends in a unit: in brackets, perhaps after the frame, or after an underscore.
 _BRACKET = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
-_ENDING = re.compile(r"_(px|norm|ms|msec|us|ns)$", re.IGNORECASE)
+_ENDING = re.compile(r"[_ ](px|norm|ms|msec|us|[\u00b5\u03bc]s|ns)$", re.IGNORECASE)  # with both signs of micro
 _FRAME = re.compile(r"^(mcs|dacs|ucs|hucs|rcs)\s*")
 
 

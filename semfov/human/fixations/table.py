@@ -111,6 +111,7 @@ def read_table(
     if units is None:
         units = _stated_units(table.name, names)
     milliseconds = _stated_milliseconds(table.name, names["duration"])
+    _warn_of_durations(table, names["duration"])
     rows = []
     for row in table.rows:
         fields = {field: row.fields.get(names[field], "") for field in (*_COLUMNS, *_SIZE, *_MORE)}
@@ -145,6 +146,17 @@ def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
             if is_meant:
                 names[name] = similar.name
     return names
+
+
+def _warn_of_durations(table: Table, name: str) -> None:
+    """Warn of a column of durations that is not read, for another has its name or none has."""
+    similar = [column for column in table.columns if "duration" in column.lower()]
+    if name not in table.columns and similar:
+        warnings.warn(
+            f"{table.name}: fixations have no durations; the column {similar[0]!r} is not read: name it as duration "
+            "among the columns, or call it duration, with its unit, as in 'duration [ms]'",
+            stacklevel=3,
+        )
 
 
 def _may_be_pixels(column: Column) -> bool:

@@ -323,3 +323,18 @@ def test_trials_of_cocosearch_have_their_own_frame_and_flags(tmp_path):
     del trial["height"]
     path.write_text(json.dumps([trial]))
     unusable(r"both a width and a height, or neither", read_cocosearch, path)
+
+
+@pytest.mark.parametrize("header", ["duration_µs", "duration_μs", "duration us", "Duration [us]"])
+def test_units_of_durations_are_read_in_any_spelling(tmp_path, header):
+    """With both signs of micro, after a line, a space and in brackets."""
+    path = tmp_path / "fixations.csv"
+    path.write_text(f"picture,subject,x,y,width,height,{header}\na.jpg,1,40,30,80,60,250000\n", "utf-8")
+    assert read_table(path)[0].durations.tolist() == [250.0]
+
+
+def test_a_column_of_durations_that_is_not_read_is_named(tmp_path):
+    path = tmp_path / "fixations.csv"
+    path.write_text("picture,subject,x,y,width,height,fixation duration [ms]\na.jpg,1,40,30,80,60,250\n")
+    with pytest.warns(UserWarning, match=r"the column 'fixation duration \[ms\]' is not read: name it"):
+        assert read_table(path)[0].durations is None

@@ -188,7 +188,8 @@ def test_columns_of_an_export_are_taken_with_its_units(tmp_path):
     assert (record.picture, record.subject, record.durations.tolist()) == ("a.jpg", "7", [250])
     path.write_text(path.read_text().replace("40,.,200,a.jpg,7\n", ""))
     named = {**names, "x": "CURRENT_FIX_X", "y": "CURRENT_FIX_Y"}
-    (record,) = read_fixations(path, columns=named, size=(80, 60))
+    with pytest.warns(UserWarning, match="'CURRENT_FIX_DURATION' is not read"):
+        (record,) = read_fixations(path, columns=named, size=(80, 60))
     assert (record.points.tolist(), record.durations) == ([[40, 30]], None)
 
 
@@ -254,3 +255,13 @@ def test_where_a_picture_was_shown_is_said_once(shown, frame, said):
     first, *others = suspicions(people, {"a.jpg": (800, 600)})
     assert re.search(said, first)
     assert all("letterboxed" in first and "letterboxed" in other for other in others)
+
+
+def test_a_check_says_in_which_encoding_names_were_read_and_which_column_was_not(tmp_path, capsys):
+    path = tmp_path / "export.csv"
+    text = "picture,subject,x,y,width,height,fixation duration\ncafé.jpg,Zoë,40,30,80,60,250\n"
+    path.write_bytes(text.encode("cp1252"))
+    main(["check", str(path)])
+    told = capsys.readouterr().err
+    assert "is not UTF-8" in told
+    assert "the column 'fixation duration' is not read" in told
