@@ -258,7 +258,7 @@ def test_the_map_of_a_replayed_search_is_that_of_the_recommended_agent(run):
     boxes = scene.boxes[scene.labels == target]
     free = (~run.grid(0).footprint(boxes).any(0)).nonzero()[:, 0]
     with torch.inference_mode():
-        kept = agent.search(scene.image, target, start=int(free[-1]), shifts=5, boxes=boxes, prior="fit")
+        kept = agent.search(scene.image, target, start=int(free[-1]), shifts=5, boxes=boxes)
     assert len(kept) > 1
     record = {
         "policy": SOUGHT,

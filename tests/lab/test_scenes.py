@@ -296,7 +296,9 @@ def test_boxes_of_a_plain_pass_are_kept_where_one_of_their_class_is_listed():
     after = record["after"]["4"]
     assert (record["objects"], record["by class"], record["plain"]) == (2, {"1": 1, "2": 1}, 3)
     assert (after["listed"], after["listed right"], after["kept"]) == (2, 1, 1)
-    assert (after["in all"], after["error"]) == pytest.approx((3.7, (3 * 0.09 + 0.25 + (SPREAD * 3.7) ** 2) ** 0.5))
+    # Objects hide together: those that are listed vary twice as much as independent ones.
+    variance = 2 * 3 * 0.09 + 0.25 + (SPREAD * 3.7) ** 2
+    assert (after["in all"], after["error"]) == pytest.approx((3.7, variance**0.5))
 
 
 def test_a_number_is_given_where_the_record_has_one_also_where_nothing_is_listed():
