@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from semfov.belief.belief import Belief, with_fields
 from semfov.belief.grid import Grid
@@ -27,11 +28,16 @@ class Look:
     A subclass is a dataclass of tensors `(B, ...)`, of other looks, also in tuples, and of values that all looks share.
     One that holds its tensors in another way implements indexing and `join`.
 
+    Attributes:
+        by_detection: names of tensors `(B, L, D)` with a row for each detection, which are padded to be joined.
+
     >>> from semfov.belief.observers.semantic import SemanticLook
     >>> look = SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
     >>> SemanticLook.join([look[:1], look]).distance.shape
     torch.Size([3, 4])
     """
+
+    by_detection: ClassVar[tuple[str, ...]] = ()
 
     def __getitem__(self, index: Tensor | slice) -> Self:
         """Select looks of the batch."""
@@ -58,9 +64,17 @@ class Look:
                 return tuple(joined(part) for part in zip(*values, strict=True))
             return first
 
-        names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
-        changes = {name: joined([getattr(look, name) for look in looks]) for name in names}
+        changes = {}
+        for field in fields(cls):  # type: ignore[arg-type]
+            values = [getattr(look, field.name) for look in looks]
+            changes[field.name] = joined(_padded(values) if field.name in cls.by_detection else values)
         return replace(looks[0], **changes)  # type: ignore[type-var]
+
+
+def _padded(values: Sequence[Tensor]) -> list[Tensor]:
+    """Pad tensors `(B, L, D)` to the largest number L of detections."""
+    detections = max(value.shape[1] for value in values)
+    return [pad(value, (0, 0, 0, detections - value.shape[1])) for value in values]
 
 
 class Observer(nn.Module, ABC):

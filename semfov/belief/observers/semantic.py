@@ -1,12 +1,10 @@
 """The paper's observer: a Dirichlet belief about all classes in every cell."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Literal, Self, get_args
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.fusion import RULES, fuse_scaled, scale_covering
@@ -30,22 +28,11 @@ class SemanticLook(Look):
         distance: from the fixation to each cell, `(B, X·Y)`.
     """
 
+    by_detection = ("likelihood", "footprint")
+
     likelihood: Tensor
     footprint: Tensor
     distance: Tensor
-
-    @classmethod
-    def join(cls, looks: Sequence[Self]) -> Self:
-        """Concatenate several batches of looks, padded to the largest number of detections."""
-        detections = max(look.likelihood.shape[-2] for look in looks)
-
-        def joined(name: str) -> Tensor:
-            values = [getattr(look, name) for look in looks]
-            if name in ("likelihood", "footprint", "covered"):
-                values = [pad(value, (0, 0, 0, detections - value.shape[-2])) for value in values]
-            return torch.cat(values)
-
-        return cls(*(joined(field.name) for field in fields(cls)))
 
 
 class Semantic(Observer):

@@ -1,12 +1,10 @@
 """The observer of searches: the paper's belief about all classes, with misses, and one detection for each cell."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from semfov.belief.association import one_of, refuted
 from semfov.belief.belief import Belief, DirichletBelief, pick
@@ -23,7 +21,6 @@ from semfov.observation.thresholds import Thresholds
 
 _LEAST = 1e-6  # of the likelihood of background, by which the others are divided
 _WEAK = 1e-5  # ε, the Dirichlet parameter of a prior that one look outweighs
-_BY_DETECTION = ("ratio", "weight", "covered")  # tensors with a row for each detection
 
 
 @dataclass(frozen=True)
@@ -39,25 +36,14 @@ class SearchLook(Look):
         log_score: logarithm of the highest score of each class, `(B, K+1)`.
     """
 
+    by_detection = ("ratio", "weight", "covered")
+
     ratio: Tensor
     weight: Tensor
     covered: Tensor
     distance: Tensor
     fixated: Tensor
     log_score: Tensor
-
-    @classmethod
-    def join(cls, looks: Sequence[Self]) -> Self:
-        """Concatenate several batches of looks, padded to the largest number of detections."""
-        detections = max(look.ratio.shape[-2] for look in looks)
-
-        def joined(name: str) -> Tensor:
-            values = [getattr(look, name) for look in looks]
-            if name in _BY_DETECTION:
-                values = [pad(value, (0, 0, 0, detections - value.shape[-2])) for value in values]
-            return torch.cat(values)
-
-        return cls(*(joined(field.name) for field in fields(cls)))
 
 
 @dataclass(frozen=True)
