@@ -103,7 +103,10 @@ class Prior:
         if self.changes_nothing:
             return presence
         if isinstance(presence, Tensor):
-            return with_prior(presence.logit(), self.share, self.fitted).sigmoid()
+            is_certain = (presence == 0) | (presence == 1)
+            # A certainty stays; its log odds are infinite, and their gradient is no number.
+            log_odds = presence.masked_fill(is_certain, 0.5).logit()
+            return torch.where(is_certain, presence, with_prior(log_odds, self.share, self.fitted).sigmoid())
         return float(self(torch.tensor(presence, dtype=torch.float64)))
 
     def place(self, place: _Odds, presence: _Odds) -> _Odds:

@@ -8,11 +8,14 @@ import torch
 
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief.association import one_of, refuted
-from semfov.belief.observers import SemanticSearch
+from semfov.belief.observers import AnyOf, SemanticSearch
 from semfov.belief.observers.semantic_search import SearchLook
+from semfov.belief.prior import Prior
 from semfov.fit.through_belief import SearchedLooks, fit_through_belief, landing_loss
+from semfov.gaze.policies import Policy
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
+from semfov.strategy import Strategy
 from tests.refusals import refused
 
 GRID = Grid(5, 4, (100, 80))
@@ -278,3 +281,54 @@ def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_f
     odds = fitted.log_miss.detach()
     torch.testing.assert_close(odds[1:], odds[1:2].expand(3, 3))
     assert fitted.metadata["method"] == "search"
+
+
+@pytest.fixture
+def told():
+    """A model with presence, of which three looks make each class almost sure."""
+    presence = Presence(torch.tensor(60.0), torch.tensor([0.7, 0.2]), torch.tensor([0.2, 0.5, 0.8]))
+    return model(presence=presence.double(), refutation=0.5)
+
+
+def test_before_the_first_look_and_where_all_has_faded_presence_is_even(told, looks):
+    observer = SemanticSearch(told)
+    start = observer.start(1, GRID, looks.boxes)
+    assert start.presence(1).tolist() == [0.5]
+    seen = watch(observer, looks)
+    assert float(seen.presence(1).detach()) > 0.99
+    gone = observer.fade(seen, None, 1e-30, seen.visited)
+    assert float(gone.presence(1).detach()) == pytest.approx(0.5)
+
+
+def test_gradients_are_finite_where_presence_is_sure_and_a_prior_is_set(told, looks):
+    belief = watch(SemanticSearch(told, prior=Prior(0.2, 0.5)), looks)
+    (belief.presence(1).sum() + belief.probability(1).sum()).backward()
+    gradients = [parameter.grad for parameter in told.presence.parameters() if parameter.grad is not None]
+    assert len(gradients) >= 2
+    assert all(bool(gradient.isfinite().all()) for gradient in gradients)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_any_of_several_classes_is_there_in_half_of_the_pictures(told, count):
+    strategy = Strategy(AnyOf(SemanticSearch(told), dict.fromkeys(range(1, count + 1), 1.0)), Policy("non-predictive"))
+    changed, prior = strategy.with_prior(None, 1)
+    start = changed.observer.start(1, GRID, torch.zeros(1, dtype=torch.float64))
+    assert float(start.presence(1).detach()) == pytest.approx(0.5)
+    assert prior.assumed is None
+    refused("prior: expected None for a search for any of several classes", strategy.with_prior, 0.3, 1)
+
+
+def test_presence_is_checked(told):
+    shares, weight, offset = torch.full((3,), 0.5), torch.ones(2), torch.tensor(0.0)
+    for wrong in (torch.tensor([0.5, 1.0, 0.5]), torch.tensor([0.0, 0.5, 0.5])):
+        refused("shares: expected numbers above 0 and below 1", Presence, offset, weight, wrong)
+    refused("offset: expected a floating-point tensor", Presence, torch.tensor(1), weight, shares)
+    refused("weight: expected shape", Presence, offset, torch.ones(3), shares)
+    refused("thresholds: expected Thresholds or None", Presence, offset, weight, shares, (0.5, 0.1))
+    refused(
+        "presence: expected one of 3 classes, got one of 2",
+        lambda: model(presence=Presence(offset, weight, shares[:2])),
+    )
+    refused("presence: expected a Presence or None", lambda: model(presence=3))
+    refused("model: expected a FovealObservationModel", SemanticSearch, "yolox-nano-search")
+    refused("prior: expected a Prior", lambda: SemanticSearch(told, prior=0.2))

@@ -11,9 +11,10 @@ from scipy.optimize import minimize
 
 from semfov import EmbeddedScenes, FovealObservationModel, Grid
 from semfov.belief.observers import SemanticSearch
+from semfov.fit.logistic import logistic_regression
 from semfov.fit.presence import BeliefsOfSearches, fit_presence, judge_presence
 from semfov.fit.protocols import choose_classes, choose_searches, numbers_drawn
-from semfov.fit.search import FitSearchConfig, fit_search, search_photographs, shares_drawn
+from semfov.fit.search import FitSearchConfig, fit_places, fit_search, search_photographs, shares_drawn
 from semfov.fit.thresholds import choose_thresholds
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
@@ -331,3 +332,50 @@ def test_the_report_has_the_measures_and_the_thresholds(run, model):
         [str(row["looks"]), f"{100 * row['found']:.1f}", *(f"{row[name]:.3f}" for name in names)]
         for row in fitted.judged
     ]
+
+
+def test_a_surer_cell_never_speaks_against_the_class():
+    """Where few searches say so by chance, the weight is 0, and the other numbers are those without that fact."""
+    searches = beliefs()
+    misleading = replace(searches, facts=searches.facts * torch.tensor([-1.0, 1.0])[:, None, None])
+    presence = fit_presence(misleading, SHARES, FitSearchConfig())
+    alone = fit_presence(
+        replace(searches, facts=searches.facts * torch.tensor([0.0, 1.0])[:, None, None]), SHARES, FitSearchConfig()
+    )
+    assert presence.weight[0] == 0
+    assert presence.weight[1] > 0
+    assert presence.weight[1].item() == pytest.approx(alone.weight[1].item(), abs=1e-4)
+    assert presence.offset.item() == pytest.approx(alone.offset.item(), abs=1e-4)
+
+
+def test_the_probabilities_of_cells_are_fitted_to_what_the_cells_hold(run, model, monkeypatch):
+    """On all cells after the looks that count, of as many absent classes as present ones."""
+    given = []
+
+    def remembered(facts, right, **options):
+        given.append((facts, right))
+        return logistic_regression(facts, right, **options)
+
+    monkeypatch.setattr("semfov.fit.search.logistic_regression", remembered)
+    presence = Presence(torch.tensor(0.4), torch.tensor([0.8, 0.3]), SHARES, place=fit_places(model, run, CONFIG))
+    ((facts, right),) = given
+    # A fit with a free offset has the mean of its answers.
+    mean = presence.of_cells(facts[:, 0].sigmoid()).mean().detach()
+    assert float(mean) == pytest.approx(float(right.double().mean()), abs=2e-3)
+    observer, cells = SemanticSearch(model, footprint="overlap"), len(run.grid(0))
+    assert len(facts) % cells == 0
+    grid, looks = run.grid(0), run.detections(0)
+    drawn = choose_searches(
+        run.scenes,
+        0,
+        grid,
+        ProtocolConfig(shifts=CONFIG.looks - 1, seed=CONFIG.seed),
+        CONFIG.classes,
+        CONFIG.max_target_area,
+        CONFIG.classes,
+    )
+    start = int(drawn[0].start)
+    belief = observer(observer.start(1, grid, facts.float()), looks[start : start + 1], grid.centres[[start]], grid)
+    first = belief.probability(drawn[0].target)[0].double().clamp(1e-6, 1 - 1e-6).logit()
+    torch.testing.assert_close(facts[:cells, 0], first, atol=1e-4, rtol=1e-4)
+    assert torch.equal(right[:cells], drawn[0].goal)

@@ -554,3 +554,16 @@ def test_a_target_is_not_absent_before_the_head_has_turned():
     agent = HeadAgent.recommended("yolox-nano")
     first = agent.search(Panorama(scene), "person", SearchSettings(passes=1))
     assert first.decision.outcome != "absent"
+
+
+def test_a_target_is_found_in_a_scene_with_fewer_cells_than_a_view(agent):
+    """The cell of the view does not count the cells of the scene."""
+    image = torch.zeros(3, 480, 640)
+    image[1, 400:460, 560:620] = 1
+    world = Flat(image)
+    views = agent.views(world)
+    assert len(world.scene) < views.cells
+    last = max(range(len(views.gaze)), key=lambda n: float(views.gaze[n].sum()))
+    path = agent.search(Flat(image), "green", SearchSettings(passes=1, confirm=0.0, start=last))
+    assert path.found
+    assert 0 <= path.decision.cell < len(world.scene)
