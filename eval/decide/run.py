@@ -254,16 +254,16 @@ class DecisionRun(ComparedLooking):
             if everywhere is not None:
                 looks = StoredLooks(everywhere, grid, torch.tensor([target]))
             # Ways with one observer have one here, too, so that looks are weighed once.
-            told: dict[Observer, tuple[Strategy, Prior]] = {}
+            with_prior_of_fit: dict[Observer, tuple[Strategy, Prior]] = {}
             for name, (compared, judge) in self.compared.items():
 
                 def rule(step: Step, judge: _Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
-                if compared.observer not in told:
+                if compared.observer not in with_prior_of_fit:
                     # Targets are drawn as they were in the fit, and there as often.
-                    told[compared.observer] = compared.with_prior("fit", target)
-                changed, prior = told[compared.observer]
+                    with_prior_of_fit[compared.observer] = compared.with_prior("fit", target)
+                changed, prior = with_prior_of_fit[compared.observer]
                 strategy = Strategy(changed.observer, compared.policy)
                 verifier = self._verifier(remembered, grid, target, prior) if name in self.verified else None
                 with torch.inference_mode():

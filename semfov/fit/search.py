@@ -27,13 +27,12 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.ranges import Count, Positive, Range, Share, Whole
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.presence import Presence
+from semfov.observation.presence import Presence, log_odds_of_cells
 from semfov.runs.config import DataConfig, ProtocolConfig
 from semfov.runs.progress import track
 from semfov.runs.setup import make_scenes
 from semfov.runs.tables import table
 
-_SURE = 1e-6  # probabilities nearer to 0 or 1 count as this far from them
 _RIDGE = 1e-3
 
 
@@ -82,7 +81,7 @@ def fit_search(
         config: settings of searches, fit and thresholds.
         run: the photographs and their stored looks.
         hold_out: whether presence and thresholds, too, are fitted without the held-out photographs; otherwise they are
-            fitted to all, once they are evaluated.
+            fitted to all, once they are evaluated. The two numbers of cells, which nothing here judges, are of all.
 
     Returns:
         The model with its report. Its odds of a miss are fitted to the photographs that are not held out.
@@ -260,7 +259,7 @@ def fit_places(model: FovealObservationModel, run: Looking, config: FitSearchCon
     Args:
         model: the observation model, with its odds of a miss.
         run: the photographs and their stored looks.
-        config: numbers of classes and looks, and seed; as many absent classes are searched for as present ones.
+        config: numbers of classes and looks, and seed; up to `classes` absent classes are searched for, too.
 
     Returns:
         Offset and slope of the log odds, `(2,)` (`Presence.of_cells`).
@@ -277,8 +276,7 @@ def fit_places(model: FovealObservationModel, run: Looking, config: FitSearchCon
         targets, goal, steps = searched
         for number, step in enumerate(steps, 1):
             if number in COUNTED:
-                probability = step.belief.probability(targets).double().clamp(_SURE, 1 - _SURE)
-                log_odds.append(probability.logit().flatten())
+                log_odds.append(log_odds_of_cells(step.belief.probability(targets).double()).flatten())
                 holds.append(goal.flatten())
     if not log_odds:
         return torch.tensor([0.0, 1.0])

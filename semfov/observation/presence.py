@@ -27,6 +27,18 @@ LEAST_SCORE = 1e-3
 _SURE = 1e-6  # probabilities nearer to 0 or 1 count as this far from them
 
 
+def log_odds_of_cells(probability: Tensor) -> Tensor:
+    """Compute the log odds of probabilities of cells, which stay finite where a cell is certain.
+
+    Args:
+        probability: `(...)`.
+
+    Returns:
+        `(...)`.
+    """
+    return probability.clamp(_SURE, 1 - _SURE).logit()
+
+
 def presence_facts(probability: Tensor, log_score: Tensor) -> Tensor:
     """Put together what a `Presence` reads of a belief about a class.
 
@@ -37,8 +49,7 @@ def presence_facts(probability: Tensor, log_score: Tensor) -> Tensor:
     Returns:
         `(..., 2)`.
     """
-    peak = probability.amax(-1).clamp(_SURE, 1 - _SURE)
-    return torch.stack([peak.logit(), log_score], -1)
+    return torch.stack([log_odds_of_cells(probability.amax(-1)), log_score], -1)
 
 
 class Presence(nn.Module):
@@ -121,7 +132,7 @@ class Presence(nn.Module):
             `(...)`.
         """
         offset, slope = self.place.to(probability)
-        return (offset + slope * probability.clamp(_SURE, 1 - _SURE).logit()).sigmoid()
+        return (offset + slope * log_odds_of_cells(probability)).sigmoid()
 
 
 def presence_of(tensors: dict[str, Tensor], thresholds: Thresholds | None) -> Presence | None:
