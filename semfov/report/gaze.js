@@ -119,6 +119,15 @@ function follow(viewer) {
   steps.start(steps.at);
 }
 
+// A link of the overview leads to a picture, and so does an address of the page that names one.
+function followLink() {
+  const number = data.pictures.findIndex((_, each) => location.hash === `#facts-${each}`);
+  if (number < 0) return;
+  find("picture").value = number;
+  choose(number);
+  find("viewer").scrollIntoView();
+}
+window.addEventListener("hashchange", followLink);
 find("picture").addEventListener("change", (event) => choose(Number(event.target.value)));
 find("who").addEventListener("change", (event) => follow(Number(event.target.value)));
 document.addEventListener("keydown", (event) => {
@@ -130,3 +139,4 @@ document.addEventListener("keydown", (event) => {
 });
 for (const layer of ["heat", "borders", "areas", "paths"]) find(layer).addEventListener("change", show);
 choose(0);
+followLink();

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.classes import counted
 from semfov.data.fixations import Fixations
 from semfov.paths.areas import AreasLike, border_of, percent, shares_around
 from semfov.paths.gaze import GazePrediction
 from semfov.report.episode import Data, jpeg_uri
+from semfov.report.overview import OverviewColumn, OverviewRow, overview_section, small_picture
 from semfov.report.template import colour_steps, filled
 from semfov.viz.gaze import BORDERS
 from semfov.viz.style import COLOURS, share_colours
@@ -20,6 +22,7 @@ from semfov.viz.style import COLOURS, share_colours
 _WIDTH = 960  # of the picture in pixels
 _QUALITY = 80  # of the picture as JPEG
 _MOST_STEPS = 12  # largest number of fixations of the slider
+_RADII = (0.09, 0.06, 0.04)  # of the first fixations over a small picture, in shares of its longer side
 
 
 def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas: AreasLike | None = None) -> Data:
@@ -31,8 +34,8 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
         areas: areas of interest, as for `GazePrediction.share`.
 
     Returns:
-        `picture`, for the script: its result in words, shares of the fixations as bytes, borders and scanpaths; and
-        `facts`, HTML.
+        `picture`, for the script: its result in words, shares of the fixations as bytes, borders and scanpaths;
+        `facts`, HTML; `shares` of the areas in words, by name; and `caution`, None for none.
     """
     longest = max(map(len, scanpaths))
     steps = min(longest, _MOST_STEPS)
@@ -51,7 +54,12 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
         "first": [[place["x"], place["y"]] for place in prediction.first_fixations()],
         "areas": [[f"{name} {percent(shares[name])}", *box] for name, box in boxes.items()],
     }
-    return {"picture": picture, "facts": _facts(prediction, shares)}
+    return {
+        "picture": picture,
+        "facts": _facts(prediction, shares),
+        "shares": {name: percent(share) for name, share in shares.items()},
+        "caution": prediction.caution,
+    }
 
 
 def _rounded_points(scanpath: Fixations) -> list[list[float]]:
@@ -71,7 +79,7 @@ def gaze_page_html(title: str, parts: Sequence[Data], before: str = "") -> str:
     Args:
         title: plain text.
         parts: the pictures, from `gaze_part`.
-        before: HTML above them.
+        before: HTML above them. Without it, several pictures have an overview (`semfov.report.overview`).
 
     Returns:
         The HTML of the page.
@@ -88,11 +96,42 @@ def gaze_page_html(title: str, parts: Sequence[Data], before: str = "") -> str:
     ]
     contents = {
         "title": escape(title),
-        "before": before,
+        "before": before if before or len(parts) == 1 else _overview(parts),
         "borders": escape(BORDERS.capitalize()),
         "facts": "".join(facts),
     }
     return filled("gaze", data, contents)
+
+
+def _overview(parts: Sequence[Data]) -> str:
+    """List the pictures with their first fixations, and the share of all fixations in each area."""
+    areas = dict.fromkeys(name for part in parts for name in part["shares"])
+    # Where nothing is to be cautious of, the column would be empty.
+    has_caution = any(part["caution"] for part in parts)
+    columns = [OverviewColumn(name, "number") for name in areas]
+    columns += [OverviewColumn("caution", "aside")] if has_caution else []
+    rows = []
+    for number, part in enumerate(parts):
+        cells = [part["shares"].get(name, "") for name in areas]
+        cells += [part["caution"] or ""] if has_caution else []
+        picture = part["picture"]
+        drawing = small_picture(picture["image"], _first_fixations(picture))
+        rows.append(OverviewRow(picture["name"], f"facts-{number}", drawing, cells))
+    headline = f"Where people look first in {counted(len(parts), 'picture')}, from the largest dot to the smallest"
+    return overview_section(headline, columns, rows)
+
+
+def _first_fixations(picture: Data) -> str:
+    """Draw the first fixations over a small picture, in shares of its width and height, in order of size."""
+    width, height = picture["size"]
+    marks = []
+    for radius, (x, y) in zip(_RADII, picture["first"], strict=False):
+        pixels = radius * max(width, height)
+        marks.append(
+            f'<ellipse cx="{x / width:.3f}" cy="{y / height:.3f}" rx="{pixels / width:.3f}" '
+            f'ry="{pixels / height:.3f}" fill="{COLOURS[0]}" stroke="#ffffff" stroke-width="0.01"/>'
+        )
+    return "".join(marks)
 
 
 _SHARES = (0.9, 0.5)  # shares of all fixations in the smallest areas whose borders are drawn

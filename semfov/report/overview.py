@@ -1,4 +1,4 @@
-"""The beginning of a page of several pictures: what was found in each, those with a find first, and links to them."""
+"""The beginning of a page of several pictures: a row for each, with a small picture, its result, and a link."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import io
 from collections.abc import Sequence
 from html import escape
+from typing import NamedTuple
 
 from semfov.data.classes import counted
 from semfov.io.files import MADE_HERE
@@ -15,8 +16,61 @@ _SIDE = 160  # longest side in pixels of a small picture, twice that on the scre
 _ORDER = ("found", "undecided", "absent")  # verdicts, those that a reader looks for first
 
 
+class OverviewColumn(NamedTuple):
+    """Column of an overview, by which a reader can sort.
+
+    Attributes:
+        head: its name.
+        kind: CSS class of its cells; empty for words.
+    """
+
+    head: str
+    kind: str = ""
+
+
+class OverviewRow(NamedTuple):
+    """Row of an overview.
+
+    Attributes:
+        name: name of the picture.
+        place: id of its part of the page.
+        small_picture: SVG, from `small_picture`; empty for a picture that was not kept.
+        cells: text of the other columns.
+        kind: CSS class of the row.
+    """
+
+    name: str
+    place: str
+    small_picture: str
+    cells: Sequence[str]
+    kind: str = ""
+
+
+def overview_section(headline: str, columns: Sequence[OverviewColumn], rows: Sequence[OverviewRow]) -> str:
+    """Make the section of a page that lists its pictures.
+
+    Args:
+        headline: what came of all of them.
+        columns: those after the name of the picture.
+        rows: the pictures, in the order in which they are listed.
+
+    Returns:
+        HTML.
+    """
+    heads = "".join(
+        f'<th scope="col" class="{column.kind}"><button type="button" class="sort">{escape(column.head)}</button></th>'
+        for column in (OverviewColumn("picture"), *columns)
+    )
+    lines = "".join(_row_html(row, columns) for row in rows)
+    return (
+        f'<section id="overview" aria-labelledby="overview-title"><h2 id="overview-title">{escape(headline)}</h2>'
+        f'<div class="wide" tabindex="0" role="region" aria-label="All pictures"><table class="objects">'
+        f"<thead><tr><td></td>{heads}</tr></thead><tbody>{lines}</tbody></table></div></section>\n"
+    )
+
+
 def overview_html(episodes: Sequence[Data], places: Sequence[str]) -> str:
-    """Make a table of the pictures of a page, each with its result, a small picture and a link.
+    """Make the overview of searches and explorations, those with a find first.
 
     Args:
         episodes: data of the records, each with its `verdict` (`semfov.report.episode.object_data`).
@@ -28,38 +82,23 @@ def overview_html(episodes: Sequence[Data], places: Sequence[str]) -> str:
     verdicts = [episode["verdict"] for episode in episodes]
     # The sort is stable, so that equal verdicts keep the order of the pictures.
     order = sorted(range(len(episodes)), key=lambda number: _ORDER.index(verdicts[number]))
-    rows = "".join(_row(episodes[number], places[number]) for number in order)
-    heads = "".join(
-        f'<th scope="col" class="{kind}"><button type="button" class="sort">{head}</button></th>'
-        for head, kind in (("picture", ""), ("result", ""), ("objects", "count"))
-    )
-    return (
-        f'<section id="overview" aria-labelledby="overview-title"><h2 id="overview-title">{_headline(verdicts)}</h2>'
-        f'<div class="wide" tabindex="0" role="region" aria-label="All pictures"><table class="objects">'
-        f"<thead><tr><td></td>{heads}</tr></thead><tbody>{rows}</tbody></table></div></section>\n"
-    )
+    rows = [_row_of_episode(episodes[number], places[number]) for number in order]
+    columns = (OverviewColumn("result"), OverviewColumn("objects", "number count"))
+    return overview_section(_headline(verdicts), columns, rows)
 
 
-def _headline(verdicts: Sequence[str]) -> str:
-    """Count the pictures with a find, and those that are undecided."""
-    found = verdicts.count("found")
-    undecided = verdicts.count("undecided")
-    doubt = f", {undecided} undecided" if undecided else ""
-    return f"Found in {found} of {counted(len(verdicts), 'picture')}{doubt}"
+def small_picture(uri: str | None, marks: str = "") -> str:
+    """Draw a picture small, since a page may have hundreds.
 
+    Args:
+        uri: the picture as the data URI of a JPEG; None for one that was not kept.
+        marks: SVG over it, in shares of its width and height.
 
-def _row(episode: Data, place: str) -> str:
-    """Make the row of a picture, whose link leads to its part of the page."""
-    small = "" if episode["image"] is None else _small_picture(episode["image"])
-    return (
-        f'<tr class="{episode["verdict"]}"><td>{small}</td>'
-        f'<th scope="row"><a href="#{place}">{escape(episode["name"])}</a></th>'
-        f'<td>{escape(episode["summary"])}</td><td class="number count">{episode["count"]}</td></tr>'
-    )
-
-
-def _small_picture(uri: str) -> str:
-    """Draw a picture that is given as the data URI of a JPEG, reduced, since the page may have hundreds."""
+    Returns:
+        SVG; empty without a picture.
+    """
+    if uri is None:
+        return ""
     from PIL import Image
 
     content = io.BytesIO(base64.b64decode(uri.partition(",")[2]))  # which the page has encoded itself
@@ -70,4 +109,31 @@ def _small_picture(uri: str) -> str:
         picture.save(file, "JPEG", quality=70, comment=MADE_HERE)
     source = f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
     image = f'<image href="{source}" width="{width}" height="{height}"/>'
-    return f'<svg class="small" viewBox="0 0 {width} {height}" aria-hidden="true">{image}</svg>'
+    over = f'<g transform="scale({width} {height})">{marks}</g>' if marks else ""
+    return f'<svg class="small" viewBox="0 0 {width} {height}" aria-hidden="true">{image}{over}</svg>'
+
+
+def _row_of_episode(episode: Data, place: str) -> OverviewRow:
+    """List what came of a search or an exploration."""
+    cells = (episode["summary"], str(episode["count"]))
+    return OverviewRow(episode["name"], place, small_picture(episode["image"]), cells, episode["verdict"])
+
+
+def _row_html(row: OverviewRow, columns: Sequence[OverviewColumn]) -> str:
+    """Make a row, whose link leads to the part of the picture."""
+    cells = "".join(
+        f'<td class="{column.kind}">{escape(cell)}</td>' if column.kind else f"<td>{escape(cell)}</td>"
+        for cell, column in zip(row.cells, columns, strict=True)
+    )
+    return (
+        f'<tr class="{row.kind}"><td>{row.small_picture}</td>'
+        f'<th scope="row"><a href="#{row.place}">{escape(row.name)}</a></th>{cells}</tr>'
+    )
+
+
+def _headline(verdicts: Sequence[str]) -> str:
+    """Count the pictures with a find, and those that are undecided."""
+    found = verdicts.count("found")
+    undecided = verdicts.count("undecided")
+    doubt = f", {undecided} undecided" if undecided else ""
+    return f"Found in {found} of {counted(len(verdicts), 'picture')}{doubt}"

@@ -259,25 +259,15 @@
   }
   window.addEventListener("hashchange", follow);
   find("class").addEventListener("change", (event) => { chosenClass = Number(event.target.value); show(); });
-  // The list of objects: a row shows its object and the look that brought it, and a head sorts by its column.
+  // The list of objects: a row shows its object and the look that brought it.
   function pick(row) {
     const article = find(episode.article), same = `[data-object="${row.dataset.object}"]`;
     for (const each of article.querySelectorAll(".picked")) each.classList.remove("picked");
     for (const each of article.querySelectorAll(same)) each.classList.add("picked");
     control.go(Number(row.dataset.look));
   }
-  function sort(head) {
-    const column = head.cellIndex, down = head.getAttribute("aria-sort") === "ascending";
-    const body = head.closest("table").tBodies[0];
-    for (const each of head.parentElement.cells) each.removeAttribute("aria-sort");
-    head.setAttribute("aria-sort", down ? "descending" : "ascending");
-    const text = (row) => row.cells[column].textContent;
-    const order = (a, b) => text(a).localeCompare(text(b), "en", { numeric: true }) * (down ? -1 : 1);
-    body.append(...[...body.rows].sort(order));
-  }
   document.addEventListener("click", (event) => {
-    const head = event.target.closest(".sort")?.parentElement, row = event.target.closest("tr[data-object]");
-    if (head) return sort(head);
+    const row = event.target.closest("tr[data-object]");
     if (row) return pick(row);
     const chosen = event.target.closest(".window");
     if (chosen) control.go(Number(chosen.dataset.look));

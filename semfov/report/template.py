@@ -58,7 +58,7 @@ def filled(name: str, data: Mapping[str, object], contents: Mapping[str, str]) -
     parts = {
         "style": _text("page.css"),
         "steps": _text("steps.html"),
-        "program": _text("steps.js", f"{name}.js"),
+        "program": _text("steps.js", "tables.js", f"{name}.js"),
         # The data are inside an element, which no text in them may close.
         "data": script.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"),
         **contents,

@@ -297,6 +297,35 @@ def test_layers_can_be_switched(opened):
     assert not opened.locator("#map").is_visible()
 
 
+def test_several_pictures_begin_with_an_overview_that_leads_to_each(opened, hostile):
+    names = [predicted(hostile).name, "b.png"]
+    rows = opened.locator("#overview tbody tr")
+    assert rows.locator("a").all_inner_texts() == names
+    assert rows.first.locator("ellipse").count() == 3
+    rows.nth(1).locator("a").click()
+    opened.wait_for_function("document.getElementById('picture').value === '1'")
+    assert opened.locator("#image").get_attribute("alt") == "b.png"
+    opened.locator("#overview .sort").first.click()
+    assert opened.locator("#overview [aria-sort=ascending]").inner_text() == "picture"
+    assert sorted(rows.locator("a").all_inner_texts()) == sorted(names)
+
+
+def test_an_overview_has_shares_of_areas_and_cautions_where_there_are_some():
+    prediction = predicted("a.png")
+    viewers = prediction.scanpaths(2, seed=0)
+    with_area = gaze_part(prediction, viewers, {"<logo>": (0, 0, 39, 78)})
+    without = gaze_part(prediction, viewers)
+    page = gaze_page_html("two", [with_area, without | {"caution": "very <small>"}])
+    overview = page[page.index('id="overview"') : page.index("</section>")]
+    share = 100 * prediction.share({"<logo>": (0, 0, 39, 78)})["<logo>"]
+    assert "&lt;logo&gt;" in overview
+    assert float(re.search(r'<td class="number">([\d.]+) %', overview)[1]) == pytest.approx(share, abs=0.5)
+    assert "very &lt;small&gt;" in overview
+    assert "caution" not in gaze_page_html("two", [without, without]).split("</section>")[0].split('id="overview"')[1]
+    assert 'id="overview"' not in gaze_page_html("one", [with_area])
+    assert 'id="overview"' not in gaze_page_html("compared", [without, without], "<section>both</section>")
+
+
 def test_another_picture_can_be_chosen(opened, hostile):
     before = heat(opened)
     assert opened.locator("#facts-0").is_visible()
