@@ -199,7 +199,8 @@ class Sensor(StatedModule, ABC):
         parts = []
         for name in self.names:
             value = settings[name]
-            parts.append(f"{name}={value:g}" if isinstance(value, float) else f"{name}={value!r}")
+            text = f"{value:g}" if isinstance(value, float) else repr(value)
+            parts.append(f"{name}={text}")
         return ", ".join(parts)
 
 
@@ -240,9 +241,9 @@ def fixations(gaze: Tensor, like: Tensor) -> Tensor:
     check_tensor(gaze, "gaze")
     batch = like.shape[0]
     for_all = gaze.shape == (2,)
-    for_each = gaze.ndim in (2, 3) and gaze.shape[0] == batch and gaze.shape[-1] == 2
+    by_image = gaze.ndim in (2, 3) and gaze.shape[0] == batch and gaze.shape[-1] == 2
     expected = f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)"
-    check(for_all or for_each, "gaze", expected, tuple(gaze.shape))
+    check(for_all or by_image, "gaze", expected, tuple(gaze.shape))
     if values_known(gaze):
         check_finite(gaze, "gaze")
     points = as_positions(gaze, like)

@@ -149,9 +149,10 @@ def _lattice(
             axes.append(torch.full((count,), axis))
             widths.append(torch.full((count,), axis * len(sizes) + k))
     exponent = torch.arange(len(sizes)).to(device, dtype)
-    return _Lattice(
-        torch.cat(places).to(device, dtype), torch.cat(axes).to(device), torch.cat(widths).to(device), exponent
-    )
+    all_places = torch.cat(places).to(device, dtype)
+    axis_of_place = torch.cat(axes).to(device)
+    width_of_place = torch.cat(widths).to(device)
+    return _Lattice(all_places, axis_of_place, width_of_place, exponent)
 
 
 def pixel_positions(count: int, length: int, k: int, convention: Convention) -> Tensor:
@@ -192,6 +193,8 @@ def _widths(sigma: float | Tensor, images: Tensor) -> Tensor:
         number = torch.as_tensor(sigma)
     width = as_positions(number, images)
     batch = images.shape[0]
-    known_shape = width.ndim == 0 or (width.shape[0] in (1, batch) and width.shape[1:] in ((), (2,)))
-    check(known_shape, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", tuple(width.shape))
-    return (width[:, None] if width.ndim == 1 else width).expand(batch, 2)
+    shapes = [(), (1,), (batch,), (1, 2), (batch, 2)]
+    check(tuple(width.shape) in shapes, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", (*width.shape,))
+    if width.ndim == 1:
+        width = width[:, None]  # the same along x and y
+    return width.expand(batch, 2)

@@ -135,8 +135,10 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
     upper_left = box[:2]
     lower_right = box[2:]
     size = box.new_tensor(picture)
-    side = torch.minimum((context * (lower_right - upper_left).amax()).clamp(min=least * max(picture)), size)
-    start = torch.minimum(((upper_left + lower_right - side) / 2).clamp(min=0), size - side)
+    wanted_side = (context * (lower_right - upper_left).amax()).clamp(min=least * max(picture))
+    side = torch.minimum(wanted_side, size)  # (2,), as a narrow picture cuts the square
+    centred_start = (upper_left + lower_right - side) / 2
+    start = torch.minimum(centred_start.clamp(min=0), size - side)
     return torch.cat([start, start + side])
 
 
@@ -153,19 +155,28 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
     Returns:
         The canvas, `(C, height, width)`.
     """
+    width, height = size
+    x1, y1, x2, y2 = box.unbind(-1)
     border = padding == "border"
-    columns, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=border)
-    rows, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=border)
-    part = image[:, top:bottom, left:right]
-    columns = columns.to(part)
-    rows = rows.to(part)
+    columns, (left, right) = _weights(x1, x2, width, image.shape[-1], border=border)
+    rows, (top, bottom) = _weights(y1, y2, height, image.shape[-2], border=border)
+    part = image[:, top:bottom, left:right]  # (C, h, w)
+    columns = columns.to(part)  # (width, w)
+    rows = rows.to(part)  # (height, h)
     # Weights end at the image, as if 0 followed; another value is subtracted before and added after.
     if value:
         part = part - value
-    is_recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
-    can_fill = image.device.type == "cpu" and part.numel() > 0 and not is_recorded and values_known(image, box)
-    canvas = _product_in_bands(rows, part, columns, box.tolist(), (left, top)) if can_fill else rows @ part @ columns.mT
+    if _can_skip_zeros(image, part, box):
+        canvas = _product_in_bands(rows, part, columns, box.tolist(), (left, top))
+    else:
+        canvas = rows @ part @ columns.mT
     return canvas + value if value else canvas
+
+
+def _can_skip_zeros(image: Tensor, part: Tensor, box: Tensor) -> bool:
+    """Tell whether the products may be written in bands: on a CPU, where no gradient and no graph needs them whole."""
+    is_recorded = torch.is_grad_enabled() and (image.requires_grad or box.requires_grad)
+    return image.device.type == "cpu" and part.numel() > 0 and not is_recorded and values_known(image, box)
 
 
 def _product_in_bands(rows: Tensor, part: Tensor, columns: Tensor, box: list[float], corner: tuple[int, int]) -> Tensor:
@@ -246,9 +257,11 @@ def _weights(start: Tensor, end: Tensor, count: int, length: int, *, border: boo
     first, last = torch.stack([first_reached, last_reached + 1]).detach().long().tolist()
     pixel = torch.arange(first, last, device=start.device)
     centre = pixel.to(start) + 0.5
-    triangle = (1 - (middle[:, None] - centre).abs() / reach).clamp(min=0)
+    distance = (middle[:, None] - centre).abs()  # (count, pixels)
+    triangle = (1 - distance / reach).clamp(min=0)
     weight = triangle / triangle.sum(-1, keepdim=True)
     if border:
+        # What a triangle reaches outside the picture counts for the nearest pixel inside.
         begin = min(max(first, 0), length - 1)
         stop = max(min(last, length), 1)
         nearest = pixel.clamp(0, length - 1) - begin
@@ -272,7 +285,9 @@ def _weights_of_all(middle: Tensor, reach: Tensor, length: int, *, border: bool)
     """
     place = middle - 0.5
     pixel = torch.arange(length)
-    weight = (1 - (place[:, None] - pixel.to(place)).abs() / reach).clamp(min=0)
+    distance = (place[:, None] - pixel.to(place)).abs()  # (count, length)
+    weight = (1 - distance / reach).clamp(min=0)
+    # The whole triangle, on an endless line of pixels: the part on either side of its middle.
     fraction = place - place.floor()
     total = _beyond(fraction, reach) + _beyond(1 - fraction, reach)
     if border:
@@ -302,4 +317,6 @@ def _outside(inwards: Tensor, reach: Tensor, total: Tensor) -> Tensor:
 def _beyond(distance: Tensor, reach: Tensor) -> Tensor:
     """Sum the triangle 1 - d / reach over d = distance, distance + 1, … up to the reach."""
     count = (reach - distance).floor().clamp(min=-1) + 1
-    return count - (count * distance + count * (count - 1) / 2) / reach
+    # The sum of `count` numbers d, d + 1, …
+    distances = count * distance + count * (count - 1) / 2
+    return count - distances / reach

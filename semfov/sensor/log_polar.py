@@ -58,8 +58,9 @@ class _Retina:
         return min(max(log2(field), 0.0), float(_TALLEST))
 
     def eccentricity(self, ring: int) -> float:
-        """Compute the eccentricity of the receptors of a ring, in the unit of `fovea`."""
-        return self.fovea * (exp((ring + 0.5) * self.spacing / self.fovea) - 1)
+        """Compute the eccentricity of the receptors of a ring, in the unit of `fovea`: r of its ρ (`log_polar`)."""
+        rho = (ring + 0.5) * self.spacing
+        return self.fovea * (exp(rho / self.fovea) - 1)
 
     def _reach(self, size: tuple[int, int]) -> float:
         """Measure the diagonal of an image, in the unit of `fovea`."""
@@ -218,8 +219,9 @@ class LogPolar(Sensor):
     def look(self, state: tuple[_Levels, _Retina], gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
         levels, retina = state
-        fixation = fixations(gaze[None], levels[0])
-        return _project(_sample(levels, fixation, retina), fixation, _size(levels[0]), retina)[0]
+        fixation = fixations(gaze[None], levels[0])  # (1, F, 2)
+        cortical = _sample(levels, fixation, retina)
+        return _project(cortical, fixation, _size(levels[0]), retina)[0]
 
     def settings(self) -> dict[str, object]:
         """List the settings that the views depend on."""
@@ -284,6 +286,7 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
     """
     batch, number, _, rings, wedges = cortical.shape
     radius, angle = _polar(fixation, size, retina.scale)
+    # Numbers of rings and wedges, also between two: ρ / δ - ½ and θ N / 2π.
     ring = retina.fovea * torch.log1p(radius / retina.fovea) / retina.spacing - 0.5
     wedge = angle.remainder(2 * pi) * (wedges / (2 * pi))
     # Places in the extended image from -1 to 1: two more rings lie before the first, a wedge before and two behind.
@@ -303,7 +306,9 @@ def _extended(cortical: Tensor) -> Tensor:
     half_turn = cortical.shape[-1] // 2
     opposite_rings = cortical[..., :2, :].flip(-2).roll(half_turn, -1)
     rings = torch.cat([opposite_rings, cortical], -2)
-    return torch.cat([rings[..., -1:], rings, rings[..., :2]], -1)
+    before = rings[..., -1:]
+    after = rings[..., :2]
+    return torch.cat([before, rings, after], -1)
 
 
 def _polar(fixation: Tensor, size: tuple[int, int], scale: tuple[float, float]) -> tuple[Tensor, Tensor]:

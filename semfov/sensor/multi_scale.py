@@ -71,7 +71,8 @@ class MultiScaleFovea(Sensor):
         plane = F.pad(image, (1, 1, 1, 1))
         means = [plane]
         for scale in range(self.scales - 1):
-            # The mean of a square is that of four squares of half its side, at all places.
+            # The mean of a square is that of four squares of half its side, at all places: of two side by side first,
+            # and then of two such pairs, one above the other.
             step = 2**scale
             padded = F.pad(plane, (step, step, step, step))
             pairs = (padded[..., step:] + padded[..., :-step]) / 2
@@ -157,13 +158,14 @@ class MultiScaleFovea(Sensor):
         x = torch.arange(width, dtype=corner.dtype, device=corner.device) + 0.5
         y = torch.arange(height, dtype=corner.dtype, device=corner.device) + 0.5
         side = self.side * 2**scale
-        columns = 2 * (x - corner[:, :1]) / side - 1
-        rows = 2 * (y - corner[:, 1:]) / side - 1
-        return torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
+        columns = 2 * (x - corner[:, :1]) / side - 1  # (F, width)
+        rows = 2 * (y - corner[:, 1:]) / side - 1  # (F, height)
+        planes = torch.broadcast_tensors(columns[:, None, :], rows[:, :, None])
+        return torch.stack(planes, -1)
 
     def boxes_to_canvas(self, state: tuple[_Planes, tuple[int, int]], gaze: Tensor, boxes: Tensor) -> Tensor:
         """Map boxes `(F·L, N, 4)` in the crops to the canvas: times 2^l, from the corner of the crop."""
-        windows = self.windows(as_positions(gaze, boxes)).flatten(0, 1)[:, None]
+        windows = self.windows(as_positions(gaze, boxes)).flatten(0, 1)[:, None]  # (F·L, 1, 4)
         corner = windows[..., :2]
         pixels = (windows[..., 2:] - corner) / self.side  # of the canvas, for one of the crop
         return boxes * pixels.repeat(1, 1, 2) + corner.repeat(1, 1, 2)
@@ -198,14 +200,14 @@ class MultiScaleFovea(Sensor):
         # Shares of the next square, for planes `(B, G, side, C, side)`.
         x, y = (first - square)[..., None, None, None].unbind(2)
         offsets = torch.arange(self.side, device=plane.device) * 2**scale
-        column = square[..., 0, None].long() + offsets
+        column = square[..., 0, None].long() + offsets  # (B, G, side)
         row = square[..., 1, None].long() + offsets
 
         # Rows first: they are contiguous in memory.
         height, width = plane.shape[-2:]
-        rows = plane.transpose(1, 2)
+        rows = plane.transpose(1, 2)  # (B, h, C, w)
         image = torch.arange(len(plane), device=plane.device)[:, None, None]
-        upper = rows[image, row.clamp(0, height - 1)]
+        upper = rows[image, row.clamp(0, height - 1)]  # (B, G, side, C, w)
         lower = rows[image, (row + 1).clamp(0, height - 1)]
         lines = upper * (1 - y) + lower * y
 

@@ -74,7 +74,7 @@ def go_around(panorama: Tensor, *, even: bool = True) -> Tensor:
     half = panorama.shape[-1] // 2
     above = panorama[..., :1, :].roll(half, -1)
     below = panorama[..., -1:, :].roll(half, -1)
-    rows = torch.cat([above, panorama, below], -2)
+    rows = torch.cat([above, panorama, below], -2)  # (..., H + 2, W); beyond a pole lies the other half of its row
     return torch.cat([rows[..., -1:], rows, rows[..., :1]], -1)
 
 
@@ -90,7 +90,8 @@ def _even_rows(panorama: Tensor) -> Tensor:
     row = torch.arange(rows, dtype=torch.float64, device=panorama.device)
     column = torch.arange(columns, dtype=torch.float64, device=panorama.device)
     half_turns = (row + 0.5) / rows - 0.5  # of latitude
-    width = (1 / (half_turns * torch.pi).cos()).clamp(max=columns)[:, None]
+    latitude = half_turns * torch.pi
+    width = (1 / latitude.cos()).clamp(max=columns)[:, None]
     # Two rounds of each row: a mean around a pixel of the middle of them never leaves them.
     twice = torch.cat([panorama, panorama], -1).double()
     total = F.pad(twice.cumsum(-1), (1, 0))
@@ -104,7 +105,9 @@ def _even_rows(panorama: Tensor) -> Tensor:
         last_pixel = (place - pixel) * twice.gather(-1, index)
         return whole_pixels + last_pixel
 
-    means = (integral(middle + width / 2) - integral(middle - width / 2)) / width
+    upper = integral(middle + width / 2)
+    lower = integral(middle - width / 2)
+    means = (upper - lower) / width
     return means.roll(columns // 2, -1).to(panorama)
 
 

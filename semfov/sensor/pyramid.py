@@ -121,7 +121,8 @@ def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "korni
     _check(image, convention)
     if convention == "opencv":
         for count, length in zip(image.shape[-2:], shape, strict=True):
-            check(0 <= 2 * count - length <= 1, "shape", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
+            double = 2 * count
+            check(length in (double, double - 1), "shape", f"{double} or {double - 1} for {count} pixels", length)
     return expand(widened(image), shape, convention).to(image.dtype)
 
 
@@ -140,8 +141,10 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
         from kornia.geometry import transform
 
         return transform.pyrup(image.contiguous())
+    height, width = size
     before = (image.shape[-2], image.shape[-1])
-    return separable(image, *expanding(before, (size[0], size[1]), convention, image.dtype, image.device))
+    columns, rows = expanding(before, (height, width), convention, image.dtype, image.device)
+    return separable(image, columns, rows)
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
@@ -204,7 +207,8 @@ def _subtract(level: Tensor, expanded: Tensor) -> Tensor:
 
 def widened(image: Tensor) -> Tensor:
     """Convert an image of half precision to float32 on a CPU, which computes with it ten times faster."""
-    return image.float() if image.dtype in (torch.float16, torch.bfloat16) and image.device.type == "cpu" else image
+    is_slow = image.dtype in (torch.float16, torch.bfloat16) and image.device.type == "cpu"
+    return image.float() if is_slow else image
 
 
 def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int] | None = None) -> bool:
@@ -243,7 +247,8 @@ def _reducing(
         if convention == "opencv":
             taps = _blur(torch.arange(0, count, 2), count)
         else:
-            taps = _compose(_resize(count, max(count // 2, 1), dtype), _blur(torch.arange(count), count))
+            blur = _blur(torch.arange(count), count)
+            taps = _compose(_resize(count, max(count // 2, 1), dtype), blur)
         # Halving an odd number of pixels shifts positions by one pixel from one end of the line to the other.
         lines.append(banded(taps, count, shift // 2, shift, 2 + count % 2, dtype, device))
     return lines[0], lines[1]
@@ -299,10 +304,12 @@ def _stuff_and_blur(count: int, length: int) -> Taps:
 
 def _blur(place: Tensor, count: int) -> Taps:
     """Make the five taps of the blur at some pixels of a line of `count` pixels, mirrored at its outermost pixels."""
-    # A line of one or two pixels is mirrored repeatedly, as `BORDER_REFLECT_101` of OpenCV does.
-    index = (place[:, None] + torch.arange(-2, 3)).abs() % max(2 * count - 2, 1)
+    # A line of one or two pixels is mirrored repeatedly, as `BORDER_REFLECT_101` of OpenCV does: a mirrored line
+    # repeats itself after a way to its last pixel and back.
+    period = 2 * count - 2
+    index = (place[:, None] + torch.arange(-2, 3)).abs() % max(period, 1)
     weight = torch.tensor(_BLUR, dtype=torch.float64).expand(len(place), 5)
-    return Taps(torch.minimum(index, 2 * count - 2 - index), weight)
+    return Taps(torch.minimum(index, period - index), weight)
 
 
 def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
@@ -312,12 +319,12 @@ def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
     ratio = torch.tensor(count).to(centre) / length
     place = (centre * ratio - 0.5).clamp(0, count - 1).double()
     before = place.floor()
-    index = before.long()[:, None] + torch.arange(2)
+    index = before.long()[:, None] + torch.arange(2)  # (length, 2), the pixels on both sides
     weight = torch.stack([1 - place + before, place - before], -1)
     return Taps(index.clamp(max=count - 1), weight)
 
 
 def _compose(outer: Taps, inner: Taps) -> Taps:
     """Make the taps of a filter `outer` of the result of a filter `inner`."""
-    weight = outer.weight[..., None] * inner.weight[outer.index]
+    weight = outer.weight[..., None] * inner.weight[outer.index]  # (pixels, outer taps, inner taps)
     return Taps(inner.index[outer.index].flatten(1), weight.flatten(1))

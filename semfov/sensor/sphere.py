@@ -92,7 +92,8 @@ class Camera:
     @property
     def focal(self) -> Tensor:
         """Focal length in pixels, `(...)`."""
-        return self.size[0] / (2 * torch.deg2rad(self.pose[..., 2] / 2).tan())
+        half_field = torch.deg2rad(self.pose[..., 2] / 2)
+        return self.size[0] / (2 * half_field.tan())
 
     @property
     def rotation(self) -> Tensor:
@@ -120,8 +121,9 @@ class Camera:
         """
         check_shape(points, "points", None, 2)
         middle = points.new_tensor(self.size) / 2 - 0.5
-        flat = (points - middle) / self.focal[..., None, None]
-        rays = _turn(self.rotation, torch.cat([flat, torch.ones_like(flat[..., :1])], -1))
+        flat = (points - middle) / self.focal[..., None, None]  # (..., N, 2), at depth 1
+        depth = torch.ones_like(flat[..., :1])
+        rays = _turn(self.rotation, torch.cat([flat, depth], -1))
         return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
 
     def points(self, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,7 +143,8 @@ class Camera:
         depth = torch.where(in_front, forward, torch.ones_like(forward))[..., None]
         size = rays.new_tensor(self.size)
         middle = size / 2 - 0.5
-        points = rays[..., :2] / depth * self.focal[..., None, None] + middle
+        flat = rays[..., :2] / depth
+        points = flat * self.focal[..., None, None] + middle
         inside = ((points >= -0.5) & (points <= size - 0.5)).all(-1)
         return torch.where(in_front[..., None], points, torch.inf), in_front & inside
 
@@ -149,7 +152,8 @@ class Camera:
 def _turn(rotation: Tensor, rays: Tensor) -> Tensor:
     """Multiply rays `(..., N, 3)` by a rotation `(..., 3, 3)`."""
     # Autocast would compute a matrix product in 16 bits, which is less exact than a pixel.
-    return (rotation[..., None, :, :] * rays[..., None, :]).sum(-1)
+    products = rotation[..., None, :, :] * rays[..., None, :]  # (..., N, 3, 3)
+    return products.sum(-1)
 
 
 @dataclass(frozen=True)
@@ -174,8 +178,9 @@ class Boxes:
 
     def _points_at(self, shares: Tensor) -> Tensor:
         """Compute the points `(M, P, 2)` at shares `(P, 2)` of the sides of each region, from its upper left corner."""
-        corner = self.boxes[:, None, :2]
-        return corner + shares * (self.boxes[:, None, 2:] - corner) - 0.5
+        corner = self.boxes[:, None, :2]  # (M, 1, 2)
+        sides = self.boxes[:, None, 2:] - corner
+        return corner + shares * sides - 0.5
 
     def contain(self, points: Tensor) -> Tensor:
         """Tell whether each region contains each of the points `(N, D)`, `(M, N)` boolean."""
@@ -196,7 +201,8 @@ class Regions(Boxes):
 
     def contain(self, points: Tensor) -> Tensor:
         """Tell whether each region contains each of the directions `(N, 3)`, `(M, N)` boolean."""
-        return super().contain(self.camera.points(points)[0])
+        pixels, _ = self.camera.points(points)  # infinite behind the camera, where no region is
+        return super().contain(pixels)
 
     def samples(self, count: int = 9) -> Tensor:
         """Place `count²` directions on a grid over each region, its borders included, `(M, count², 3)`."""
@@ -223,7 +229,8 @@ class Regions(Boxes):
         outline = panorama_points(self.outlines(257), size)
         x, y = outline.unbind(-1)
         # Neighbouring points of an outline are less than half a turn apart: so it goes on across the seam.
-        step = (x.diff(dim=-1) + width / 2) % width - width / 2
+        half_turn = width / 2
+        step = (x.diff(dim=-1) + half_turn) % width - half_turn
         first = x[:, :1]
         unrolled = torch.cat([first, first + step.cumsum(-1)], -1)
         leftmost = unrolled.amin(-1)
