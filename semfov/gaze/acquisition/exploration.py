@@ -265,7 +265,8 @@ def _divergence(outlook: Outlook) -> Tensor:
 def _lead(mean: Tensor) -> Tensor:
     """Compute the margin of the most probable class of means `(..., K+1)`: its probability minus the second largest."""
     first, place = mean.max(-1, keepdim=True)
-    return first[..., 0] - mean.scatter(-1, place, -torch.inf).amax(-1)
+    second = mean.scatter(-1, place, -torch.inf).amax(-1)
+    return first[..., 0] - second
 
 
 def _deviation(peak: Tensor, total: Tensor) -> Tensor:

@@ -60,7 +60,8 @@ class Outlook(NamedTuple):
         beta = self.beta[..., None, :]
         least = self.likelihood.amin(-1, keepdim=True)
         # Likelihoods are not divided by their scale: that would be one more pass over the largest tensor.
-        share = (self.likelihood - least).mul_(1 / (self.total[..., None, None] * self.scale + least))
+        sum_of_both = self.total[..., None, None] * self.scale + least
+        share = (self.likelihood - least).mul_(1 / sum_of_both)
         return torch.addcmul(beta, beta, share)
 
 
@@ -102,14 +103,19 @@ def _expected_looks(mean: Tensor, expected: Tensor) -> Tensor:
     """
     components = mean.shape[-1]
     check(expected.shape[0] == components, "model", f"{components} classes, as the belief has", expected.shape[0])
-    table = expected.to(mean).flatten(1)
-    scores = mean @ table if mean.ndim == 2 else one_by_one(lambda maps: maps @ table, mean.flatten(0, -3))
+    table = expected.to(mean).flatten(1)  # (K+1, N (K+1))
+
+    def scores_of(maps: Tensor) -> Tensor:
+        return maps @ table
+
+    scores = scores_of(mean) if mean.ndim == 2 else one_by_one(scores_of, mean.flatten(0, -3))
     return scores.view(*mean.shape[:-1], *expected.shape[1:])
 
 
 def _outlook(beta: Tensor, total: Tensor, mean: Tensor, likelihood: Tensor) -> Outlook:
     """Make the belief after looks with these likelihoods, `(..., X·Y, N, K+1)`."""
-    return Outlook(beta, total, mean, likelihood, (mean[..., None, :] @ likelihood.mT).mT)
+    scale = (mean[..., None, :] @ likelihood.mT).mT  # Σ_k p_k λ_k
+    return Outlook(beta, total, mean, likelihood, scale)
 
 
 def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) -> Outlook:
@@ -135,11 +141,11 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
     sample = torch.arange(likelihoods.shape[2], device=beta.device)
     # Multiples of the golden ratio fill the unit interval evenly, whatever the number of looks.
     start = (visited.sum(-1).to(beta) * _GOLDEN).frac()[..., None, None]
-    point = (sample + start) / len(sample)
-    cumulative = mean.cumsum(-1)[..., None, :]
+    point = (sample + start) / len(sample)  # (..., 1, M), the same in all cells
+    cumulative = mean.cumsum(-1)[..., None, :]  # (..., X·Y, 1, K+1)
     # The class of a point is the number of classes whose cumulative probability lies below it.
     drawn = (point[..., None] >= cumulative).sum(-1).clamp(max=components - 1)
-    likelihood = likelihoods.to(beta)[drawn, :, sample]
+    likelihood = likelihoods.to(beta)[drawn, :, sample]  # (..., X·Y, M, N, K+1)
     by_level_and_sample = likelihood.transpose(-2, -3).flatten(-3, -2)
     return _outlook(beta, total, mean, by_level_and_sample)
 
@@ -173,13 +179,16 @@ def sampled_likelihoods(
         )
     alpha = model.alpha.detach()
     generator = np.random.default_rng(seed)
-    drawn = generator.standard_gamma(alpha.double().cpu().numpy()[:, :, None].repeat(samples, 2))
+    shapes = alpha.double().cpu().numpy()[:, :, None].repeat(samples, 2)  # (K+1, N, M, K+1)
+    # Gamma variates divided by their sum have a Dirichlet distribution.
+    drawn = generator.standard_gamma(shapes)
     scores = torch.from_numpy(drawn / drawn.sum(-1, keepdims=True)).to(alpha)
     if not calibrated:
         return scores
     # A border belongs to the level inside it; the last level has none, and is everything beyond.
     outer = torch.cat([model.edges, model.edges.new_full((1,), torch.inf)])
-    return model.calibrate(scores, outer[None, :, None].expand(scores.shape[:-1])).detach()
+    distances = outer[None, :, None].expand(scores.shape[:-1])
+    return model.calibrate(scores, distances).detach()
 
 
 class Lookahead(AcquisitionFunction):
@@ -233,10 +242,9 @@ class Lookahead(AcquisitionFunction):
         """
         total, mean = _total_and_mean(beta)
         cells = _block(_PRODUCT, beta, beta.shape[-1])
+        blocks = zip(beta.split(cells, -2), total.split(cells, -1), mean.split(cells, -2), strict=True)
         rows = []
-        for part, part_total, part_mean in zip(
-            beta.split(cells, -2), total.split(cells, -1), mean.split(cells, -2), strict=True
-        ):
+        for part, part_total, part_mean in blocks:
             columns = []
             for levels in expected.split(_block(_PRODUCT, beta, part.numel()), 1):
                 likelihood = _expected_looks(part_mean, levels)
@@ -295,4 +303,5 @@ def at_levels(values: Tensor, levels: Tensor) -> Tensor:
     Returns:
         `(..., X·Y, X·Y)`, by seen cell and fixation.
     """
-    return values.gather(-1, levels.expand(*values.shape[:-1], levels.shape[-1]))
+    index = levels.expand(*values.shape[:-1], levels.shape[-1])
+    return values.gather(-1, index)

@@ -63,7 +63,9 @@ class FovealHit(_TargetVisibility):
 
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
         """Compute the probability of a detection."""
-        return -torch.expm1(torch.log1p(-present[..., None, :] * visibility).sum(-1))
+        # The product of the misses as a sum of logarithms, which is exact also where it is nearly 1.
+        log_of_misses = torch.log1p(-present[..., None, :] * visibility).sum(-1)
+        return -torch.expm1(log_of_misses)
 
 
 class PlaceInformation(_TargetVisibility):

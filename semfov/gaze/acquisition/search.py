@@ -135,13 +135,16 @@ class NeighbourhoodPosterior(AcquisitionFunction):
         self.register_buffer("target", torch.as_tensor(target))
         self.register_buffer("levels", model.level(grid.cell_distance))
         cell = torch.arange(len(grid))
-        place = torch.stack([cell % grid.columns, cell // grid.columns], -1).to(torch.get_default_dtype())
-        self.register_buffer("kernel", (-torch.cdist(place, place).square() / (2 * sigma**2)).exp())
+        column = cell % grid.columns
+        row = cell // grid.columns
+        place = torch.stack([column, row], -1).to(torch.get_default_dtype())
+        distance = torch.cdist(place, place)  # (X·Y, X·Y), in cells
+        self.register_buffer("kernel", (-distance.square() / (2 * sigma**2)).exp())
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Compute values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
         outlook = look_ahead(beta, self.model.expected_scores())
-        predicted = at_levels(pick(outlook.next_mean, self.target), self.levels)
+        predicted = at_levels(pick(outlook.next_mean, self.target), self.levels)  # (..., x, f)
         return (predicted * self.kernel.to(predicted)).sum(-2)

@@ -342,12 +342,14 @@ class FixationDensity(Pretrained):
         rows, columns = cells_of(size)
         top, left, step = corner
         # Centres of the cells, in longer sides of the picture as the path is.
-        x = (torch.arange(left, columns, step).to(path) + 0.5) * (width / columns / longer)
-        y = (torch.arange(top, rows, step).to(path) + 0.5) * (height / rows / longer)
+        column = torch.arange(left, columns, step).to(path)
+        row = torch.arange(top, rows, step).to(path)
+        x = (column + 0.5) * (width / columns / longer)
+        y = (row + 0.5) * (height / rows / longer)
         cells = (len(y), len(x))
         places = torch.stack([x.expand(cells), y[:, None].expand(cells)], -1).flatten(0, 1)
 
-        fixations = (~path[..., 0].isnan()).sum(1)
+        fixations = (~path[..., 0].isnan()).sum(1)  # NaN stands for none
         gain_of_map, gain_of_centre = self.oculomotor.gains(fixations)[..., None, None].unbind(1)
         return {
             "map": gain_of_map * terms["map"][:, top::step, left::step],
@@ -386,7 +388,7 @@ class FixationDensity(Pretrained):
         path = start[:, None]
         for _ in range(fixations - 1):
             log_density = torch.stack([*self.given(terms, size, path).values()]).sum(0)
-            density = log_density.flatten(1).double().softmax(1)
+            density = log_density.flatten(1).double().softmax(1)  # (n, rows · columns)
             cell = density.multinomial(1, generator=generator)[:, 0]
             corner = torch.stack([cell % columns, cell // columns], 1).to(start)
             within_cell = torch.rand(corner.shape, generator=generator).to(start)
@@ -471,13 +473,15 @@ def _size_of(features: FeatureMaps | Mapping[str, Tensor]) -> tuple[int, int]:
     if isinstance(features, FeatureMaps):
         width, height = features.placement.size
         return height, width
-    return max((int(maps.shape[-2]), int(maps.shape[-1])) for maps in features.values())
+    sizes = [(int(maps.shape[-2]), int(maps.shape[-1])) for maps in features.values()]
+    return max(sizes)
 
 
 def cells_of(size: tuple[int, int]) -> tuple[int, int]:
     """Count rows and columns of cells of a picture of `(height, width)`, 52 along its longer side."""
     longer = max(size)
-    return max(1, round(_CELLS * size[0] / longer)), max(1, round(_CELLS * size[1] / longer))
+    rows, columns = (max(1, round(_CELLS * side / longer)) for side in size)
+    return rows, columns
 
 
 def blurred(maps: Tensor, sigma: Tensor) -> Tensor:
@@ -490,10 +494,14 @@ def blurred(maps: Tensor, sigma: Tensor) -> Tensor:
     Returns:
         `(..., rows, columns)`.
     """
-    return _blurring(maps.shape[-2], sigma) @ maps @ _blurring(maps.shape[-1], sigma).mT
+    along_rows = _blurring(maps.shape[-1], sigma)
+    along_columns = _blurring(maps.shape[-2], sigma)
+    return along_columns @ maps @ along_rows.mT
 
 
 def _blurring(cells: int, sigma: Tensor) -> Tensor:
     """Make the matrix `(cells, cells)` that blurs a line of cells; differentiable in σ."""
     place = torch.arange(cells, device=sigma.device, dtype=sigma.dtype)
-    return ((place[:, None] - place).square() / (-2 * sigma.square())).softmax(-1)
+    squared_distance = (place[:, None] - place).square()
+    # A softmax of -d² / 2σ² is a Gaussian whose weights sum to 1.
+    return (squared_distance / (-2 * sigma.square())).softmax(-1)

@@ -50,11 +50,11 @@ def features_so_far(views: FeatureMaps, fixations: Tensor, scanpath: Tensor) -> 
     for name, maps in views.maps.items():
         height, width = maps.shape[-2:]
         pixels = _pixels_on_picture(views, height, width, fixations)
-        distance = torch.cdist(pixels.expand(len(points), -1, -1), view_fixations)
+        distance = torch.cdist(pixels.expand(len(points), -1, -1), view_fixations)  # (B, pixels, n)
         closest_look = distance.masked_fill(~fixated[:, None], torch.inf).argmin(-1)
-        closest_view = nearest_view.gather(1, closest_look)
+        closest_view = nearest_view.gather(1, closest_look)  # (B, pixels)
         pixel = torch.arange(height * width, device=closest_view.device)
-        features_by_pixel = maps.flatten(2).transpose(1, 2)
+        features_by_pixel = maps.flatten(2).transpose(1, 2)  # (views, pixels, C)
         features = features_by_pixel[closest_view, pixel]
         joined[name] = features.transpose(1, 2).unflatten(2, (height, width))
     return replace(views, maps=joined)
@@ -72,10 +72,12 @@ def _pixels_on_picture(views: FeatureMaps, height: int, width: int, like: Tensor
     Returns:
         Centres of the pixels row by row, `(height · width, 2)`, in pixels of the picture.
     """
-    place = views.placement
-    columns = (torch.arange(width).to(like) + 0.5) * (views.canvas[0] / width)
-    rows = (torch.arange(height).to(like) + 0.5) * (views.canvas[1] / height)
-    x = (columns - place.offset[0]) / place.scale[0]
-    y = (rows - place.offset[1]) / place.scale[1]
+    canvas_width, canvas_height = views.canvas
+    offset_x, offset_y = views.placement.offset
+    scale_x, scale_y = views.placement.scale
+    columns = (torch.arange(width).to(like) + 0.5) * (canvas_width / width)  # in canvas pixels
+    rows = (torch.arange(height).to(like) + 0.5) * (canvas_height / height)
+    x = (columns - offset_x) / scale_x
+    y = (rows - offset_y) / scale_y
     centres = torch.stack([x.expand(height, -1), y[:, None].expand(-1, width)], -1)
     return centres.flatten(0, 1) - 0.5

@@ -110,10 +110,12 @@ class PictureLikeness(nn.Module):
             InputError: there are more or fewer values.
         """
         check_shape(values, "values", None, len(self.mean))
-        standard = (values - self.mean) / self.deviation
-        along = standard @ self.axes.mT
+        standard = (values - self.mean) / self.deviation  # (B, P)
+        along = standard @ self.axes.mT  # (B, axes)
+        # What no axis explains is divided by its mean variance.
         rest = (standard.square().sum(1) - along.square().sum(1)) / self.rest
-        return ((along.square() / self.variance).sum(1) + rest) / (len(self.mean) * self.limit)
+        squared_distance = (along.square() / self.variance).sum(1) + rest
+        return squared_distance / (len(self.mean) * self.limit)
 
 
 def pooled(features: FeatureMaps, layers: Iterable[str]) -> Tensor:
@@ -130,7 +132,8 @@ def pooled(features: FeatureMaps, layers: Iterable[str]) -> Tensor:
     for name in layers:
         maps = features.maps[name]
         rows, columns = sides_of(features, (int(maps.shape[-2]), int(maps.shape[-1])))
-        part = maps[..., rows.first : rows.stop, columns.first : columns.stop].float().flatten(2)
+        on_picture = maps[..., rows.first : rows.stop, columns.first : columns.stop]
+        part = on_picture.float().flatten(2)  # (B, C, pixels)
         means = part.mean(2, keepdim=True)
         # `Tensor.std` along rows takes twenty times as long.
         deviations = torch.linalg.vector_norm(part - means, dim=2) / part.shape[2] ** 0.5

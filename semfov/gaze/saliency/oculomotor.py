@@ -77,9 +77,11 @@ class OculomotorBias(nn.Module):
         Returns:
             `(B, N)`.
         """
-        saccade = places - last[:, None]
+        saccade = places - last[:, None]  # (B, N, 2)
         length = _norm(saccade)
-        cos, sin = (saccade / length[..., None].clamp(min=1e-9)).unbind(-1)
+        direction = saccade / length[..., None].clamp(min=1e-9)
+        cos, sin = direction.unbind(-1)
+        # Of twice and four times the angle, by the formulas of the double angle.
         cos2 = cos.square() - sin.square()
         sin2 = 2 * cos * sin
         cos4 = cos2.square() - sin2.square()
@@ -89,7 +91,8 @@ class OculomotorBias(nn.Module):
         # The turn τ from the saccade before, of which a path of one fixation has none.
         step = torch.where(before.isnan(), 0.0, last - before)
         unit = step / _norm(step)[:, None].clamp(min=1e-9)
-        cos_turn = cos * unit[:, None, 0] + sin * unit[:, None, 1]
+        cos_before, sin_before = unit[:, None].unbind(-1)  # (B, 1)
+        cos_turn = cos * cos_before + sin * sin_before
         cos_2_turn = 2 * cos_turn.square() - 1
         cos_3_turn = 4 * cos_turn**3 - 3 * cos_turn
         has_turn = (~before[:, :1].isnan()).to(cos_turn)
@@ -97,7 +100,7 @@ class OculomotorBias(nn.Module):
 
         tables = torch.cat([self.saccade, self.turn])
         # A table that is interpolated linearly is its first value and the shares of its steps that were passed.
-        by_length = tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)
+        by_length = tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)  # (B, tables, N)
         angles = torch.stack([*directions, *turns], -2)
         return by_length.mul(angles).sum(-2)
 
@@ -118,12 +121,13 @@ class OculomotorBias(nn.Module):
         # Products of matrices would lose the digits of short distances.
         distance = torch.cdist(points, places.expand(len(earlier), -1, -1), compute_mode="donot_use_mm_for_euclid_dist")
         ages = torch.arange(earlier.shape[1], device=path.device).clamp(max=_AGES - 1)
-        tables = F.pad(self.back, (0, 1))[ages]  # 0 from the last knot on
+        tables = F.pad(self.back, (0, 1))[ages]  # (fixations, knots), 0 from the last knot on
         # As in `_saccade_bias`, a table is its first value and its steps; those of a fixation that is not there are 0.
         intervals = len(_NEAR) - 1
-        steps = tables.diff(dim=1).flatten()
-        weights = steps * fixated[..., None].expand(-1, -1, intervals).flatten(1)
-        passed = _passed(_NEAR, distance).flatten(1, 2)
+        steps = tables.diff(dim=1).flatten()  # one for each interval of each fixation
+        fixated_by_interval = fixated[..., None].expand(-1, -1, intervals).flatten(1)
+        weights = steps * fixated_by_interval
+        passed = _passed(_NEAR, distance).flatten(1, 2)  # (B, fixations · intervals, N)
         by_distance = (weights[:, None] @ passed)[:, 0]
         at_fixations = (tables[:, 0] * fixated).sum(1)
         return bias + by_distance + at_fixations[:, None]
@@ -150,4 +154,6 @@ def _norm(vectors: Tensor) -> Tensor:
 def _passed(knots: tuple[float, ...], distance: Tensor) -> Tensor:
     """Compute the share of each interval between K knots that distances `(..., N)` have passed, `(..., K - 1, N)`."""
     knot = distance.new_tensor(knots)
-    return ((distance[..., None, :] - knot[:-1, None]) / knot.diff()[:, None]).clamp(0, 1)
+    beyond_knot = distance[..., None, :] - knot[:-1, None]
+    width = knot.diff()[:, None]
+    return (beyond_knot / width).clamp(0, 1)

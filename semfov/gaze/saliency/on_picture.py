@@ -70,11 +70,12 @@ def on_picture(
     Returns:
         `(B, U, rows, columns)`.
     """
+    rows, columns = cells
     vertical, horizontal = sides_of(features, shape)
-    if _interpolates(vertical, cells[0]):
-        values = _line(vertical, cells[0], values) @ values
-    if _interpolates(horizontal, cells[1]):
-        values = values @ _line(horizontal, cells[1], values).mT
+    if _interpolates(vertical, rows):
+        values = _line(vertical, rows, values) @ values
+    if _interpolates(horizontal, columns):
+        values = values @ _line(horizontal, columns, values).mT
     return values
 
 
@@ -107,6 +108,8 @@ def interpolation(
         `(cells, length)`, whose rows sum to 1.
     """
     centres = torch.arange(cells, device=device, dtype=dtype) + 0.5
-    place = (start + centres * ((end - start) / cells) - 0.5).clamp(0, length - 1)
+    step = (end - start) / cells
+    place = (start + centres * step - 0.5).clamp(0, length - 1)
     pixels = torch.arange(length, device=device, dtype=dtype)
-    return (1 - (place[:, None] - pixels).abs()).clamp(min=0)
+    distance = (place[:, None] - pixels).abs()  # (cells, length)
+    return (1 - distance).clamp(min=0)

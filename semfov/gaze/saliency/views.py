@@ -53,7 +53,8 @@ class PictureView(NamedTuple):
 def _ramp(cells: int) -> Tensor:
     """Compute the weights of cells along a side."""
     place = torch.arange(cells) + 0.5
-    return (torch.minimum(place, cells - place) / max(cells * _EDGE, 1.0)).clamp(max=1)
+    from_edge = torch.minimum(place, cells - place)
+    return (from_edge / max(cells * _EDGE, 1.0)).clamp(max=1)
 
 
 def views_of(cells: tuple[int, int], quality: Quality, *, panorama: bool = False) -> list[PictureView]:
