@@ -90,9 +90,16 @@ class SceneObserver(Observer):
         """Make the belief before the first look; `grid` is the strip of all views."""
         check(batch == 1, "batch", "1, as a head has one episode at a time", batch)
         cells = len(self.views.world.scene)
+        components = 2 if self._searches else self.inner.components
         nothing = like.new_zeros(1, cells)
-        values = like.new_zeros(1, cells, 2 if self._searches else self.inner.components)
-        return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), {})
+        return SceneBelief(
+            values=like.new_zeros(1, cells, components),
+            closest=nothing + torch.inf,
+            owner=nothing.long() - 1,  # no pose
+            examined=nothing.bool(),
+            looks=like.new_zeros(1),
+            views={},
+        )
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
         """Weigh a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
@@ -118,15 +125,15 @@ class SceneObserver(Observer):
         if before is None:
             before = self.inner.start(1, views.view_grid, values)
         view = self.inner.update(before, look.inner)
-        probabilities = views.spread(self._probabilities(view, look.target), pose).mT
-        cells = views.visible[pose]
+        cells = views.visible[pose]  # (V,), of the scene
+        probabilities = views.spread(self._probabilities(view, look.target), pose).mT  # (V, C)
+        closest_so_far = belief.closest[0, cells]
         is_owner = belief.owner[0, cells] == pose
-        nearest = torch.minimum(
-            views.distances[pose][int(look.cell)],
-            torch.where(is_owner, belief.closest[0, cells], torch.inf),
-        )
+        # The distances of this gaze, and of earlier ones in the same view.
+        distance = views.distances[pose][int(look.cell)]
+        nearest = torch.minimum(distance, torch.where(is_owner, closest_so_far, torch.inf))
         # The view takes the cells to which its gaze came closest, and renews those that it had.
-        takes = (nearest <= belief.closest[0, cells]) | is_owner
+        takes = (nearest <= closest_so_far) | is_owner
         taken = cells[takes]
         values = values.clone()
         closest = belief.closest.clone()
@@ -154,10 +161,10 @@ class SceneObserver(Observer):
         if keep == 1:
             return belief
         cells = self.views.cells
-        views = {
-            pose: self.inner.fade(view, look.inner, keep, visited[:, pose * cells : (pose + 1) * cells])
-            for pose, view in belief.views.items()
-        }
+        views = {}
+        for pose, view in belief.views.items():
+            visited_in_view = visited[:, pose * cells : (pose + 1) * cells]
+            views[pose] = self.inner.fade(view, look.inner, keep, visited_in_view)
         examined = torch.zeros_like(belief.examined)
         examined[0, self.views.gaze_cell[visited[0]]] = True
         unseen = self._unseen(look.target, belief.values)

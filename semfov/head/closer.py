@@ -63,8 +63,9 @@ class CloserLooks:
         points = views.world.to_scene(middles, pose)
         cells = views.world.scene.cell_of(views.world.pixels_of(points)).tolist()
         # The sides of boxes as shares of those of the view.
-        shares = (boxes[:, 2:] - boxes[:, :2]) / boxes.new_tensor(views.world.size)
-        extents = (shares.amax(-1) * field).tolist()
+        sides = boxes[:, 2:] - boxes[:, :2]
+        shares = sides / boxes.new_tensor(views.world.size)
+        extents = (shares.amax(-1) * field).tolist()  # in degrees, about
         for cell, point, extent in zip(cells, points, extents, strict=True):
             self._places[cell] = _Place(point, self._field_around(extent))
 
@@ -74,9 +75,10 @@ class CloserLooks:
         Returns:
             Boxes `(M, 4)` and their middles `(M, 2)`, in pixels of the view.
         """
-        class_scores = detections.scores[0]
+        class_scores = detections.scores[0]  # (L, K+1)
         scores = class_scores[:, 1:].amax(-1) if self.target is None else class_scores[:, self.target]
-        boxes = detections.boxes[0, detections.mask[0] & (scores >= _FAINTEST)]
+        may_show = detections.mask[0] & (scores >= _FAINTEST)
+        boxes = detections.boxes[0, may_show]
         size = boxes.new_tensor(self.views.world.size)
         middles = (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5
         inside = ((middles >= -0.5) & (middles <= size - 0.5)).all(-1)
@@ -109,7 +111,8 @@ class CloserLooks:
         self._cells = dict(zip(actions, cells, strict=True))
         values = torch.full((len(views.grid),), OUT)
         if actions:
-            values[torch.tensor(actions)] = self._gains(belief, here, torch.tensor(actions), torch.tensor(cells))
+            numbers = torch.tensor(actions)
+            values[numbers] = self._gains(belief, here, numbers, torch.tensor(cells))
         return values
 
     def _gains(self, belief: SceneBelief, here: int, actions: Tensor, cells: Tensor) -> Tensor:

@@ -79,7 +79,9 @@ def live(eye: Eye, views: Views) -> Detect:
         opened = number, frame
         if real_pose is pose:
             return look(frame, point)
-        detections = look(frame, world.to_view(views.gaze[action][None], real_pose)[0])
+        # A head may stop beside the pose that it was sent to: it fixates the point, and the boxes are moved.
+        real_point, _ = world.to_view(views.gaze[action][None], real_pose)
+        detections = look(frame, real_point)
         return replace(detections, boxes=_moved_boxes(detections.boxes, world, real_pose, pose))
 
     return detect
@@ -88,7 +90,8 @@ def live(eye: Eye, views: Views) -> Detect:
 def _moved_boxes(boxes: Tensor, world: World, from_pose: Tensor, to_pose: Tensor) -> Tensor:
     """Move boxes `(..., 4)` of the view from one pose to that from another: the smallest around their corners there."""
     x1, y1, x2, y2 = boxes.unbind(-1)
-    corners = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], -1).unflatten(-1, (4, 2))
+    clockwise = [x1, y1, x2, y1, x2, y2, x1, y2]
+    corners = torch.stack(clockwise, -1).unflatten(-1, (4, 2))  # (..., 4, 2)
     in_scene = world.to_scene(corners.reshape(-1, 2) - 0.5, from_pose)
     in_view, _ = world.to_view(in_scene, to_pose)
     moved = in_view.view(corners.shape) + 0.5

@@ -35,11 +35,13 @@ def was_fixated(belief: SceneBelief, world: World) -> Tensor:
     Returns:
         `(S,)`, boolean.
     """
-    chance = belief.probability(0)[0]
+    chance = belief.probability(0)[0]  # (S,)
     fixated = torch.where(belief.examined[0], chance, 0.0).view(1, 1, world.scene.rows, world.scene.columns)
     # In a panorama the first and the last column are neighbours.
-    around = F.pad(fixated, (1, 1, 0, 0), mode="circular" if world.closed else "constant")
-    return F.max_pool2d(F.pad(around, (0, 0, 1, 1)), 3, 1).flatten() >= chance
+    with_neighbours = F.pad(fixated, (1, 1, 0, 0), mode="circular" if world.closed else "constant")
+    padded = F.pad(with_neighbours, (0, 0, 1, 1))
+    largest_around = F.max_pool2d(padded, kernel_size=3, stride=1).flatten()
+    return largest_around >= chance
 
 
 class LookGain(nn.Module):
@@ -107,14 +109,16 @@ class SearchGain(LookGain):
             `(A,)`, in probabilities of a find; the values of actions from other poses have no meaning.
         """
         views = self.views
-        chance = belief.probability(0)[0]
-        sharpness = views.acuity(belief.closest[0])
+        chance = belief.probability(0)[0]  # (S,), P(t ∈ x)
+        sharpness = views.acuity(belief.closest[0])  # (S,), a(d*)
         weighted = chance * views.world.area
-        found = torch.where(was_fixated(belief, views.world), 0.0, chance)[views.gaze_cell]
+        new_chance = torch.where(was_fixated(belief, views.world), 0.0, chance)
+        found = new_chance[views.gaze_cell]  # (A,)
         gains = torch.zeros_like(found)
         for pose in poses:
             cells = views.visible[pose]
-            sharper = (self._acuity[pose] - sharpness[cells]).clamp(min=0) @ weighted[cells]
+            gain_in_sharpness = (self._acuity[pose] - sharpness[cells]).clamp(min=0)  # (cells, V)
+            sharper = gain_in_sharpness @ weighted[cells]
             actions = slice(pose * views.cells, (pose + 1) * views.cells)
             gains[actions] = found[actions] + self.foresight * sharper
         return gains
@@ -154,8 +158,9 @@ class ExploreGain(LookGain):
         self.unseen = unseen
         side = views.view_grid.columns
         # After a turn the eye lands near the corners, the sides or the middle of a view.
-        places = torch.tensor([side // 5, side // 2, side - 1 - side // 5])
-        self._landings = (places[:, None] * side + places).flatten()
+        margin = side // 5
+        places = torch.tensor([margin, side // 2, side - 1 - margin])
+        self._landings = (places[:, None] * side + places).flatten()  # (9,), cells
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
         """Compute the expected gain of each action.
@@ -180,7 +185,7 @@ class ExploreGain(LookGain):
             is_seen_here = is_seen[cells]
             if bool(is_seen_here.any()):
                 seen = cells[is_seen_here]
-                distance = views.distances[pose][fixated][:, is_seen_here]
+                distance = views.distances[pose][fixated][:, is_seen_here]  # (fixated, seen)
                 corrected = corrected_cells(probabilities[:, seen], belief.closest[:, seen], distance, views.fovea)[0]
                 gain = gain + corrected @ views.world.area[seen]
             gains[pose * views.cells + fixated] = gain
@@ -234,12 +239,14 @@ class PerSecond(AcquisitionFunction):
             `(1, A)`, expected gains per second; `OUT` for actions that must not be chosen.
         """
         views = self.gain.views
-        values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, self.poses)
-        allowed = torch.zeros(len(views), dtype=torch.bool)
+        present_pose = self.action // views.cells
+        values = self.gain(own(belief, SceneBelief, "belief"), present_pose, self.poses)
+        allowed = torch.zeros(len(views), dtype=torch.bool)  # by pose
         allowed[self.poses] = True
         if self.speeds is not None:
             values = values / views.durations(self.action, self.speeds)
-            pose = views.poses[self.action // views.cells]
+            pose = views.poses[present_pose]
             turn = views.world.turn(pose.expand_as(views.poses), views.poses)
             allowed &= self.speeds.makes(turn)
-        return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]
+        allowed_actions = allowed.repeat_interleave(views.cells)
+        return torch.where(allowed_actions, values, OUT)[None]

@@ -105,8 +105,11 @@ class OnvifClient:
             element = answer.find(f".//{{{_TYPES}}}{name}/{{{_TYPES}}}XAddr")
             if element is None or not element.text:
                 raise DataError(f"camera: expected a camera with the service {name}, got one without it")
-            # A camera behind a router gives its own address, at which it cannot be reached from here.
-            found[name] = urlunsplit(urlsplit(self.address)[:2] + urlsplit(element.text.strip())[2:])
+            # A camera behind a router gives its own address, at which it cannot be reached from here: scheme and host
+            # are those that it answers at.
+            device = urlsplit(self.address)
+            service = urlsplit(element.text.strip())
+            found[name] = urlunsplit(service._replace(scheme=device.scheme, netloc=device.netloc))
         return found
 
     def call(self, address: str, body: str) -> XML.Element:
@@ -162,7 +165,9 @@ class OnvifClient:
         """Make the header that names a user, with a digest of the password for this message alone."""
         nonce = os.urandom(16)
         created = (datetime.now(UTC) + (self._ahead or timedelta())).strftime("%Y-%m-%dT%H:%M:%SZ")
-        digest = base64.b64encode(hashlib.sha1(nonce + created.encode() + self.password.encode()).digest()).decode()
+        # WS-Security UsernameToken: the digest of nonce, time and password, in this order.
+        secret = nonce + created.encode() + self.password.encode()
+        digest = base64.b64encode(hashlib.sha1(secret).digest()).decode()
         secext, utility = f"{_SECURITY}wssecurity-secext-1.0.xsd", f"{_SECURITY}wssecurity-utility-1.0.xsd"
         kind = f"{_SECURITY}username-token-profile-1.0#PasswordDigest"
         return (
@@ -299,13 +304,12 @@ class OnvifCamera(PanTiltCamera):
         Returns:
             The position.
         """
-        left, right = self.pan
-        down, up = self.tilt
-        pan = 2 * (direction[0] - left) / (right - left) - 1
-        tilt = 2 * (direction[1] - down) / (up - down) - 1
-        wide = _focal(self.fields[-1])
-        narrow = _focal(self.fields[0])
-        zoom = (_focal(field) - wide) / (narrow - wide) if narrow > wide else 0.0
+        # Pan and tilt run from -1 to 1 between the limits, zoom from 0 at the shortest focal length to 1.
+        pan = 2 * _share(direction[0], self.pan) - 1
+        tilt = 2 * _share(direction[1], self.tilt) - 1
+        shortest = _focal(self.fields[-1])
+        longest = _focal(self.fields[0])
+        zoom = _share(_focal(field), (shortest, longest)) if longest > shortest else 0.0
         return Position(pan, tilt, zoom)
 
     def direction_of(self, position: Position) -> tuple[tuple[float, float], float]:
@@ -321,9 +325,9 @@ class OnvifCamera(PanTiltCamera):
         down, up = self.tilt
         pan = left + (position.pan + 1) / 2 * (right - left)
         tilt = down + (position.tilt + 1) / 2 * (up - down)
-        wide = _focal(self.fields[-1])
-        narrow = _focal(self.fields[0])
-        focal = wide + position.zoom * (narrow - wide)
+        shortest = _focal(self.fields[-1])
+        longest = _focal(self.fields[0])
+        focal = shortest + position.zoom * (longest - shortest)
         return (pan, tilt), 2 * math.degrees(math.atan(1 / focal))
 
     def where(self) -> Position:
@@ -340,12 +344,12 @@ class OnvifCamera(PanTiltCamera):
     def _status(self) -> tuple[Position, bool | None]:
         """Ask for the position, and whether the camera moves; None where it does not say."""
         answer = self._command("GetStatus")
-        turned = answer.find(f".//{{{_TYPES}}}PanTilt[@x]")
-        if turned is None:
+        pan_and_tilt = answer.find(f".//{{{_TYPES}}}PanTilt[@x]")
+        if pan_and_tilt is None:
             raise DataError("camera: expected its position, got a status without pan and tilt")
-        pan = _number(turned, "x")
-        tilt = _number(turned, "y")
-        units = turned.get("space", "")
+        pan = _number(pan_and_tilt, "x")
+        tilt = _number(pan_and_tilt, "y")
+        units = pan_and_tilt.get("space", "")
         is_generic = not units or units.endswith("/PositionGenericSpace")
         if not is_generic or max(abs(pan), abs(tilt)) > _BEYOND:
             expected = "its position from -1 to 1 (the generic space of ONVIF)"
@@ -438,6 +442,12 @@ def _is_moving(status: XML.Element) -> bool | None:
 def _focal(field: float) -> float:
     """Focal length in halves of the width of a frame."""
     return 1 / math.tan(math.radians(field) / 2)
+
+
+def _share(value: float, limits: tuple[float, float]) -> float:
+    """Tell where a value lies between two limits, from 0 at the first to 1 at the second."""
+    first, second = limits
+    return (value - first) / (second - first)
 
 
 def _number(element: XML.Element, name: str) -> float:

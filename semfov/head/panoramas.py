@@ -126,15 +126,16 @@ class Panoramas(ComposedScenes):
         camera = Camera(torch.tensor(patch.pose), _SLOT)
         image = self._resized(patch, camera)
         columns, rows = self._pixels_around(patch, camera)
-        pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()
+        pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()  # (rows, columns, 2)
         directions = panorama_directions(pixels.flatten(0, 1), self.size)
-        points, _ = camera.points(directions)
+        points, _ = camera.points(directions)  # (rows · columns, 2)
         x1, y1, x2, y2 = patch.box
         low = points.new_tensor([x1, y1]) - 0.5
         high = points.new_tensor([x2, y2]) - 0.5
         inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
         # Places in the photograph as `grid_sample` takes them, from -1 to 1; far ones, behind the camera, are unused.
-        place = (2 * (points - low) / (high - low) - 1).nan_to_num().clamp(-2, 2).view(1, *inside.shape, 2)
+        place = 2 * (points - low) / (high - low) - 1
+        place = place.nan_to_num().clamp(-2, 2).view(1, *inside.shape, 2)
         projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
         row, column = inside.nonzero().unbind(-1)
         canvas[:, rows[row], columns[column]] = projection[:, row, column]
@@ -173,9 +174,11 @@ class Panoramas(ComposedScenes):
             annotation = self.scenes.annotation(patch.scene)
             x1, y1, x2, y2 = patch.box
             width, height = annotation.size
-            scale = annotation.boxes.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
-            boxes.append(annotation.boxes * scale + annotation.boxes.new_tensor([x1, y1] * 2))
-            poses.append(torch.tensor([patch.pose]).expand(len(annotation.boxes), 3))
+            boxes_in_photograph = annotation.boxes  # (M, 4)
+            scale = boxes_in_photograph.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
+            corner = boxes_in_photograph.new_tensor([x1, y1] * 2)
+            boxes.append(boxes_in_photograph * scale + corner)
+            poses.append(torch.tensor([patch.pose]).expand(len(boxes_in_photograph), 3))
         return Regions(torch.cat(boxes), Camera(torch.cat(poses), _SLOT))
 
     def annotation(self, index: int) -> Annotation:

@@ -66,8 +66,7 @@ def check_limits(name: str, limits: Sequence[float]) -> None:
         InputError: they are not.
     """
     is_pair = isinstance(limits, Sequence) and len(limits) == 2
-    are_numbers = is_pair and all(isinstance(limit, Real) and math.isfinite(limit) for limit in limits)
-    check(are_numbers, name, "a pair of limits in degrees", limits)
+    check(is_pair and all(map(_is_finite, limits)), name, "a pair of limits in degrees", limits)
     check_degrees(name, limits)
 
 
@@ -83,11 +82,17 @@ def check_fields(fields: Sequence[float]) -> tuple[float, ...]:
     Raises:
         InputError: they are not.
     """
-    are_numbers = isinstance(fields, Sequence) and len(fields) > 0 and all(is_number(field) for field in fields)
-    are_angles = are_numbers and min(fields) > 0 and max(fields) < 180 and list(fields) == sorted(fields)
+    are_numbers = isinstance(fields, Sequence) and len(fields) > 0 and all(map(is_number, fields))
+    ascend = are_numbers and list(fields) == sorted(fields)
+    are_angles = ascend and fields[0] > 0 and fields[-1] < 180
     check(are_angles, "fields", "one or more angles below 180 degrees, narrowest first, such as (60.0,)", fields)
     check_degrees("fields", fields)
-    return tuple(float(field) for field in fields)
+    return tuple(map(float, fields))
+
+
+def _is_finite(value: object) -> bool:
+    """Tell whether a value is a number, and finite."""
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 class _Scene:
@@ -217,8 +222,10 @@ class Sphere(_Scene):
 
     def angles_of(self, points: Tensor) -> Tensor:
         """Compute pan from -180 to 180 degrees, and tilt, of a head that turns to directions `(N, 3)`; → `(N, 2)`."""
-        x, y, z = points.unbind(-1)
-        return torch.rad2deg(torch.stack([torch.atan2(x, z), torch.atan2(-y, torch.hypot(x, z))], -1))
+        x, y, z = points.unbind(-1)  # to the right, down and ahead
+        pan = torch.atan2(x, z)
+        tilt = torch.atan2(-y, torch.hypot(x, z))
+        return torch.rad2deg(torch.stack([pan, tilt], -1))
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
         """Compute by which angle the head turns from one pose to another.
@@ -261,7 +268,9 @@ class Sphere(_Scene):
             Rings of poses `(3,)`, of which every second pose of every second ring tiles the scene.
         """
         width, height = self.size
-        field_up = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * height / width))
+        # Of a flat image, the tangents of half the fields are in proportion to its sides.
+        half_across = math.tan(math.radians(field / 2))
+        field_up = 2 * math.degrees(math.atan(half_across * height / width))
         down, up = self.tilt
         middle = (down + up) / 2
         reach = (up - down) / 2
@@ -281,7 +290,8 @@ class Sphere(_Scene):
         left, right = self.pan
         width = min(right - left, 360)
         # Two for each window that fits, rounded up, but for the error of the division.
-        count = 2 * math.ceil(width * math.cos(math.radians(tilt)) / field - 1e-9)
+        length = width * math.cos(math.radians(tilt))
+        count = 2 * math.ceil(length / field - 1e-9)
         # The ends of an arc are both poses; those of a ring are the same one.
         steps = range(count if self.around else count + 1)
         return [width * step / max(count, 1) + left for step in steps]
@@ -354,7 +364,8 @@ class Panorama(Sphere):
         pixels: Tensor | None = None
         if not isinstance(image, tuple):
             pixels = as_image(image, color=color)
-            width, height = image = pixels.shape[-1], pixels.shape[-2]
+            image = (pixels.shape[-1], pixels.shape[-2])
+            width, height = image
             if abs(width / height - 2) > 0.1:
                 warnings.warn(
                     f"image: expected a panorama of 360 by 180 degrees, which is twice as wide as high, got {width} × "
@@ -363,8 +374,10 @@ class Panorama(Sphere):
                 )
         super().__init__(image, size, tilt=(-reach, reach), fields=fields, speeds=speeds, cell=cell)
         self.reach = reach
-        self._source = None if pixels is None else go_around(pixels)
-        self._drawn = None if self._source is None else self._source[:, 1:-1, 1:-1]
+        self._source: Tensor | None = None
+        if pixels is not None:
+            self._source = go_around(pixels)
+            self._drawn = self._source[:, 1:-1, 1:-1]  # without the border
 
     def view(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Render the view of the camera."""
@@ -386,20 +399,24 @@ class _Plane(_Scene):
         cell: float,
     ) -> None:
         self.fields = check_fields(fields)
-        self.picture = width, height = picture
+        self.picture = picture
+        width, height = picture
         if degree is None:
-            degree = min(640 / 60, min(width, height * size[0] / size[1]) / max(fields))
+            widest = min(width, height * size[0] / size[1])  # pixels across of the largest view in the picture
+            degree = min(640 / 60, widest / max(fields))
         check(degree > 0, "degree", "a positive number of pixels", degree)
         check(cell > 0, "cell", "a positive number of degrees", cell)
         self.size = size
         self.cell = cell
         self.degree = degree
         self.speeds = Speeds() if speeds is None else speeds
-        across = width / degree / 2
-        up = height / degree / 2
-        self.pan = (-across, across)
-        self.tilt = (-up, up)
-        self.scene = Grid(max(1, round(2 * across / cell)), max(1, round(2 * up / cell)), self.picture)
+        half_width = width / degree / 2  # in degrees
+        half_height = height / degree / 2
+        self.pan = (-half_width, half_width)
+        self.tilt = (-half_height, half_height)
+        columns = max(1, round(2 * half_width / cell))
+        rows = max(1, round(2 * half_height / cell))
+        self.scene = Grid(columns, rows, self.picture)
         self.centres = self.scene.centres
         self.area = torch.ones(len(self.scene))
 
@@ -426,7 +443,8 @@ class _Plane(_Scene):
         size = points.new_tensor(self.size)
         extent = points.new_tensor([x2 - x1, y2 - y1])
         # Points count from the centres of pixels, and windows from their edges, half a pixel before.
-        pixels = (points + 0.5 - points.new_tensor([x1, y1])) * size / extent - 0.5
+        in_window = points + 0.5 - points.new_tensor([x1, y1])
+        pixels = in_window * size / extent - 0.5
         is_inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(-1)
         return pixels, is_inside
 
@@ -446,7 +464,8 @@ class _Plane(_Scene):
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
         """Compute the distance between the middles of two windows."""
-        return torch.linalg.vector_norm(one[..., :2] - other[..., :2], dim=-1)
+        offset = one[..., :2] - other[..., :2]  # of pan and tilt; the third number is the field of view
+        return torch.linalg.vector_norm(offset, dim=-1)
 
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
         """Compute the distance between the points that two pixels show, in degrees."""
@@ -463,7 +482,7 @@ class _Plane(_Scene):
         check(is_inside, "field", expected, got)
         pans = self._middles(picture_width, width)
         # Pixels count down, and tilts up.
-        tilts = [-down for down in self._middles(picture_height, height)]
+        tilts = [-middle for middle in self._middles(picture_height, height)]
         return [[torch.tensor([pan, tilt, field]) for pan in pans] for tilt in tilts]
 
     def _middles(self, length: int, side: float) -> list[float]:
@@ -484,7 +503,9 @@ class _Plane(_Scene):
         return Boxes(self.boxes(boxes, pose))
 
     def boxes(self, boxes: Tensor, pose: Tensor) -> Tensor:
-        return (self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5).view(-1, 4)
+        corners = boxes.reshape(-1, 2) - 0.5  # edges lie half a pixel before the centres that points count from
+        corners_in_scene = self.to_scene(corners, pose)
+        return (corners_in_scene + 0.5).view(-1, 4)
 
 
 def _limited(angle: float, most: float) -> float:
@@ -540,7 +561,9 @@ class Flat(_Plane):
         if self.opened is None:
             return super().view(pose)
         pixels = self.opened.read(self._box(pose)).float()[None] / 255
-        return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1), pose
+        width, height = self.size
+        view = F.interpolate(pixels, (height, width), mode="bilinear", antialias=True)[0]
+        return view.clamp(0, 1), pose
 
 
 World = Sphere | _Plane  # a scene of either kind: both have the same methods

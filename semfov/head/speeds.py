@@ -75,7 +75,9 @@ class Speeds:
             `(...)`, seconds; 0 where the head stays.
         """
         angle = torch.where(angle > _STILL, angle, 0.0)
-        reaches_speed = self.head**2 / self.acceleration  # degrees after which the head has its full speed, and stops
+        # Half of a short turn is accelerated, and half is slowed down. `reaches_speed` degrees are the shortest turn in
+        # which the head has its full speed for a moment.
+        reaches_speed = self.head**2 / self.acceleration
         accelerated = 2 * (angle / self.acceleration).sqrt()
         cruising = angle / self.head + self.head / self.acceleration
         return torch.where(angle <= reaches_speed, accelerated, cruising)
@@ -102,6 +104,9 @@ class Speeds:
         Returns:
             `(...)`, seconds.
         """
+        octaves = octaves.abs()
+        # Eye, head and lens move at the same time.
         slowest = torch.maximum(self.saccade(eye), self.turn(head))
-        moves = (head > _STILL) | (octaves.abs() > _STILL)
-        return self.look + torch.maximum(slowest, self.zoom * octaves.abs()) + self.settle * moves
+        slowest = torch.maximum(slowest, self.zoom * octaves)
+        moves = (head > _STILL) | (octaves > _STILL)
+        return self.look + slowest + self.settle * moves

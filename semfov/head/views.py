@@ -52,7 +52,7 @@ class Views:
         rows = world.poses(fields[-1])
         self.poses = torch.stack([pose for row in rows for pose in row])
         self.lattice = len(self.poses)
-        # Every second pose of every second row tiles the scene.
+        # Poses are half a view apart, so that every second pose of every second row tiles the scene.
         numbers = torch.arange(self.lattice).split([len(row) for row in rows])
         self.tiling = [numbers_of_row[::2].tolist() for numbers_of_row in numbers[::2]]
         width, height = world.size
@@ -63,7 +63,8 @@ class Views:
         self.gaze = torch.cat([world.to_scene(centres, pose) for pose in self.poses])
         self.gaze_cell = world.scene.cell_of(world.pixels_of(self.gaze))
         # For each field of view, angles between the cells of a view, `(cells, cells)`.
-        self._shifts = torch.stack([world.shift(centres[:, None], centres[None], field) for field in fields])
+        shifts = [world.shift(centres[:, None], centres[None], field) for field in fields]
+        self._shifts = torch.stack(shifts)
         self._field_numbers = [len(fields) - 1] * self.lattice
         self.visible: list[Tensor] = []
         self.points: list[Tensor] = []
@@ -194,15 +195,16 @@ class Views:
         Returns:
             `(C, V)`.
         """
-        image = values.unflatten(-1, (_POINTS, _POINTS))[None]
+        image = values.unflatten(-1, (_POINTS, _POINTS))[None]  # (1, C, rows, columns)
         shares = (self.points[pose] + 0.5) / self.view_grid.extent
-        place = (2 * shares - 1)[None, None].to(values)  # from -1 to 1, as `grid_sample` takes them
+        place = (2 * shares - 1)[None, None].to(values)  # (1, 1, V, 2), from -1 to 1, as `grid_sample` takes them
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 
     def _distances(self, pose: Tensor, points: Tensor) -> Tensor:
         """Distance `(cells, V)` from each cell of a view to those seen; d in a view narrower by r is r (σ + d) - σ."""
-        ratio = float(pose[2]) / self.fields[-1]
-        distance = torch.cdist(self.view_grid.centres, points) / self.view_grid.extent.amax()
+        ratio = float(pose[2]) / self.fields[-1]  # r
+        pixels = torch.cdist(self.view_grid.centres, points)
+        distance = pixels / self.view_grid.extent.amax()
         return ratio * (self.fovea + distance) - self.fovea
 
     def acuity(self, distance: Tensor) -> Tensor:
@@ -231,5 +233,6 @@ class Views:
         head = self.world.turn(pose.expand_as(self.poses), self.poses)
         octaves = (self.poses[:, 2] / pose[2]).log2()
         # The angle of the saccade is measured in the field of view of the new pose.
-        eye = self._shifts[:, cell][torch.tensor(self._field_numbers)]
+        shifts_from_cell = self._shifts[:, cell]  # (fields, cells)
+        eye = shifts_from_cell[torch.tensor(self._field_numbers)]  # (poses, cells)
         return speeds.duration(eye, head[:, None], octaves[:, None]).flatten()
