@@ -41,13 +41,6 @@ Each takes at most about 25 ns for a number that it reads or writes, and less th
 counted, on one core. Others, such as those with inner graphs, of text, or with a search in them, are open-ended.
 """
 
-_OF_SHAPES = frozenset(
-    ("Concat", "Gather", "Slice", "Cast", "Squeeze", "Unsqueeze", "Identity", "Add", "Sub", "Mul", "Div", "Neg")
-)
-"""Operations through which shape inference follows the values of shapes."""
-
-_LENGTHS = {"Shape": 8, "Constant": _SMALL, "Range": math.inf}  # of what such operations make
-
 _Sizes = tuple[int, ...]
 _Value = TypeVar("_Value")
 
@@ -69,6 +62,23 @@ _SURE_NUMBERS = _Limit(2**28, 2**4)  # that such a pass reads or writes
 _SURE_NODES = 2**12  # that onnxruntime surely arranges in seconds
 
 
+class _Tensor(NamedTuple):
+    """A tensor whose sizes are known: its shape, and the bytes of an element."""
+
+    sizes: _Sizes
+    width: int
+
+    @property
+    def numbers(self) -> int:
+        """Number of its elements."""
+        return math.prod(self.sizes)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all its elements."""
+        return self.numbers * self.width
+
+
 @dataclass(frozen=True)
 class Budget:
     """The nodes of a model without functions, and the sizes of its tensors as far as they are known.
@@ -76,14 +86,12 @@ class Budget:
     Attributes:
         name: what messages call the model.
         graph: the nodes, and what is stored.
-        sizes: shapes by name, of the tensors whose sizes do not depend on values.
-        widths: bytes of an element, of the same tensors.
+        tensors: by name, the tensors whose sizes do not depend on values.
     """
 
     name: str
     graph: GraphProto
-    sizes: Mapping[str, _Sizes]
-    widths: Mapping[str, int]
+    tensors: Mapping[str, _Tensor]
 
     @staticmethod
     def of(model: ModelProto, canvas: tuple[int, int], name: str) -> Budget:
@@ -103,26 +111,23 @@ class Budget:
         import onnx
 
         slim = without_weights(model)
-        _forget_stated_sizes(slim.graph, canvas)
+        _fix_input_sizes(slim.graph, canvas)
+        _forget_stated_sizes(slim.graph)
         # Inference follows the values of shapes one by one, also where a model lets them grow without an end.
         is_short = _longest_shape(slim.graph, {}) <= _MOST_LENGTH
         inferred = onnx.shape_inference.infer_shapes(slim, data_prop=is_short).graph
-        sizes: dict[str, _Sizes] = {}
-        widths: dict[str, int] = {}
+        tensors: dict[str, _Tensor] = {}
         for value in (*inferred.value_info, *inferred.input, *inferred.output):
-            stated = dims(value)
-            check_elements(f"{name}: tensor {excerpt(value.name)}", stated)
+            sizes = dims(value)
+            check_elements(f"{name}: tensor {excerpt(value.name)}", sizes)
             if _has_known_sizes(value):
-                sizes[value.name] = tuple(stated)
-                widths[value.name] = _width(value.type.tensor_type.elem_type)
-        for tensor in inferred.initializer:
-            sizes[tensor.name] = tuple(tensor.dims)
-            widths[tensor.name] = _width(tensor.data_type)
+                tensors[value.name] = _Tensor(tuple(sizes), _width(value.type.tensor_type.elem_type))
+        for stored in inferred.initializer:
+            tensors[stored.name] = _Tensor(tuple(stored.dims), _width(stored.data_type))
         for sparse in model.graph.sparse_initializer:
             # Its values are those that are not 0; a node that reads it reads them all.
-            sizes[sparse.values.name] = tuple(sparse.dims)
-            widths[sparse.values.name] = _width(sparse.values.data_type)
-        return Budget(name, model.graph, sizes, widths)
+            tensors[sparse.values.name] = _Tensor(tuple(sparse.dims), _width(sparse.values.data_type))
+        return Budget(name, model.graph, tensors)
 
     def check(self, stored: int) -> None:
         """Check the memory that a pass takes.
@@ -146,27 +151,25 @@ class Budget:
         Returns:
             Whether sizes depend on values, time on other things than sizes, or a pass is long.
         """
-        if len(self.graph.node) > _SURE_NODES:
+        nodes = self.graph.node
+        # The first two come before the sums, which take longer.
+        if len(nodes) > _SURE_NODES or not all(map(self._is_bounded, nodes)):
             return True
-        for node in self.graph.node:
-            if not self._is_usual(node) or any(output and output not in self.sizes for output in node.output):
-                return True
-        products = sum(map(self._products, self.graph.node))
-        numbers = sum(map(self._numbers, self.graph.node))
+        products = sum(map(self._products, nodes))
+        numbers = sum(map(self._numbers, nodes))
         return products > _SURE_PRODUCTS.of(stored) or numbers > _SURE_NUMBERS.of(stored)
 
-    def _is_usual(self, node: NodeProto) -> bool:
-        """Tell whether the time of an operation follows from sizes."""
-        import onnx
+    def _is_bounded(self, node: NodeProto) -> bool:
+        """Tell whether the time of a node follows from sizes, and all that it makes has known ones."""
+        return _is_usual(node) and self._knows(node.output)
 
-        if node.op_type not in _USUAL or node.domain not in ("", "ai.onnx"):
-            return False
-        if node.op_type == "Cast":
-            return _attribute(node, "to", onnx.TensorProto.FLOAT) != onnx.TensorProto.STRING
-        if node.op_type == "Resize":
-            return _attribute(node, "mode", b"nearest") != b"cubic"
-        # Of more than two, results between them may be larger than all that is known.
-        return node.op_type != "Einsum" or len(node.input) <= 2
+    def _knows(self, names: Iterable[str]) -> bool:
+        """Tell whether the sizes of all tensors are known; the empty name stands for one that is left out."""
+        return self.tensors.keys() >= set(filter(None, names))
+
+    def _known(self, names: Iterable[str]) -> list[_Tensor]:
+        """List the tensors of known sizes among some."""
+        return [self.tensors[name] for name in names if name in self.tensors]
 
     def bytes(self) -> int:
         """Sum the bytes of all tensors that follow from stored ones, and the most bytes of the others at any one time.
@@ -177,19 +180,20 @@ class Budget:
         stored = {tensor.name for tensor in self.graph.initializer}
         sparse = {tensor.values.name for tensor in self.graph.sparse_initializer}
         of_image = {value.name for value in self.graph.input} - stored - sparse
-        constant = sum(map(self._bytes, sparse))
-        now = sum(map(self._bytes, of_image))
+        constant = self._bytes(sparse)
+        now = self._bytes(of_image)
         most = now
         released: Counter[int] = Counter()  # bytes by the place of the node after which nothing reads them
         for place, node in enumerate(self.graph.node):
-            new = sum(map(self._bytes, node.output))
+            new = self._bytes(node.output)
             if of_image.isdisjoint(_read(node)):
                 constant += new
                 continue
             of_image.update(node.output)
             for output in node.output:
                 end = last_readers.get(output, place)
-                released[end] += self._bytes(output)
+                released[end] += self._bytes([output])
+            # A node has all that it makes before what it reads is released.
             now += new
             most = max(most, now + self._workspace(node))
             now -= released[place]
@@ -204,54 +208,57 @@ class Budget:
         last_readers.update({output.name: len(nodes) for output in self.graph.output})
         return last_readers
 
-    def _bytes(self, name: str) -> int:
-        """Compute the bytes of a tensor; 0 where its sizes are unknown."""
-        return math.prod(self.sizes[name]) * self.widths[name] if name in self.sizes else 0
+    def _bytes(self, names: Iterable[str]) -> int:
+        """Sum the bytes of tensors; those of unknown sizes count as 0."""
+        return sum(tensor.bytes for tensor in self._known(names))
 
     def _workspace(self, node: NodeProto) -> int:
         """Compute the bytes that a transposed convolution makes of its input before it sums: all weights a place."""
-        inputs = node.input[:2]
-        are_known = self.sizes.keys() >= {*inputs}
-        if node.op_type != "ConvTranspose" or not are_known:
+        tensors = self._known(node.input[:2])
+        if node.op_type != "ConvTranspose" or len(tensors) < 2:
             return 0
-        # Image `(B, C, H, W)`, weights `(C, M, h, w)`.
-        image, weights = (self.sizes[name] for name in inputs)
-        places = math.prod(image[2:])
-        numbers_a_place = math.prod(weights[1:])
-        return places * numbers_a_place * self.widths[inputs[0]]
+        image, weights = tensors  # `(B, C, H, W)` and `(C, M, h, w)`
+        places = math.prod(image.sizes[2:])
+        numbers_a_place = math.prod(weights.sizes[1:])
+        return places * numbers_a_place * image.width
 
     def _products(self, node: NodeProto) -> int:
         """Count the multiplications of a node with products of matrices, those of numbers of 8 bytes eight times."""
-        products = _PRODUCTS.get(node.op_type)
-        names = [name for name in (*node.input, *node.output) if name]
-        if products is None or not self.sizes.keys() >= {*names}:
+        if node.op_type not in _PRODUCTS or not self._knows([*node.input, *node.output]):
             return 0
-        inputs = [self.sizes.get(name, ()) for name in node.input]
-        slowness = 8 if self.widths[node.input[0]] == 8 else 1
-        return slowness * products(node, inputs, self.sizes[node.output[0]])
+        left_out = _Tensor((), 0)  # an input without a name, such as a bias
+        inputs = [self.tensors.get(name, left_out) for name in node.input]
+        sizes = [tensor.sizes for tensor in inputs]
+        products = _PRODUCTS[node.op_type](node, sizes, self.tensors[node.output[0]].sizes)
+        slowness = 8 if inputs[0].width == 8 else 1
+        return slowness * products
 
     def _numbers(self, node: NodeProto) -> int:
         """Count the numbers that a node reads and writes, also those of a pool's kernel and between two steps."""
-        names = [name for name in (*node.input, *node.output) if name in self.sizes]
-        numbers = sum(math.prod(self.sizes[name]) for name in names)
-        if node.op_type in ("MaxPool", "AveragePool") and node.output[0] in self.sizes:
+        tensors = self._known([*node.input, *node.output])
+        numbers = sum(tensor.numbers for tensor in tensors)
+        if node.op_type in ("MaxPool", "AveragePool") and node.output[0] in self.tensors:
             kernel = math.prod(_attribute(node, "kernel_shape", ()))
-            comparisons = math.prod(self.sizes[node.output[0]]) * kernel
+            comparisons = self.tensors[node.output[0]].numbers * kernel
             numbers += comparisons // 16  # each takes less time than a number
         workspace = self._workspace(node)
         if workspace:
-            numbers += workspace // self.widths[node.input[0]]
+            numbers += workspace // self.tensors[node.input[0]].width
         return numbers
 
 
-def _forget_stated_sizes(graph: GraphProto, canvas: tuple[int, int]) -> None:
-    """Give inputs the sizes of one image `(width, height)` where they are open, and delete those of all else."""
+def _fix_input_sizes(graph: GraphProto, canvas: tuple[int, int]) -> None:
+    """Give inputs the sizes of one image `(width, height)` where they are open."""
+    width, height = canvas
     for value in graph.input:
-        kind = value.type.tensor_type
-        rank = len(kind.shape.dim)
-        usual = (1, 3, canvas[1], canvas[0]) if rank == 4 else (1,) * rank
-        for side, size in zip(kind.shape.dim, usual, strict=True):
+        sides = value.type.tensor_type.shape.dim
+        usual = (1, 3, height, width) if len(sides) == 4 else (1,) * len(sides)
+        for side, size in zip(sides, usual, strict=True):
             side.dim_value = side.dim_value or size
+
+
+def _forget_stated_sizes(graph: GraphProto) -> None:
+    """Delete what a model states of the sizes of all but its inputs, so that they are inferred."""
     for value in graph.output:
         if value.type.HasField("tensor_type"):
             value.type.tensor_type.ClearField("shape")
@@ -265,7 +272,9 @@ _Products = Callable[["NodeProto", list[_Sizes], _Sizes], int]
 def _of_matrices(_: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
     """Count a column of the second matrix for each element of the result."""
     second = inputs[1]
-    columns = output[-1] if len(second) > 1 and output else 1
+    # A vector is one column; of a matrix, the columns are the last side of the result.
+    is_matrix = len(second) > 1 and len(output) > 0
+    columns = output[-1] if is_matrix else 1
     return math.prod(output) * math.prod(second[-2:]) // max(columns, 1)
 
 
@@ -319,6 +328,39 @@ _PRODUCTS: dict[str, _Products] = {
 """Multiplications of the operations with products of matrices."""
 
 
+def _is_usual(node: NodeProto) -> bool:
+    """Tell whether the time of an operation follows from sizes."""
+    if node.op_type not in _USUAL or node.domain not in ("", "ai.onnx"):
+        return False
+    has_usual_form = _FORMS.get(node.op_type)
+    return has_usual_form is None or has_usual_form(node)
+
+
+def _makes_numbers(node: NodeProto) -> bool:
+    """Tell whether a `Cast` makes numbers; the length of texts is unknown."""
+    import onnx
+
+    return _attribute(node, "to", onnx.TensorProto.FLOAT) != onnx.TensorProto.STRING
+
+
+def _reads_few_pixels(node: NodeProto) -> bool:
+    """Tell whether a `Resize` reads a few pixels for one of its own; cubic weights take far longer."""
+    return _attribute(node, "mode", b"nearest") != b"cubic"
+
+
+def _multiplies_two(node: NodeProto) -> bool:
+    """Tell whether an `Einsum` has at most two inputs; of more, results between them may exceed all that is known."""
+    return len(node.input) <= 2
+
+
+_FORMS: dict[str, Callable[[NodeProto], bool]] = {
+    "Cast": _makes_numbers,
+    "Resize": _reads_few_pixels,
+    "Einsum": _multiplies_two,
+}
+"""Operations of which only one form is usual, with what tells it."""
+
+
 def _attribute(node: NodeProto, name: str, otherwise: _Value) -> _Value:
     """Read an attribute of a node, or a value of the same type for nodes without it."""
     import onnx
@@ -352,16 +394,32 @@ def _read(node: NodeProto) -> Iterator[str]:
             yield from _read(inner)
 
 
+def _longest(inputs: list[float]) -> float:
+    """Find the length of the longest shape that a node reads."""
+    return max(inputs, default=0.0)
+
+
+_LENGTHS: dict[str, Callable[[list[float]], float]] = {
+    "Shape": lambda _: 8.0,  # one for each side of a tensor, of which networks have fewer
+    "Constant": lambda _: float(_SMALL),
+    "Range": lambda _: math.inf,  # is computed one by one
+    "Concat": sum,  # joined to itself again and again, a shape grows without an end
+    **dict.fromkeys(
+        ("Gather", "Slice", "Cast", "Squeeze", "Unsqueeze", "Identity", "Add", "Sub", "Mul", "Div", "Neg"), _longest
+    ),
+}
+"""Lengths of what operations make that shape inference follows by its values, from the lengths of what they read."""
+
+
 def _longest_shape(graph: GraphProto, lengths: dict[str, float]) -> float:
     """Find the largest length of a shape that inference may follow; `lengths` has those of tensors around the graph."""
-    # Shapes that are joined to themselves again and again grow without an end, and a `Range` is computed one by one.
     lengths |= {tensor.name: math.prod(tensor.dims) for tensor in graph.initializer}
     longest = 0.0
     for node in graph.node:
-        inputs = [lengths.get(name, 0) for name in node.input]
-        length = _LENGTHS.get(node.op_type, 0.0)
-        if node.op_type in _OF_SHAPES:
-            length = sum(inputs) if node.op_type == "Concat" else max(inputs, default=0)
+        length = 0.0  # of what is no shape
+        if node.op_type in _LENGTHS:
+            inputs = [lengths.get(name, 0) for name in node.input]
+            length = _LENGTHS[node.op_type](inputs)
         lengths |= dict.fromkeys(node.output, length)
         longest = max(longest, length, *(_longest_shape(inner, lengths) for inner in graphs(node)))
     return longest
