@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import log2
 from typing import NamedTuple
@@ -73,29 +73,42 @@ def landmarks(steps: Sequence[NetworkStep]) -> dict[str, str]:
         The names of the steps, by those of their places and strides.
     """
     strides = {step.name: step.stride for step in steps if step.stride is not None}
-    places: dict[tuple[str, int], str] = {}
-    for stride, name in _backbone_maps(steps, strides).items():
-        places["backbone", stride] = name
-    for stride, name in _head_maps(steps, strides).items():
-        places["head", stride] = name
-    return {f"{place}{stride}": name for (place, stride), name in sorted(places.items()) if stride >= _LEAST_STRIDE}
+    names: dict[str, str] = {}
+    for place, maps in (("backbone", _backbone_maps(steps, strides)), ("head", _head_maps(steps, strides))):
+        for stride, name in sorted(maps.items()):
+            if stride >= _LEAST_STRIDE:
+                names[f"{place}{stride}"] = name
+    return names
 
 
-def _changes(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> Iterator[tuple[NetworkStep, str]]:
-    """List the steps that compute a map of another stride than one that they read, with the map that they read."""
+class _Change(NamedTuple):
+    """A map that a step computes from one of another stride, and the strides of both."""
+
+    source: str
+    from_stride: int
+    result: str
+    to_stride: int
+
+
+def _changes(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> Iterator[_Change]:
+    """List where a map is computed from one of another stride, in order of computation."""
     for step in steps:
-        for read in step.reads if step.name in strides else ():
-            if strides.get(read, strides[step.name]) != strides[step.name]:
-                yield step, read
+        if step.name not in strides:
+            continue
+        stride = strides[step.name]
+        for source in step.reads:
+            source_stride = strides.get(source, stride)  # weights are no maps, and change nothing
+            if source_stride != stride:
+                yield _Change(source, source_stride, step.name, stride)
 
 
 def _backbone_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict[int, str]:
     """Find the first map of each stride that a coarser one is computed from, or else a finer one."""
     halved: dict[int, str] = {}
     doubled: dict[int, str] = {}
-    for step, read in _changes(steps, strides):
-        maps = halved if strides[step.name] > strides[read] else doubled
-        maps.setdefault(strides[read], read)
+    for change in _changes(steps, strides):
+        maps = halved if change.to_stride > change.from_stride else doubled
+        maps.setdefault(change.from_stride, change.source)
     return {**doubled, **halved}
 
 
@@ -107,14 +120,11 @@ def _head_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict
     end = _backbone_end(steps, strides, order)
     # The first tensor that a convolution reads is its map; the others are weights.
     readers = Counter(step.reads[0] for step in steps if step.convolution and step.reads)
-    maps: dict[int, str] = {}
-    for name, stride in strides.items():
-        if not readers[name] or order[name] < end:
-            continue
-        # A map that one convolution reads does not replace one that two read, as boxes and scores come from those.
-        if readers[name] > 1 or readers[maps.get(stride, name)] == 1:
-            maps[stride] = name
-    return maps
+    later = [name for name in strides if order[name] >= end]
+    with_reader = {strides[name]: name for name in later if readers[name] > 0}
+    # Boxes and scores come from a map that two convolutions read, so that such a map replaces any other.
+    with_readers = {strides[name]: name for name in later if readers[name] > 1}
+    return {**with_reader, **with_readers}
 
 
 def _backbone_end(steps: Sequence[NetworkStep], strides: Mapping[str, int], order: Mapping[str, int]) -> int:
@@ -129,9 +139,9 @@ def _backbone_end(steps: Sequence[NetworkStep], strides: Mapping[str, int], orde
         The place.
     """
     coarsest = max(strides.values())
-    ends = [order[name] for name, stride in strides.items() if stride == coarsest]
-    ends += [order[step.name] for step, read in _changes(steps, strides) if strides[step.name] < strides[read]]
-    return min(ends)
+    ends = [name for name, stride in strides.items() if stride == coarsest]
+    ends += [change.result for change in _changes(steps, strides) if change.to_stride < change.from_stride]
+    return min(order[name] for name in ends)
 
 
 def stride_of(canvas: int, side: int) -> int:
@@ -199,25 +209,30 @@ def record_maps(modules: Mapping[str, nn.Module]) -> Iterator[dict[str, list[Ten
 
     def hook_of(name: str) -> Callable[[nn.Module, object, object], None]:
         def note(module: nn.Module, inputs: object, output: object) -> None:
-            runs[name].append(list(_maps_in(output)))
+            tensors = filter(_is_map, _tensors_in(output))
+            runs[name].append(list(tensors))
 
         return note
 
-    hooks = [module.register_forward_hook(hook_of(name)) for name, module in modules.items()]
-    try:
+    with ExitStack() as hooks:
+        for name, module in modules.items():
+            hooks.callback(module.register_forward_hook(hook_of(name)).remove)
         yield maps
         for name, parts in runs.items():
             maps[name] = [torch.cat(pieces) for pieces in zip(*parts, strict=True)]
-    finally:
-        for hook in hooks:
-            hook.remove()
 
 
-def _maps_in(output: object) -> Iterator[Tensor]:
-    """List the maps `(B, C, h, w)` in what a module returns, in order."""
+def _is_map(tensor: Tensor) -> bool:
+    """Tell whether a tensor has the form of a map, `(B, C, h, w)`."""
+    return tensor.ndim == 4 and tensor.is_floating_point()
+
+
+def _tensors_in(output: object) -> Iterator[Tensor]:
+    """List the tensors in what a module returns, which may be nested, in order."""
+    if isinstance(output, Mapping):
+        output = tuple(output.values())
     if isinstance(output, Tensor):
-        if output.ndim == 4 and output.is_floating_point():
-            yield output
-    elif isinstance(output, Mapping | list | tuple):
-        for part in output.values() if isinstance(output, Mapping) else output:
-            yield from _maps_in(part)
+        yield output
+    elif isinstance(output, list | tuple):
+        for part in output:
+            yield from _tensors_in(part)

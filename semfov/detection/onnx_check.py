@@ -88,12 +88,19 @@ def _tensors(message: Message) -> Iterator[TensorProto]:
         return
     if isinstance(message, onnx.SparseTensorProto):
         yield onnx.TensorProto(name=message.values.name, dims=message.dims)
+    for part in _parts(message):
+        yield from _tensors(part)
+
+
+def _parts(message: Message) -> Iterator[Message]:
+    """List the parts of a part of a model that hold tensors."""
     for field, value in message.ListFields():
         if field.message_type is None or field.message_type.name not in _HOLDERS:
             continue
-        is_repeated = not hasattr(value, "ListFields")
-        for part in value if is_repeated else [value]:
-            yield from _tensors(part)
+        if hasattr(value, "ListFields"):
+            yield value
+        else:  # the field is repeated
+            yield from value
 
 
 def places_of_weights(tensors: Iterable[TensorProto]) -> set[str]:

@@ -158,11 +158,12 @@ def names_beside(path: Path) -> list[str] | None:
     """
     for name, read_names in _NAMES_BESIDE.items():
         names_file = path.with_name(name)
-        if names_file.is_file():
-            text = read_text(names_file, most=_MOST_BYTES)
-            names = _texts(read_names(text))
-            if names and all(map(is_plain, names)):
-                return names
+        if not names_file.is_file():
+            continue
+        text = read_text(names_file, most=_MOST_BYTES)
+        names = _texts(read_names(text))
+        if names and all(map(is_plain, names)):
+            return names
     return None
 
 
@@ -181,7 +182,7 @@ def _names_in_yaml(text: str) -> list[str | int]:
         content = yaml.load(text, _TextsAndNull)  # noqa: S506 (it makes texts alone)
     except (yaml.YAMLError, RecursionError, ValueError):
         return []
-    return _listed(content.get("names")) if isinstance(content, Mapping) else []
+    return _names_under("names", content)
 
 
 def _names_in_config(text: str) -> list[str | int]:
@@ -190,7 +191,12 @@ def _names_in_config(text: str) -> list[str | int]:
         content = json.loads(text)
     except (RecursionError, ValueError):
         return []
-    return _listed(content.get("id2label")) if isinstance(content, Mapping) else []
+    return _names_under("id2label", content)
+
+
+def _names_under(key: str, content: object) -> list[str | int]:
+    """List the names under a key of a file's content; none where it is no mapping."""
+    return _listed(content.get(key)) if isinstance(content, Mapping) else []
 
 
 def _names_in_lines(text: str) -> list[str]:
@@ -199,14 +205,17 @@ def _names_in_lines(text: str) -> list[str]:
     `0: cat` is a name with its number. `1 cat` may also be a name that begins with a number, as `1 euro` does: it is
     one unless three lines or more are counted, and their names differ without the numbers, too.
     """
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    numbered = [match for match in map(_NUMBERED.fullmatch, lines) if match]
+    lines = _texts(text.splitlines())
+    numbered = list(filter(None, map(_NUMBERED.fullmatch, lines)))
     numbers = [int(match["number"]) for match in numbered]
+    from_zero = list(range(len(lines)))
+    from_one = list(range(1, len(lines) + 1))
+    if numbers not in (from_zero, from_one):
+        return lines
+    marks = [match["mark"] for match in numbered]
     names = [match["name"] for match in numbered]
-    are_counted = numbers in ([*range(len(lines))], [*range(1, len(lines) + 1)])
-    are_marked = all(match["mark"] for match in numbered)
-    are_distinct = len({*names}) == len(names) >= _COUNTED
-    return names if are_counted and (are_marked or are_distinct) else lines
+    are_distinct = len(set(names)) == len(names) >= _COUNTED
+    return names if all(marks) or are_distinct else lines
 
 
 _COUNTED = 3  # least number of lines whose numbers, with blanks after them, are those of the lines
@@ -239,17 +248,20 @@ def _texts(names: list[str | int] | list[str]) -> list[str]:
 def _names_of_exporter(metadata: Mapping[str, str]) -> OnnxSettings:
     """Find class names in metadata under other keys than Ultralytics': a list, by numbers, or a name a line."""
     for key in _NAMES:
-        text = metadata.get(key, "")
-        names: list[str | int] | list[str]
-        try:
-            names = _listed(ast.literal_eval(text))
-        except (ValueError, SyntaxError, RecursionError, MemoryError):
-            separator = "\n" if "\n" in text.strip() else ","
-            names = text.split(separator)
-        names = _texts(names)
+        names = _texts(_names_in_value(metadata.get(key, "")))
+        # One name alone may be any text under such a key, which says nothing of classes.
         if len(names) > 1 and all(map(is_plain, names)):
             return {"classes": names}
     return {}
+
+
+def _names_in_value(text: str) -> list[str | int] | list[str]:
+    """List the names in a value of metadata: Python's list or dict, or names in lines or with commas."""
+    try:
+        return _listed(ast.literal_eval(text))
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        separator = "\n" if "\n" in text.strip() else ","
+        return text.split(separator)
 
 
 def _ultralytics(metadata: Mapping[str, str]) -> OnnxSettings:
@@ -257,16 +269,23 @@ def _ultralytics(metadata: Mapping[str, str]) -> OnnxSettings:
     settings: OnnxSettings = {}
     try:
         if "names" in metadata:
-            names = ast.literal_eval(metadata["names"])
-            settings["classes"] = [names[number] for number in range(len(names))]
-            if isinstance(names, str) or not all(is_plain(str(name)) for name in settings["classes"]):
-                return {}
+            settings["classes"] = _numbered_names(metadata["names"])
         if "imgsz" in metadata:
             height, width = ast.literal_eval(metadata["imgsz"])
             settings["input_size"] = [int(width), int(height)]
     except (ValueError, SyntaxError, TypeError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
         return {}  # keys of the same name from another exporter
     return settings
+
+
+def _numbered_names(text: str) -> list[str]:
+    """Read a dict of names by number, or a list; raises `ValueError` and others for any other value."""
+    names = ast.literal_eval(text)
+    listed = [names[number] for number in range(len(names))]
+    are_names = all(is_plain(str(name)) for name in listed)
+    if isinstance(names, str) or not are_names:
+        raise ValueError("expected names by number")
+    return listed
 
 
 def with_input_size(path: Path, canvas: Canvas) -> Path:
@@ -316,20 +335,24 @@ def _resize_shapes(graph: onnx.GraphProto, size: Canvas, canvas: Canvas) -> None
     from onnx import numpy_helper
 
     new_sizes = {cells(size, stride): cells(canvas, stride) for stride in STRIDES}
-    constants = {tensor.name: tensor for tensor in graph.initializer}
-    shape_names: set[str] = set()
-    for node in graph.node:
-        if node.op_type == "Reshape":
-            shape_names.add(node.input[1])
-        elif node.op_type == "Constant":
-            constants[node.output[0]] = node.attribute[0].t
-    for name in shape_names & constants.keys():
-        tensor = constants[name]
+    for tensor in _shapes_asked_for(graph):
         shape = numpy_helper.to_array(tensor).copy()
         if len(shape) <= 2:
-            continue
+            continue  # no map, which is `(…, rows, columns)`
         old_size = int(shape[-1]), int(shape[-2])
         if old_size in new_sizes:
             columns, rows = new_sizes[old_size]
             shape[-2:] = rows, columns
             tensor.CopyFrom(numpy_helper.from_array(shape, tensor.name))
+
+
+def _shapes_asked_for(graph: onnx.GraphProto) -> list[onnx.TensorProto]:
+    """List the constants that `Reshape` nodes read as the shapes of their outputs."""
+    constants = {tensor.name: tensor for tensor in graph.initializer}
+    shape_names: set[str] = set()
+    for node in graph.node:
+        if node.op_type == "Constant":
+            constants[node.output[0]] = node.attribute[0].t
+        if node.op_type == "Reshape":
+            shape_names.add(node.input[1])
+    return [constants[name] for name in shape_names & constants.keys()]

@@ -21,10 +21,11 @@ from semfov.detection.onnx_apart import ModelApart
 from semfov.detection.onnx_budget import check_elements, dims, without_weights
 from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_check import check_file, stored_bytes
-from semfov.detection.onnx_program import Opening, Port, describe, open_session, runtime
+from semfov.detection.onnx_program import Description, Opening, Port, describe, open_session, runtime
 from semfov.errors import DataError, check
 
 if TYPE_CHECKING:
+    from onnx import GraphProto
     from onnxruntime import InferenceSession
 
 _INTEGERS = "tensor(int64)", "tensor(int32)"  # of outputs that number classes and boxes
@@ -105,6 +106,7 @@ class OnnxSession:
             open_ended=self.open_ended,
         )
         self._further = tuple(further)
+        # A model with further outputs is given in memory, and has no file; its weights stay where they are.
         opening: Opening = {
             "path": None if self._further else fspath(self.path),
             "folder": fspath(self.path.parent),
@@ -114,32 +116,29 @@ class OnnxSession:
             "tensors": _MOST_MEMORY if self.open_ended else None,
             "process": None,
         }
-        self._session: InferenceSession | ModelApart
         try:
-            model = self._model_with_further_outputs() if self._further else None
-            if self.open_ended:
-                self._session = self._opened_apart(opening, model)
-                description = self._session.description
-            else:
-                self._session = open_session(opening, model)
-                description = describe(self._session)
+            self._session, description = self._open(opening)
         except UnicodeDecodeError as error:
             raise DataError(f"cannot load the ONNX model {str(path)!r}: its names are not text ({error})") from None
         except Exception as error:  # onnxruntime's own exceptions share no base class
             raise DataError(f"cannot load the ONNX model {str(path)!r}: {_reason(error)}") from error
         self.metadata = description["metadata"]
         self.producer = description["producer"]
-        for output in description["outputs"]:
-            name = f"{self.path.name}: output {output['name']!r}"
-            check(output["type"] in (*_FLOATS, *_INTEGERS), name, "numbers", output["type"])
-        self.outputs: tuple[tuple[str, _Sizes], ...] = tuple(
-            (output["name"], _sizes(output["shape"])) for output in description["outputs"]
-        )
+        self.outputs = self._read_outputs(description["outputs"])
         self._inputs = self._read_inputs(description["inputs"])
         self.image = self._inputs.image
         self.shape = self._inputs.shape
         batch = self.shape[0]
         check(batch is None or batch <= _MOST_BATCH, "batch", f"at most {_MOST_BATCH} images at once", batch)
+
+    def _open(self, opening: Opening) -> tuple[InferenceSession | ModelApart, Description]:
+        """Open the model, an open-ended one in a process of its own, and read what onnxruntime says of it."""
+        model = self._model_with_further_outputs()
+        if self.open_ended:
+            apart = self._opened_apart(opening, model)
+            return apart, apart.description
+        session = open_session(opening, model)
+        return session, describe(session)
 
     def _opened_apart(self, opening: Opening, model: bytes | None) -> ModelApart:
         """Open the model in a process of its own, whose memory is limited where it uses no other device."""
@@ -148,8 +147,10 @@ class OnnxSession:
             opening["process"] = _MOST_MEMORY + beside + _COPIES * stored_bytes(self.path)
         return ModelApart(opening, model, _MOST_SECONDS)
 
-    def _model_with_further_outputs(self) -> bytes:
-        """Make the model that also returns the tensors inside it that are asked for."""
+    def _model_with_further_outputs(self) -> bytes | None:
+        """Make the model that also returns the tensors inside it that are asked for; None where none are."""
+        if not self._further:
+            return None
         import onnx
 
         model = onnx.load(self.path, load_external_data=False)
@@ -157,11 +158,18 @@ class OnnxSession:
         model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in self._further if name not in names)
         return model.SerializeToString()
 
+    def _read_outputs(self, outputs: Sequence[Port]) -> tuple[tuple[str, _Sizes], ...]:
+        """List name and shape of each output; raises `InputError` for one that holds no numbers."""
+        for output in outputs:
+            name = f"{self.path.name}: output {output['name']!r}"
+            check(output["type"] in (*_FLOATS, *_INTEGERS), name, "numbers", output["type"])
+        return tuple((output["name"], _sizes(output["shape"])) for output in outputs)
+
     def _read_inputs(self, inputs: Sequence[Port]) -> _Inputs:
         """Find the input for images, and the others; raises `InputError` for others than detectors have."""
         descriptions = [f"{port['name']} {port['shape']} {port['type']}" for port in inputs]
         got = ", ".join(descriptions)
-        images = [port for port in inputs if len(port["shape"]) == 4 and port["type"] in _FLOATS]
+        images = list(filter(_takes_images, inputs))
         expected = "one floating-point input (B, 3, H, W)"
         check(len(images) == 1, self.path.name, expected, got)
         image = images[0]
@@ -194,8 +202,7 @@ class OnnxSession:
         runs = [self._run(part.contiguous()) for part in source.split(size)]
         outputs = {}
         for name, _ in self.outputs:
-            parts = [run[name] for run in runs]
-            rows = parts[0] if len(parts) == 1 else torch.cat(parts)  # one part needs no copy
+            rows = _joined([run[name] for run in runs])
             outputs[name] = rows[:batch].to(image)
         return outputs
 
@@ -249,17 +256,18 @@ class OnnxSession:
         Returns:
             Outputs by name: zeros where the model states all shapes, else the outputs of a run.
         """
-        shapes: dict[str, list[int]] = {}
-        are_stated = True
+        are_open = self.open_ended
+        stated_shapes: dict[str, list[int]] = {}
         for name, shape in self.outputs:
             sizes = shape[1:]  # the first one is that of the batch
-            shapes[name] = [size for size in sizes if size is not None]
-            check_elements(f"{self.path.name}: output {name!r}", shapes[name])
-            are_stated = are_stated and bool(shape) and None not in sizes
-        if are_stated and not self.open_ended:
-            return {name: torch.zeros(1, *sizes) for name, sizes in shapes.items()}
-        width, height = size
-        return self(torch.zeros(1, 3, height, width))
+            stated = [size for size in sizes if size is not None]
+            check_elements(f"{self.path.name}: output {name!r}", stated)
+            stated_shapes[name] = stated
+            are_open |= not shape or None in sizes
+        if are_open:
+            width, height = size
+            return self(torch.zeros(1, 3, height, width))
+        return {name: torch.zeros(1, *sizes) for name, sizes in stated_shapes.items()}
 
     def steps(self, canvas: Canvas) -> list[NetworkStep]:
         """List the steps of the model in order, with the strides of their maps.
@@ -270,14 +278,7 @@ class OnnxSession:
         Returns:
             A step for each tensor that is computed.
         """
-        import onnx
-
-        model = without_weights(onnx.load(self.path, load_external_data=False))
-        image = next(value for value in model.graph.input if value.name == self.image)
-        sizes = (1, 3, canvas[1], canvas[0])
-        for side, size in zip(image.type.tensor_type.shape.dim, sizes, strict=True):
-            side.dim_value = size
-        graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+        graph = self._graph_for(canvas)
         shapes = {value.name: dims(value) for value in [*graph.value_info, *graph.output]}
         steps = []
         from_image = {self.image}  # tensors that are computed from the image; others are stored weights, and no maps
@@ -286,11 +287,36 @@ class OnnxSession:
             if not from_image.isdisjoint(inputs):
                 from_image.update(node.output)
             for output in node.output:
-                shape = shapes.get(output, [])
-                is_map = output in from_image and len(shape) == 4 and min(shape[2:]) > 1
-                stride = stride_of(canvas[0], shape[3]) if is_map else None
+                stride = _stride(shapes.get(output, []), canvas) if output in from_image else None
                 steps.append(NetworkStep(output, stride, inputs, node.op_type == "Conv"))
         return steps
+
+    def _graph_for(self, canvas: Canvas) -> GraphProto:
+        """Infer the shapes inside the model for one image of the size `(width, height)` of a canvas."""
+        import onnx
+
+        model = without_weights(onnx.load(self.path, load_external_data=False))
+        image = next(value for value in model.graph.input if value.name == self.image)
+        width, height = canvas
+        for side, size in zip(image.type.tensor_type.shape.dim, (1, 3, height, width), strict=True):
+            side.dim_value = size
+        return onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Join the rows of several runs; those of one run need no copy."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _stride(shape: Sequence[int], canvas: Canvas) -> int | None:
+    """Find the stride of a map `(1, C, rows, columns)`; None for a tensor of another shape."""
+    is_map = len(shape) == 4 and min(shape[2:]) > 1
+    return stride_of(canvas[0], shape[3]) if is_map else None
+
+
+def _takes_images(port: Port) -> bool:
+    """Tell whether an input has the form of images."""
+    return len(port["shape"]) == 4 and port["type"] in _FLOATS
 
 
 def _reason(error: Exception) -> str:
