@@ -123,27 +123,54 @@ def shares(candidates: Candidates, policy: BackgroundPolicy) -> tuple[Tensor, Te
     lookup(policy, get_args(BackgroundPolicy), "background policy")
     classes = candidates.classes
     check_shape(classes, "classes", None)
-    background = _background(candidates, policy)
+    background = _BACKGROUNDS[policy](candidates)
     # Where all scores are 0, the classes share equally instead of 0 / 0.
     classes = classes.clamp(min=torch.finfo(classes.dtype).tiny)
     return background, (1 - background)[..., None] * classes / classes.sum(-1, keepdim=True)
 
 
-def _background(candidates: Candidates, policy: BackgroundPolicy) -> Tensor:
-    """Compute the background score `(...)` by a policy; `score_vectors` has the formulas."""
+# Background scores `s_0` `(...)` by policy; `score_vectors` has the formulas.
+
+
+def _residual(candidates: Candidates) -> Tensor:
+    """Compute `1 - o`; where the head has no objectness, the best class score is `o`."""
+    if candidates.objectness is None:
+        return 1 - candidates.classes.amax(-1)
+    return 1 - candidates.objectness
+
+
+def _normalised(candidates: Candidates) -> Tensor:
+    """Compute `(1 - o) / (1 - o + Σ o c)`, or with `Σ c` where the head has no objectness."""
+    background = _residual(candidates)
+    total_of_classes = candidates.classes.sum(-1)
+    if candidates.objectness is not None:
+        total_of_classes = candidates.objectness * total_of_classes
+    total = background + total_of_classes
+    return background / total.clamp(min=torch.finfo(candidates.classes.dtype).tiny)
+
+
+def _uniform(candidates: Candidates) -> Tensor:
+    """Compute `1 / (K + 1)`."""
     classes = candidates.classes
-    if policy == "own":
-        if candidates.background is None:
-            raise InputError("background: expected a head with a score for the policy 'own', got none; use 'residual'")
-        return candidates.background
-    if policy == "uniform":
-        return torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))
-    if policy == "none":
-        return torch.zeros_like(classes[..., 0])
-    objectness = classes.amax(-1) if candidates.objectness is None else candidates.objectness
-    if policy == "residual":
-        return 1 - objectness
-    # With objectness, the scores of the classes are o c; the classes share the rest as with every policy.
-    total_of_classes = classes.sum(-1) if candidates.objectness is None else objectness * classes.sum(-1)
-    total = 1 - objectness + total_of_classes
-    return (1 - objectness) / total.clamp(min=torch.finfo(classes.dtype).tiny)
+    return torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))
+
+
+def _none(candidates: Candidates) -> Tensor:
+    """Compute 0."""
+    return torch.zeros_like(candidates.classes[..., 0])
+
+
+def _own(candidates: Candidates) -> Tensor:
+    """Take the background probability of the head; raises `InputError` where it has none."""
+    if candidates.background is None:
+        raise InputError("background: expected a head with a score for the policy 'own', got none; use 'residual'")
+    return candidates.background
+
+
+_BACKGROUNDS: dict[BackgroundPolicy, Callable[[Candidates], Tensor]] = {
+    "residual": _residual,
+    "normalised": _normalised,
+    "uniform": _uniform,
+    "none": _none,
+    "own": _own,
+}
