@@ -23,6 +23,9 @@ toaster, sink, refrigerator, book, clock, vase, scissors, teddy bear, hair drier
 
 COCO_CLASSES: tuple[str, ...] = tuple(name.strip() for name in _NAMES.split(","))
 
+COCO_CATEGORIES = 91
+"""Number of COCO's category ids: background, the 80 classes, and ids that stand for nothing."""
+
 
 _PLACEHOLDERS = ("", "n/a", "none", "null", "background", "__background__", "no object", "no-object")
 """Names of outputs that do not stand for a class, in lower case: gaps in COCO's category ids, and background."""
@@ -44,6 +47,17 @@ class UnnamedClasses(InputError):
         self.count = count
 
 
+def coco_categories() -> list[str]:
+    """List the names of COCO's category ids, as outputs of models that are numbered by them.
+
+    Returns:
+        The names, background first, with placeholders where an id stands for nothing.
+    """
+    from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights  # takes seconds to import
+
+    return FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
+
+
 def names_in_order(names: Mapping[object, _Name]) -> list[_Name] | None:
     """List names in the order of their numbers.
 
@@ -57,7 +71,7 @@ def names_in_order(names: Mapping[object, _Name]) -> list[_Name] | None:
     ['cat', 'dog']
     """
     by_number = {str(number): name for number, name in names.items()}
-    numbers = [str(number) for number in range(len(by_number))]
+    numbers = list(map(str, range(len(by_number))))
     if by_number.keys() != set(numbers):
         return None
     return [by_number[number] for number in numbers]

@@ -6,12 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
-from semfov.detection.class_names import COCO_CLASSES, UnnamedClasses, keep_classes, named_outputs, without_placeholders
+from semfov.detection.class_names import (
+    COCO_CATEGORIES,
+    COCO_CLASSES,
+    UnnamedClasses,
+    coco_categories,
+    keep_classes,
+    named_outputs,
+    without_placeholders,
+)
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import choose_layers, landmarks
 from semfov.detection.onnx_cells import Canvas
@@ -47,10 +55,8 @@ class OnnxDetector(Detector):
 
     Private attributes: `_places` are the scores of the head that stand for a class, among `_scores` of them.
     `_first_checked` becomes true after the first pass whose values could be read, and `_rounding_told` with the
-    warning of scores a little outside [0, 1]; either happens once. `_tensors` names, by layer, the tensors inside the
-    model that are maps (None before the first call that asks for maps), and `_named_layers` are those of them that have
-    a name by their place. `_map_session` is `session`, or one of the same model that also returns the maps asked for
-    last.
+    warning of scores a little outside [0, 1]; either happens once. `_maps` are found by the first call that asks for
+    maps. `_map_session` is `session`, or one of the same model that also returns the maps asked for last.
     """
 
     def __init__(
@@ -94,8 +100,7 @@ class OnnxDetector(Detector):
         self._scores = len(classes)
         self._first_checked = False
         self._rounding_told = False
-        self._tensors: dict[str, str] | None = None
-        self._named_layers: tuple[str, ...] = ()
+        self._maps: _Maps | None = None
         self._map_session = session
 
     def propose(self, canvas: Tensor) -> Candidates:
@@ -148,14 +153,13 @@ class OnnxDetector(Detector):
         return outputs, {layer: outputs[tensor] for layer, tensor in tensors.items()}
 
     def _map_tensors(self, canvas: Tensor, layers: Sequence[str] | None) -> dict[str, str]:
-        """Find the tensors inside the model that are the maps of layers, all named ones if None; by layer."""
-        if self._tensors is None:
+        """Find the tensors inside the model that are the maps of layers, all with a place if None; by layer."""
+        if self._maps is None:
             steps = self.session.steps((canvas.shape[-1], canvas.shape[-2]))
-            named = landmarks(steps)
-            self._tensors = {step.name: step.name for step in steps if step.stride is not None} | named
-            self._named_layers = tuple(named)
-        wanted = self._named_layers if layers is None else layers
-        return {layer: self._tensors[layer] for layer in choose_layers(wanted, [*self._tensors], self.name)}
+            self._maps = _Maps(landmarks(steps), [step.name for step in steps if step.stride is not None])
+        tensors = self._maps.by_layer()
+        wanted = self._maps.by_place if layers is None else layers
+        return {layer: tensors[layer] for layer in choose_layers(wanted, [*tensors], self.name)}
 
     def _check_canvas(self, canvas: Tensor) -> None:
         """Raise `InputError` for a canvas of another shape than the network takes."""
@@ -164,8 +168,7 @@ class OnnxDetector(Detector):
         rows, columns = canvas.shape[-2:]
         fixed = f"{width} × {height} px, the fixed input of {self.name}"
         remedy = "a sensor with crops needs crops of that side, or a network that takes pictures of any size"
-        same = height in (None, rows) and width in (None, columns)
-        check(same, "canvas", fixed, f"{columns} × {rows} px; {remedy}")
+        check(_takes(self.session, (columns, rows)), "canvas", fixed, f"{columns} × {rows} px; {remedy}")
 
     def decode(self, outputs: dict[str, Tensor], size: Canvas, least: float = 0.0) -> Candidates:
         """Decode the outputs of the network.
@@ -201,11 +204,7 @@ class OnnxDetector(Detector):
 
     def _rounded_scores(self, candidates: Candidates) -> Candidates:
         """Clamp scores that rounding has put a little outside [0, 1], with one warning."""
-        least, greatest = _range(candidates.classes)
-        if candidates.objectness is not None:
-            least_objectness, greatest_objectness = _range(candidates.objectness)
-            least = min(least, least_objectness)
-            greatest = max(greatest, greatest_objectness)
+        least, greatest = _score_range(candidates)
         remedy = "set logits=True if the model returns them before the sigmoid"
         got = f"[{least:.3g}, {greatest:.3g}]; {remedy}, and check that its head is {self.head!r}"
         check_data(least >= -_ROUNDING and greatest <= 1 + _ROUNDING, self.name, "scores in [0, 1]", got)
@@ -245,6 +244,23 @@ class OnnxDetector(Detector):
         return settings
 
 
+class _Maps(NamedTuple):
+    """The maps inside a model: names of tensors by their place in the network, and the names of all that are maps."""
+
+    by_place: dict[str, str]
+    tensors: list[str]
+
+    def by_layer(self) -> dict[str, str]:
+        """List the tensors by the names of layers that users may ask for: those of the model, and the places."""
+        return {**dict(zip(self.tensors, self.tensors, strict=True)), **self.by_place}
+
+
+def _takes(session: OnnxSession, size: Canvas) -> bool:
+    """Tell whether a model takes images `(width, height)`, whose own sides may be open."""
+    height, width = session.shape[2:]
+    return width in (None, size[0]) and height in (None, size[1])
+
+
 def _checked_floats(canvas: Tensor) -> Tensor:
     """Return a canvas of floats; raises `InputError` for other numbers."""
     check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
@@ -263,6 +279,15 @@ def _range(numbers: Tensor) -> tuple[float, float]:
         return 0.0, 0.0
     least, greatest = numbers.aminmax()
     return float(least), float(greatest)
+
+
+def _score_range(candidates: Candidates) -> tuple[float, float]:
+    """Find the least and greatest of all class scores and objectness."""
+    least, greatest = _range(candidates.classes)
+    if candidates.objectness is None:
+        return least, greatest
+    least_objectness, greatest_objectness = _range(candidates.objectness)
+    return min(least, least_objectness), max(greatest, greatest_objectness)
 
 
 def load_onnx(
@@ -354,11 +379,14 @@ def load_onnx(
 def _find_file(name: str, weights: str | PathLike[str] | None) -> tuple[Path, str | None]:
     """Find the file of a model by its path, or by the name of a published one; with the name, if it is published."""
     if name in _ONNX_MODELS:
-        return (fetch(name) if weights is None else Path(weights)), name
+        weights_file = fetch(name) if weights is None else Path(weights)
+        return weights_file, name
     if weights is not None or not name.endswith(".onnx"):
-        lookup(name, _ONNX_MODELS, "ONNX model")
+        lookup(name, _ONNX_MODELS, "ONNX model")  # raises, with the nearest names
     file = Path(name)
-    return file, NETWORKS.get(sha256(file)) if file.is_file() else None
+    # A published file is known by its content, whatever it is called; a missing one is reported when it is opened.
+    published_name = NETWORKS.get(sha256(file)) if file.is_file() else None
+    return file, published_name
 
 
 def _overridden(settings: OnnxSettings, **options: object) -> OnnxSettings:
@@ -369,9 +397,9 @@ def _overridden(settings: OnnxSettings, **options: object) -> OnnxSettings:
 
 def _class_count(names: Sequence[str] | None, *, published: bool) -> int | None:
     """Count the classes of a model: those of its names, or COCO's if it is published; None where neither is known."""
-    if names is None:
-        return len(COCO_CLASSES) if published else None
-    return len(names) if names or published else None
+    if published:
+        return len(COCO_CLASSES if names is None else names)
+    return len(names) if names else None
 
 
 def _recognised_head(session: OnnxSession, outputs: Mapping[str, Tensor], size: Canvas, classes: int | None) -> str:
@@ -417,12 +445,15 @@ def _class_names(
     Raises:
         InputError: the head does not fit the outputs, or there are no names, or others than scores.
     """
-    nearby = names_beside(file) if stated is None and not published else None
-    selects = HEADS[head].selects
-    # Outputs of a network that selects boxes itself do not tell how many classes there are.
-    names = nearby if stated is None and selects else stated
+    nearby = None
+    if stated is None and not published:
+        nearby = names_beside(file)
+    names = stated
+    # Outputs of a network that selects boxes itself do not tell how many classes there are; a file of names does.
+    if names is None and HEADS[head].selects:
+        names = nearby
     scores = _score_count(head, outputs, size, names)
-    if selects:
+    if HEADS[head].selects:
         warnings.warn(
             f"{file.name} selects boxes itself and returns one class of each, so all other scores are 0; exported with "
             "end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
@@ -470,8 +501,7 @@ def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -
         return width, height
     size = _sides(input_size)
     check_canvas("input_size", size)
-    same = width in (None, size[0]) and height in (None, size[1])
-    check(same, "input_size", f"the model's fixed size, {width} x {height}", size)
+    check(_takes(session, size), "input_size", f"the model's fixed size, {width} x {height}", size)
     return size
 
 
@@ -486,14 +516,10 @@ def _sides(input_size: int | Sequence[int]) -> Canvas:
 
 def _unstated_names(nearby: Sequence[str] | None, count: int, file: Path) -> Sequence[str]:
     """Name scores by a file beside the model, or 80 by COCO's classes, or 91 by COCO's category ids with their gaps."""
-    if nearby is not None:
-        for names in (nearby, without_placeholders(nearby)):  # as of a list that begins with background
-            if len(names) == count:
-                return names
-    if count == 80:
-        return COCO_CLASSES
-    if count == 91:
-        from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
-
-        return FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
+    in_file = [] if nearby is None else [nearby, without_placeholders(nearby)]  # a list may begin with background
+    for names in (*in_file, COCO_CLASSES):
+        if len(names) == count:
+            return names
+    if count == COCO_CATEGORIES:
+        return coco_categories()
     raise UnnamedClasses(count, file, nearby)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
-from semfov.detection.class_names import keep_classes
+from semfov.detection.class_names import COCO_CATEGORIES, coco_categories, keep_classes
 from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.placement import Placement
@@ -35,6 +35,13 @@ _Weights = Any
 
 _PREFIX = "torchvision:"
 
+_COUNTS = (
+    "roi_heads.box_predictor.cls_score.out_features",  # Faster R-CNN
+    "head.classification_head.num_classes",  # RetinaNet and FCOS
+    "head.classification_head.num_columns",  # SSD
+)
+"""Where heads have the number of their outputs, background included."""
+
 
 class TorchvisionDetector(ModuleDetector):
     """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
@@ -56,12 +63,9 @@ class TorchvisionDetector(ModuleDetector):
     ) -> None:
         if classes is None:
             # COCO's names are taken only for as many outputs, as other classes are usually more or fewer.
-            from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
-
-            names = FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
-            count = _output_count(model)
-            check(count == len(names), "classes", "the names of the model's outputs after the first, background", None)
-            classes = names[first:]
+            is_coco = _output_count(model) == COCO_CATEGORIES
+            check(is_coco, "classes", "the names of the model's outputs after the first, background", None)
+            classes = coco_categories()[first:]
         decoder, softmax = _decoder_of(model)
         check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
         transform: _Model = model.transform
@@ -101,21 +105,23 @@ class TorchvisionDetector(ModuleDetector):
 
         transform: _Model = self.model.transform
         pixels = transform.normalize(self._pixels(canvas))
+        # Padded to what the network can halve; boxes are cut to the sizes without this padding.
         batch = transform.batch_images(list(pixels), size_divisible=transform.size_divisible)
-        sizes = [(canvas.shape[-2], canvas.shape[-1])] * canvas.shape[0]
+        height, width = canvas.shape[-2:]
+        sizes = [(height, width)] * len(canvas)
         return self._decoder(self.model, ImageList(batch, sizes), self.first)
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1], padded with empty boxes to one number."""
         raw = self.outputs(canvas)
         images = [self._candidates(boxes, scores) for boxes, scores in raw]
-        boxes = pad_sequence([image.boxes for image in images], True)
-        classes = pad_sequence([image.classes for image in images], True)
-        # Padding is all background.
-        background = None
-        if self._softmax:
-            background = pad_sequence([scores[:, 0] for _, scores in raw], True, 1.0).to(canvas.dtype)
-        return Candidates(boxes.to(canvas.dtype), classes.to(canvas.dtype), background=background)
+        boxes = pad_sequence([image.boxes for image in images], True).to(canvas.dtype)  # (B, N, 4)
+        classes = pad_sequence([image.classes for image in images], True).to(canvas.dtype)  # (B, N, K)
+        if not self._softmax:
+            return Candidates(boxes, classes)
+        # The first of the scores of a softmax is background, and padding is all background.
+        background = pad_sequence([scores[:, 0] for _, scores in raw], True, 1.0).to(canvas.dtype)  # (B, N)
+        return Candidates(boxes, classes, background=background)
 
     def _candidates(self, boxes: Tensor, scores: Tensor) -> Candidates:
         """Make candidates of one image, without placeholders of classes, and with one box for each row.
@@ -127,8 +133,9 @@ class TorchvisionDetector(ModuleDetector):
             return candidates
         # A detection has one box for all its scores: the one of its best class.
         places = torch.tensor(self._places, device=boxes.device) + self.first
-        best = places[candidates.classes.argmax(-1)]
-        best_boxes = boxes.gather(1, best[:, None, None].expand(-1, 1, 4))[:, 0]
+        best = places[candidates.classes.argmax(-1)]  # (N,), places among the C outputs
+        index = best[:, None, None].expand(-1, 1, 4)
+        best_boxes = boxes.gather(1, index)[:, 0]
         return Candidates(best_boxes, candidates.classes)
 
     def feature_modules(self) -> dict[str, nn.Module]:
@@ -196,10 +203,11 @@ def _published_weights(weights: _Weights, members: _Weights) -> _Weights:
     """Find the member of torchvision's enum of a model's weights; None for a file and for random weights."""
     if weights is None or isinstance(weights, members):
         return weights
-    text = fspath(weights).removeprefix(f"{members.__name__}.")
-    if not isinstance(weights, str) or Path(text).suffix:
+    name = fspath(weights).removeprefix(f"{members.__name__}.")
+    is_file = not isinstance(weights, str) or Path(name).suffix != ""
+    if is_file:
         return None
-    return members[lookup(text, [*members.__members__], f"{members.__name__} member")]
+    return members[lookup(name, [*members.__members__], f"{members.__name__} member")]
 
 
 def _check_options(options: Iterable[str], name: str, kind: type[nn.Module]) -> None:
@@ -256,11 +264,12 @@ def _roi_outputs(model: _Model, images: "ImageList", first: int) -> _Raw:
     heads = model.roi_heads
     regions = heads.box_head(heads.box_roi_pool(features, proposals, images.image_sizes))
     logits, regression = heads.box_predictor(regions)
-    counts = [len(boxes) for boxes in proposals]
+    counts = [len(boxes) for boxes in proposals]  # of each image
+    decoded = heads.box_coder.decode(regression, proposals)
     # Without proposals the box coder does not add the class dimension.
-    boxes = heads.box_coder.decode(regression, proposals).reshape(len(logits), logits.shape[-1], 4).split(counts)
-    scores = logits.softmax(-1).split(counts)
-    return _clipped(boxes, scores, images)
+    boxes = decoded.reshape(len(logits), logits.shape[-1], 4)
+    scores = logits.softmax(-1)
+    return _clipped(boxes.split(counts), scores.split(counts), images)
 
 
 def _ssd_outputs(model: _Model, images: "ImageList", first: int) -> _Raw:
@@ -289,7 +298,8 @@ def _level_outputs(model: _Model, images: "ImageList", first: int) -> _Raw:
     boxes = []
     best_scores = []
     for regression, image_scores, anchor in zip(outputs["bbox_regression"], scores, anchors, strict=True):
-        rows = _best_of_levels(image_scores[:, first:].detach().amax(-1), counts, model.topk_candidates)
+        best_class = image_scores[:, first:].detach().amax(-1)  # (N,)
+        rows = _best_of_levels(best_class, counts, model.topk_candidates)
         boxes.append(decode(regression[rows], anchor[rows]))
         best_scores.append(image_scores[rows])
     return _clipped(boxes, best_scores, images)
@@ -346,11 +356,7 @@ def _decoder_of(model: nn.Module) -> tuple[_Decoder, bool]:
 
 def _output_count(model: nn.Module) -> int | None:
     """Count a model's outputs, background included; None where its head is not one of torchvision's."""
-    for path in (
-        "roi_heads.box_predictor.cls_score.out_features",
-        "head.classification_head.num_classes",
-        "head.classification_head.num_columns",
-    ):
+    for path in _COUNTS:
         part: object = model
         for name in path.split("."):
             part = getattr(part, name, None)
