@@ -103,21 +103,25 @@ def category_ids(
         InputError: an id is none, or a class has no category.
     """
     named = [category for category in categories if isinstance(category, Mapping)]
-    if not named:
-        ids = [category for category in categories if not isinstance(category, Mapping)]
-        expected = "whole numbers or texts, or categories of a file"
-        check(all(map(_is_id, ids)), "categories", expected, categories[:3])
-        return [_plain_id(value) for value in ids]
+    if named:
+        return _ids_by_name(named, classes)
+    ids = cast(Sequence[int | str], categories)
+    check(all(map(_is_id, ids)), "categories", "whole numbers or texts, or categories of a file", categories[:3])
+    return list(map(_plain_id, ids))
+
+
+def _ids_by_name(categories: Sequence[Category], classes: Sequence[str] | None) -> list[int | str]:
+    """Find the ids of the categories of a file that have the names of classes, in their order."""
     if classes is None:
         raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
-    by_name: dict[str, int | str] = {}
-    for category in named:
-        identifier = _plain_id(cast(int | str, category["id"]))
-        by_name.setdefault(canonical_name(str(category["name"])), identifier)
+    ids: dict[str, int | str] = {}
+    for category in categories:
+        name = canonical_name(str(category["name"]))
+        ids.setdefault(name, _plain_id(cast(int | str, category["id"])))
     names = class_indices(classes)
-    missing = [name for name in names if name not in by_name]
+    missing = [name for name in names if name not in ids]
     check(not missing, "categories", "a category for each class", f"none for {', '.join(missing[:3])}")
-    return [by_name[name] for name in names]
+    return [ids[name] for name in names]
 
 
 def _is_id(value: object) -> bool:

@@ -31,6 +31,9 @@ _EXPORTED = re.compile(r"(yolo(v?([5-9]|1\d|26)|world|-nas|e-)[a-z0-9_-]*|rt-?de
 _OTHER_FORMATS = (".tflite", ".engine", ".trt", ".xml", ".bin", ".pb", ".h5", ".keras", ".mlmodel", ".safetensors")
 """Ends of the names of models in formats that are not read."""
 
+_FILES = (".onnx", ".cfg")
+"""Ends of the names of files that are read; other names are those of published detectors, or of a library."""
+
 _Loader = Callable[..., Detector]
 """A function that makes a detector of a name or a model, with options of its own."""
 
@@ -43,6 +46,9 @@ _WRAPPERS: dict[str, _Loader] = {
     "ultralytics.": UltralyticsDetector,
 }
 """Classes of detectors that hold a module (in memory, not a copy), by the package of its class or of its bases."""
+
+_LIBRARIES: dict[str, _Loader] = {"torchvision": TorchvisionDetector.load, "hf": TransformersDetector.load}
+"""Loaders by what stands before the colon of a name."""
 
 _INNER = "module", "_orig_mod", "model"
 """Where a model is in what wraps it: for several GPUs, compiled, or for training."""
@@ -97,13 +103,11 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
 
 def _loader_of(name: str) -> _Loader:
     """Find the loader of a detector by its name or its file."""
-    if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
+    file = WEIGHTS[name].file if name in WEIGHTS else name
+    if file.endswith(".onnx"):
         return load_onnx
-    if name.startswith("torchvision:"):
-        return TorchvisionDetector.load
-    if name.startswith("hf:"):
-        return TransformersDetector.load
-    return load_yolo
+    library, _, _ = name.partition(":")
+    return _LIBRARIES.get(library, load_yolo)
 
 
 def _wrapper_of(model: nn.Module) -> _Loader:
@@ -111,14 +115,18 @@ def _wrapper_of(model: nn.Module) -> _Loader:
     for package, wrapper in _WRAPPERS.items():
         if any(f"{kind.__module__}.".startswith(package) for kind in type(model).__mro__):
             return wrapper
-    remedy = "write a class with the method propose (semfov.Detector), or export it to ONNX"
+    kind = f"{type(model).__module__}.{type(model).__qualname__}"
+    remedy = f"{_hint_of_inner(model)}write a class with the method propose (semfov.Detector), or export it to ONNX"
+    raise InputError(f"detector: expected a model of torchvision, transformers or Ultralytics, got {kind}; {remedy}")
+
+
+def _hint_of_inner(model: nn.Module) -> str:
+    """Write where in a model another one is that it wraps, `""` if there is none."""
     for name in _INNER:
         inner = getattr(model, name, None)
         if isinstance(inner, nn.Module):
-            remedy = f"give the {type(inner).__name__} in it, which is its .{name}; or {remedy}"
-            break
-    kind = f"{type(model).__module__}.{type(model).__qualname__}"
-    raise InputError(f"detector: expected a model of torchvision, transformers or Ultralytics, got {kind}; {remedy}")
+            return f"give the {type(inner).__name__} in it, which is its .{name}; or "
+    return ""
 
 
 def _load(load: _Loader, model: str | nn.Module, description: str, options: dict[str, Any]) -> Detector:
@@ -132,14 +140,14 @@ def _load(load: _Loader, model: str | nn.Module, description: str, options: dict
     """
     names_of_loader = _options_of(load)
     check_options(options, [*names_of_loader, *_COMMON], f"semfov.load_detector for {description}")
+    # What is wrong is reported before a network is loaded.
     if options.get("classes") is not None:
         options = {**options, "classes": given_names(options["classes"])}
     if "device" in options:
         _check_is_device(options["device"])
-    selection = {name: value for name, value in options.items() if name in _SELECTING}
-    Selection(**selection)  # what is wrong is reported before a network is loaded
-    loader_options = {name: value for name, value in options.items() if name in names_of_loader}
-    detector = load(model, **loader_options)
+    selection = _part(options, _SELECTING)
+    Selection(**selection)
+    detector = load(model, **_part(options, names_of_loader))
     # What is not given stays as the loader has set it, such as `per_class` in the settings of an ONNX file.
     detector.selection = replace(detector.selection, **selection)
     if options.get("background") is not None:
@@ -151,6 +159,11 @@ def _load(load: _Loader, model: str | nn.Module, description: str, options: dict
     if torch.device(device).type != "meta":
         check_device(device)
     return detector.to(device)
+
+
+def _part(options: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Take the options of some names."""
+    return {name: value for name, value in options.items() if name in names}
 
 
 def _check_is_device(device: torch.device | str) -> None:
@@ -173,9 +186,9 @@ def loader_options() -> list[str]:
     Returns:
         The names, some of them several times.
     """
-    loaders: list[_Loader] = [load_yolo, load_onnx, TorchvisionDetector.load, TransformersDetector.load]
+    loaders: list[_Loader] = [load_yolo, load_onnx, *_LIBRARIES.values(), *_WRAPPERS.values()]
     names = list(_COMMON)
-    for load in (*loaders, *_WRAPPERS.values()):
+    for load in loaders:
         names += _options_of(load)
     return names
 
@@ -194,7 +207,7 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
         DataError: there is no such file.
     """
     name = _detector_name(name_or_path)
-    if name.endswith((".onnx", ".cfg")):
+    if name.endswith(_FILES):
         if not Path(name).exists():
             raise DataError(f"detector: no such file: {name}; check the path")
         check_regular(name)
@@ -205,15 +218,15 @@ def _detector_name(name_or_path: str | PathLike[str]) -> str:
     """Return a name as it is written in tables, and the path of a file as it is."""
     name = fspath(name_or_path)
     check("://" not in name, "detector", "a file on this machine, or a name", f"{name}; download it")
-    if name.endswith((".onnx", ".cfg")):
+    if name.endswith(_FILES):
         return name
     _check_has_loader(name)
     lower = name.lower()
-    if lower.startswith("torchvision:"):
+    if lower in WEIGHTS or lower.startswith("torchvision:"):
         return lower
     if lower.startswith("hf:"):
         return f"hf:{name[3:]}"  # names of the hub keep their case
-    return lower if lower in WEIGHTS else lookup(name, WEIGHTS, "detector")
+    return lookup(name, WEIGHTS, "detector")
 
 
 def _check_has_loader(name: str) -> None:
@@ -323,8 +336,9 @@ def given_names(classes: object) -> tuple[str, ...]:
 def _names_in_text(text: str | PathLike[str]) -> tuple[str, ...]:
     """Read class names in a text with commas, or in a file with a name a line."""
     words = fspath(text)
-    is_path = isinstance(text, PathLike) or Path(words).suffix in (".txt", ".names")
-    if is_path or Path(words).is_file():
-        lines = [line.strip() for line in read_text(words).splitlines()]
-        return tuple(line for line in lines if line)
-    return tuple(name.strip() for name in words.split(","))
+    # A list that is missing is read all the same, as the error says more than a class of that name would.
+    is_list = isinstance(text, PathLike) or Path(words).suffix in (".txt", ".names")
+    if is_list or Path(words).is_file():
+        lines = map(str.strip, read_text(words).splitlines())
+        return tuple(filter(None, lines))
+    return tuple(map(str.strip, words.split(",")))

@@ -56,13 +56,13 @@ class TransformersDetector(ModuleDetector):
         config: Any = model.config
         if classes is None:
             classes = [config.id2label[index] for index in sorted(config.id2label)]
-        # A model of another kind that is trained without focal loss would have a softmax, too.
-        has_softmax = config.model_type in _SOFTMAX
-        has_focal_loss = getattr(config, "use_focal_loss", True)
         settings = _with_usual_settings(processor or {}, config.model_type)
         size = _processor_size(settings)
-        is_known = bool(has_focal_loss) or has_softmax
-        check(is_known, "model", "scores trained with focal loss", f"use_focal_loss={has_focal_loss}")
+        has_softmax = config.model_type in _SOFTMAX
+        if not has_softmax:
+            # A model of another kind that is trained without focal loss would have a softmax, too.
+            focal_loss = getattr(config, "use_focal_loss", True)
+            check(bool(focal_loss), "model", "scores trained with focal loss", f"use_focal_loss={focal_loss}")
         resizes = bool(settings.get("do_resize", True))
         stretches = resizes and "height" in size
         super().__init__(
@@ -179,7 +179,9 @@ def _with_usual_settings(processor: ProcessorSettings, kind: str) -> dict[str, A
 def _preprocessing_of(settings: ProcessorSettings, *, stretch: bool) -> Preprocessing:
     """Read from an image processor's settings what the network expects of its input."""
     # A processor takes bytes, which it rescales; a canvas is in [0, 1].
-    factor = (settings.get("rescale_factor") or 1 / 255) if settings.get("do_rescale", True) else 1.0
+    factor = 1.0
+    if settings.get("do_rescale", True):
+        factor = settings.get("rescale_factor") or 1 / 255
     preprocessing = Preprocessing(stretch=stretch, scale=255 * factor)
     if settings["do_normalize"]:
         return preprocessing.merged({"mean": settings["image_mean"], "std": settings["image_std"]})
@@ -187,21 +189,30 @@ def _preprocessing_of(settings: ProcessorSettings, *, stretch: bool) -> Preproce
 
 
 def _processor_size(settings: ProcessorSettings) -> dict[str, int]:
-    """Read the size of an image processor as a mapping; older settings give it as a number or `(height, width)`."""
+    """Read the size of an image processor as a mapping from names of sides to pixels."""
     stated = settings["size"]
-    sides: Mapping[str, int | None] = {}
-    if isinstance(stated, Mapping):
-        sides = stated
-    elif isinstance(stated, int):
-        sides = {"shortest_edge": stated, "longest_edge": settings.get("max_size")}
-    elif isinstance(stated, list | tuple) and len(stated) == 2:
-        height, width = stated
-        sides = {"height": height, "width": width}
-    size = {name: value for name, value in sides.items() if value is not None}
-    in_pixels = all(type(value) is int and 0 < value <= _LARGEST for value in size.values())
+    size = {name: side for name, side in _named_sides(stated, settings).items() if side is not None}
     expected = "height and width, max_height and max_width, shortest_edge or longest_edge, in whole pixels"
-    check(in_pixels and set(size) in _FORMS_OF_SIZE, "processor size", expected, excerpt(stated))
+    is_form = set(size) in _FORMS_OF_SIZE
+    check(is_form and all(map(_is_side, size.values())), "processor size", expected, excerpt(stated))
     return size
+
+
+def _named_sides(stated: object, settings: ProcessorSettings) -> Mapping[str, int | None]:
+    """Name the sides of a size, which older settings give as a number or `(height, width)`; empty for other forms."""
+    if isinstance(stated, Mapping):
+        return stated
+    if isinstance(stated, int):
+        return {"shortest_edge": stated, "longest_edge": settings.get("max_size")}
+    if isinstance(stated, list | tuple) and len(stated) == 2:
+        height, width = stated
+        return {"height": height, "width": width}
+    return {}
+
+
+def _is_side(value: object) -> bool:
+    """Tell whether a value is a side of a canvas in pixels; True is a whole number for Python, and no side."""
+    return type(value) is int and 0 < value <= _LARGEST
 
 
 def _largest_canvas(size: Mapping[str, int]) -> tuple[int, int]:

@@ -23,14 +23,9 @@ class UltralyticsDetector(ModuleDetector):
         name: str = "ultralytics",
         input_size: int | tuple[int, int] = 640,
     ) -> None:
-        # An `ultralytics.YOLO` object has its network as `model`; a network has layers there.
-        inner = getattr(model, "model", None)
-        network = inner if hasattr(inner, "names") else model
-        if not isinstance(network, nn.Module) or not hasattr(network, "names"):
-            raise InputError(f"detector: expected a network of Ultralytics with names, got {type(model).__name__}")
+        network = _network_of(model)
         if classes is None:
-            labels = cast(dict[int, str] | list[str], network.names)
-            classes = [labels[index] for index in sorted(labels)] if isinstance(labels, dict) else list(labels)
+            classes = _names_of(network)
         if isinstance(input_size, int):
             input_size = input_size, input_size
         super().__init__(
@@ -57,7 +52,25 @@ class UltralyticsDetector(ModuleDetector):
         outputs = self.model(self._pixels(canvas))
         columns = outputs[0] if isinstance(outputs, list | tuple) else outputs
         shape = tuple(columns.shape) if isinstance(columns, Tensor) else (type(columns).__name__,)
-        expected = f"a network that returns all class scores of each box, (B, {4 + self._count}, N)"
+        channels = 4 + self._count
+        expected = f"a network that returns all class scores of each box, (B, {channels}, N)"
         remedy = "use a detection model whose head selects no boxes (end2end off)"
-        check(len(shape) == 3 and shape[1] == 4 + self._count, "detector", expected, f"{shape}; {remedy}")
+        check(len(shape) == 3 and shape[1] == channels, "detector", expected, f"{shape}; {remedy}")
         return keep_classes(decode_yolov8(columns.to(canvas.dtype)), self._places, self._count)
+
+
+def _network_of(model: nn.Module) -> nn.Module:
+    """Find the network in a model of Ultralytics: in an `ultralytics.YOLO` its `model`, else the model itself."""
+    # A network has layers as its own `model`, which have no names of classes.
+    for network in (getattr(model, "model", None), model):
+        if isinstance(network, nn.Module) and hasattr(network, "names"):
+            return network
+    raise InputError(f"detector: expected a network of Ultralytics with names, got {type(model).__name__}")
+
+
+def _names_of(network: nn.Module) -> list[str]:
+    """List the names of a network's classes, which it has by number or in a list."""
+    names = cast(dict[int, str] | list[str], network.names)
+    if isinstance(names, dict):
+        return [names[number] for number in sorted(names)]
+    return list(names)
