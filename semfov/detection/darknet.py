@@ -378,10 +378,9 @@ class Darknet(nn.Module):
         """Find the last layer that reads the output of each layer; itself, if none does."""
         last_reader = {index: index for index in range(-1, len(self.layers))}
         for index, sources in enumerate(self.sources):
-            for source in sources:
-                last_reader[source] = index
-        for index in self._head_numbers():
-            last_reader[index] = len(self.layers)  # the network returns the maps of heads at its end
+            last_reader |= dict.fromkeys(sources, index)
+        # The network returns the maps of heads at its end.
+        last_reader |= dict.fromkeys(self._head_numbers(), len(self.layers))
         return last_reader
 
     def _head_numbers(self) -> list[int]:
@@ -424,13 +423,12 @@ class Darknet(nn.Module):
         """
         steps = []
         origins: dict[int, int] = {}  # of layers that hand on the map of another one
-        for index, (layer, sources) in enumerate(zip(self.layers, self.sources, strict=True)):
-            read = [origins.get(source, source) for source in sources]
-            hands_on = isinstance(layer, nn.Identity) or (isinstance(layer, Route) and layer.groups == 1)
-            if hands_on and len(read) == 1:
-                origins[index] = read[0]
+        for index, layer in enumerate(self.layers):
+            sources = [origins.get(source, source) for source in self.sources[index]]
+            if len(sources) == 1 and _hands_on(layer):
+                origins[index] = sources[0]
                 continue
-            maps = tuple(str(number) for number in read if number >= 0)  # without the image, -1
+            maps = tuple(str(number) for number in sources if number >= 0)  # without the image, -1
             stride = round(float(self.steps[index]))
             steps.append(NetworkStep(str(index), stride, maps, isinstance(layer, Convolution)))
         return {name: int(layer) for name, layer in landmarks(steps).items()}
@@ -496,6 +494,12 @@ class Darknet(nn.Module):
             layer.weight.copy_(weight)
             cast(Tensor, layer.bias).copy_(bias)
         return hashlib.sha256(data).hexdigest()
+
+
+def _hands_on(layer: nn.Module) -> bool:
+    """Tell whether a layer with one source returns the map of this source: a head, a dropout or a plain route."""
+    is_plain_route = isinstance(layer, Route) and layer.groups == 1
+    return is_plain_route or isinstance(layer, nn.Identity)
 
 
 def _read_data(path: Path, name: str, numbers: int) -> bytearray:

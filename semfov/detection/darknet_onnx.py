@@ -75,7 +75,8 @@ class Graph:
         Returns:
             The names of its outputs.
         """
-        names = [f"{self._free_name(op)}_{number}" for number in range(outputs)]
+        name = self._free_name(op)
+        names = [f"{name}_{number}" for number in range(outputs)]
         self._append(op, inputs, names, attributes)
         return names
 
@@ -108,21 +109,19 @@ class Graph:
         return name
 
 
+_ACTIVATIONS: dict[str, Callable[[Graph, str], str]] = {
+    "linear": lambda graph, x: x,
+    "leaky": lambda graph, x: graph.add("LeakyRelu", x, alpha=0.1),
+    "relu": lambda graph, x: graph.add("Relu", x),
+    "mish": lambda graph, x: graph.add("Mul", x, graph.add("Tanh", graph.add("Softplus", x))),
+    "swish": lambda graph, x: graph.add("Mul", x, graph.add("Sigmoid", x)),
+    "logistic": lambda graph, x: graph.add("Sigmoid", x),
+}
+"""Nodes of activations by their Darknet name: `x tanh(ln(1 + e^x))` for mish, `x σ(x)` for swish."""
+
+
 class _NetworkGraph(Graph):
     """The graph of a Darknet network, in float32."""
-
-    def activation(self, kind: str, source: str) -> str:
-        """Add an activation by its Darknet name."""
-        if kind == "linear":
-            return source
-        if kind == "leaky":
-            return self.add("LeakyRelu", source, alpha=0.1)
-        if kind == "relu":
-            return self.add("Relu", source)
-        if kind == "mish":
-            return self.add("Mul", source, self.add("Tanh", self.add("Softplus", source)))
-        gate = self.add("Sigmoid", source)
-        return self.add("Mul", source, gate) if kind == "swish" else gate
 
     def layer(self, layer: nn.Module, *sources: str) -> str:
         """Add a layer that reads the outputs of others."""
@@ -135,7 +134,8 @@ class _NetworkGraph(Graph):
         if isinstance(layer, Route):
             return self._route(layer, sources)
         if isinstance(layer, Shortcut):
-            return self.activation(layer.activation, self.add("Add", *sources))
+            total = self.add("Add", *sources)
+            return _ACTIVATIONS[layer.activation](self, total)
         return sources[0]  # heads are decoded apart from their maps, and dropout does nothing
 
     def _convolution(self, layer: Convolution, source: str) -> str:
@@ -149,7 +149,7 @@ class _NetworkGraph(Graph):
             pads=[vertical, horizontal, vertical, horizontal],
             group=layer.groups,
         )
-        return self.activation(layer.activation, convolved)
+        return _ACTIVATIONS[layer.activation](self, convolved)
 
     def _max_pool(self, layer: MaxPool, source: str) -> str:
         before = layer.padding // 2
@@ -175,10 +175,10 @@ class _NetworkGraph(Graph):
         )
 
     def _route(self, layer: Route, sources: Sequence[str]) -> str:
-        chunks = list(sources)
+        chunks = sources
         if layer.groups > 1:
-            for number, source in enumerate(sources):
-                chunks[number] = self.add_several("Split", source, outputs=layer.groups, axis=1)[layer.group]
+            parts = [self.add_several("Split", source, outputs=layer.groups, axis=1) for source in sources]
+            chunks = [names[layer.group] for names in parts]
         return chunks[0] if len(chunks) == 1 else self.add("Concat", *chunks, axis=1)
 
     def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
@@ -267,8 +267,8 @@ def _network_graph(network: Darknet, layers: Sequence[int]) -> _NetworkGraph:
     graph = _NetworkGraph()
     tensors = {-1: "images"}
     decoded_heads = []
-    for index, (layer, sources) in enumerate(zip(network.layers, network.sources, strict=True)):
-        inputs = [tensors[source] for source in sources]
+    for index, layer in enumerate(network.layers):
+        inputs = [tensors[source] for source in network.sources[index]]
         tensors[index] = graph.layer(layer, *inputs)
         if isinstance(layer, Head):
             step = float(network.steps[index])
@@ -282,8 +282,10 @@ def _network_graph(network: Darknet, layers: Sequence[int]) -> _NetworkGraph:
 
 def _has_gradients(tensors: Sequence[Tensor]) -> bool:
     """Tell whether derivatives of tensors are followed, backwards or forwards."""
-    follows_backwards = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    return follows_backwards or any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+    backwards = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    tangents = [forward_ad.unpack_dual(tensor).tangent for tensor in tensors]
+    forwards = any(tangent is not None for tangent in tangents)
+    return backwards or forwards
 
 
 class _OpenSession(NamedTuple):

@@ -136,9 +136,13 @@ class Detections:
             self.boxes[..., rows, :], self.scores[..., rows, :], self.mask[..., rows], self.confidence[..., rows]
         )
 
+    def _columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """List the tensors, in the order of the attributes."""
+        return self.boxes, self.scores, self.mask, self.confidence
+
     def _mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
         """Apply a function to each tensor."""
-        return type(self)(function(self.boxes), function(self.scores), function(self.mask), function(self.confidence))
+        return type(self)(*map(function, self._columns()))
 
     @classmethod
     def empty(cls, batch: int, classes: int, *, like: Tensor | None = None) -> Self:
@@ -170,13 +174,8 @@ class Detections:
         """
         check(len(images) > 0, "images", "at least one batch of detections", 0)
         longest = max(batch.mask.shape[-1] for batch in images)
-        padded = [batch._padded(longest) for batch in images]
-        return cls(
-            torch.cat([batch.boxes for batch in padded]),
-            torch.cat([batch.scores for batch in padded]),
-            torch.cat([batch.mask for batch in padded]),
-            torch.cat([batch.confidence for batch in padded]),
-        )
+        padded = [batch._padded(longest)._columns() for batch in images]
+        return cls(*map(torch.cat, zip(*padded, strict=True)))
 
     def _padded(self, length: int) -> Self:
         """Pad the detections to a length."""
@@ -337,6 +336,7 @@ def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
     Returns:
         `(B,)`, or `(B, T)`; 0 without detections.
     """
-    scores = detections.scores * detections.mask[..., None]
-    highest = scores.amax(1) if scores.shape[1] else scores.new_zeros(len(scores), scores.shape[-1])
+    scores = detections.scores * detections.mask[..., None]  # (B, L, K+1)
+    batch, rows, components = scores.shape
+    highest = scores.amax(1) if rows else scores.new_zeros(batch, components)
     return highest[..., target]

@@ -323,7 +323,8 @@ def check_images(images: Tensor) -> None:
     """
     is_tensor = isinstance(images, Tensor)
     check(is_tensor, "images", "a batch of tensors", f"a {type(images).__name__}; give semfov.as_image(picture)[None]")
-    are_rgb = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0 and images.is_floating_point()
+    has_shape = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0
     expected = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
-    check(are_rgb, "images", expected, f"{images.dtype} of shape {tuple(images.shape)}")
+    got = f"{images.dtype} of shape {tuple(images.shape)}"
+    check(has_shape and images.is_floating_point(), "images", expected, got)
     check_pixels(images, "images")

@@ -245,10 +245,13 @@ def _cut_by_windows(boxes: Tensor, windows: Tensor, side: Tensor, size: tuple[fl
     else:
         upper = torch.tensor(size)
     border = _BORDER * side[:, None]
-    distance = boxes - windows
-    at_low_border = (distance <= border)[:, :2] & (windows[:, :2] > lower)
-    at_high_border = (distance >= -border)[:, 2:] & (windows[:, 2:] < upper)
-    return at_low_border.any(-1) | at_high_border.any(-1)
+    distance = boxes - windows  # (M, 4), from the left, upper, right and lower border
+    at_low_border = distance[:, :2] <= border
+    at_high_border = distance[:, 2:] >= -border
+    # A border of the picture is no cut.
+    cut_low = at_low_border & (windows[:, :2] > lower)
+    cut_high = at_high_border & (windows[:, 2:] < upper)
+    return cut_low.any(-1) | cut_high.any(-1)
 
 
 def merge_looks(
@@ -367,14 +370,15 @@ def _overlapping_pairs(
         corners = np.concatenate([corners, next_turn])
         classes = np.tile(classes, 2)
     # Classes are moved apart, so that neighbours along x are of one class.
-    shift = classes * (2 * np.abs(corners).max(initial=0) + 1)
+    farthest = np.abs(corners).max(initial=0)
+    shift = classes * (2 * farthest + 1)
     start = corners[:, 0] + shift
     end = corners[:, 2] + shift
     rank = start.argsort(kind="stable")
     first, second = neighbours(start[rank], end[rank])
     first = rank[first]
     second = rank[second]
-    x1, y1, x2, y2 = np.ascontiguousarray(corners.T)
+    x1, y1, x2, y2 = np.ascontiguousarray(corners.T)  # columns are read faster where each is contiguous
     shared = intersection(x1, y1, x2, y2, first, second)
     if around is not None:
         first = first % count
@@ -411,7 +415,8 @@ def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     count = np.maximum(stop - np.arange(1, len(start) + 1), 0)
     first = np.arange(len(start)).repeat(count)
     # The pairs of an interval stand together, and the last of them is with interval `stop - 1`.
-    second = np.arange(len(first)) + (stop - count.cumsum()).repeat(count)
+    to_second = stop - count.cumsum()
+    second = np.arange(len(first)) + to_second.repeat(count)
     return first, second
 
 

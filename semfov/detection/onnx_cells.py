@@ -101,5 +101,6 @@ def cell_grid(
     for stride in strides:
         columns, rows = (torch.arange(side, device=device, dtype=dtype) + offset for side in cells(canvas, stride))
         x, y = torch.meshgrid(columns, rows, indexing="xy")
-        levels.append(torch.stack([x, y, torch.full_like(x, stride)], -1).reshape(-1, 3))
+        level = torch.stack([x, y, torch.full_like(x, stride)], -1)  # (rows, columns, 3)
+        levels.append(level.reshape(-1, 3))
     return torch.cat(levels)

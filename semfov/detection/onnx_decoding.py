@@ -133,7 +133,8 @@ def decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
         _check_numbers_of_classes(numbers[scores > 0], classes)
     # Rows without a score are padding, whose class may be any number, or NaN.
     index = numbers.nan_to_num(0).long().clamp(0, max(classes - 1, 0))
-    vectors = scores.new_zeros(*scores.shape, classes).scatter(-1, index[..., None], scores[..., None])
+    nothing = scores.new_zeros(*scores.shape, classes)  # (B, N, K)
+    vectors = nothing.scatter(-1, index[..., None], scores[..., None])
     return Candidates(rows[..., :4], vectors)
 
 
@@ -166,7 +167,8 @@ def decode_selected(outputs: Mapping[str, Tensor], classes: int | None) -> Candi
     scores = selected["scores"] if "scores" in selected else boxes[..., 4]
     if "count" in selected:
         place = torch.arange(scores.shape[1], device=scores.device)
-        scores = scores * (place < selected["count"].reshape(-1, 1))
+        is_box = place < selected["count"].reshape(-1, 1)  # (B, N); what follows is padding
+        scores = scores * is_box
     rows = torch.cat([boxes[..., :4], scores[..., None], labels[..., None]], -1)
     return decode_end_to_end(rows, classes)
 
@@ -192,9 +194,9 @@ def decode_distances(scores: Tensor, distances: Tensor, grid: Tensor) -> Candida
     check(bins > 0 and rest == 0, "distances", expected, shape)
     stride = grid[..., 2:]
     point = grid[..., :2] * stride
-    chances = distances.unflatten(-1, (4, bins)).softmax(-1)
+    chances = distances.unflatten(-1, (4, bins)).softmax(-1)  # (B, N, 4, bins)
     bin_numbers = torch.arange(bins).to(distances)
-    distance = chances @ bin_numbers * stride
+    distance = chances @ bin_numbers * stride  # (B, N, 4), to the left, upper, right and lower side
     upper_left = point - distance[..., :2]
     lower_right = point + distance[..., 2:]
     boxes = torch.cat([upper_left, lower_right], -1)
@@ -214,7 +216,8 @@ def decode_detr(logits: Tensor, boxes: Tensor, canvas: Canvas) -> Candidates:
     """
     check_shape(logits, "logits", None, None, None)
     scores = logits.softmax(-1)
-    return Candidates(fraction_corners(boxes, canvas), scores[..., :-1], background=scores[..., -1])
+    no_object = scores[..., -1]
+    return Candidates(fraction_corners(boxes, canvas), scores[..., :-1], background=no_object)
 
 
 def corners(boxes: Tensor) -> Tensor:

@@ -129,13 +129,17 @@ def recognise(signature: Signature, run: Callable[[], _Outputs] | None = None) -
     _check_has_scores(signature)
     names = [name for name, head in HEADS.items() if head.recognises(signature)]
     if len(names) > 1 and run is not None:
-        outputs = run()
-        # Where no head places boxes on the canvas, the message names all that fit.
-        names = [name for name in names if _places_boxes(HEADS[name], outputs, signature)] or names
+        names = _placing_boxes(names, run(), signature)
     # Outputs with YOLOX's own names are YOLOX's, even where the values do not tell which form they have.
     if len(names) == 1 or names == ["yolox", "yolox-decoded"]:
         return names[0]
     raise InputError(_unrecognised(signature, names))
+
+
+def _placing_boxes(names: list[str], outputs: _Outputs, signature: Signature) -> list[str]:
+    """List the heads that place boxes on the canvas; all, if none does, so that a message names them."""
+    placing = [name for name in names if _places_boxes(HEADS[name], outputs, signature)]
+    return placing or names
 
 
 def _unrecognised(signature: Signature, names: Sequence[str]) -> str:
@@ -154,11 +158,11 @@ def _check_has_scores(signature: Signature) -> None:
     """Raise `InputError` for rows of 7: image, box, class and score, which are left after non-maximum suppression."""
     if signature.layout != "rows":
         return
-    _, columns = signature.rows.sides
-    # With three classes, rows of 7 are boxes and all scores.
+    rows, columns = signature.rows.sides
+    name, _ = signature.outputs[0]
+    # With three classes, rows of 7 are boxes and all scores; with as many rows as cells, no box was left out.
     selected = columns == 7 and signature.classes != 3 and not signature.rows.cells.anchors
-    name, shape = signature.outputs[0]
-    output = f"output {name} (1, {shape[1]}, {shape[2]})"
+    output = f"output {name} (1, {rows}, {columns})"
     check(not selected, output, "all class scores of each box", "boxes without them; export the model without NMS")
 
 
@@ -416,11 +420,12 @@ class _DistanceMaps(_CellsHead):
     """
 
     def recognises(self, signature: Signature) -> bool:
-        if signature.layout != "levels" or any(len(shape) != 3 for _, shape in signature.outputs):
+        shapes = [shape for _, shape in signature.outputs]
+        if signature.layout != "levels" or any(len(shape) != 3 for shape in shapes):
             return False
-        levels = len(signature.outputs) // 2
-        cells = [cell_count(signature.canvas, [stride]) for stride in STRIDES[:levels]]
-        return sorted(shape[1] for _, shape in signature.outputs) == sorted(cells * 2)
+        strides = STRIDES[: len(shapes) // 2]
+        cells = [cell_count(signature.canvas, [stride]) for stride in strides]
+        return sorted(shape[1] for shape in shapes) == sorted(cells * 2)
 
     def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
         strides = STRIDES[: len(outputs) // 2]
@@ -516,11 +521,15 @@ class _RtDetr(_SigmoidQueries):
             # Classes that are unknown are COCO's.
             classes = 80 if signature.classes is None else signature.classes
             return query_logits(signature.shapes)[-1] == classes
-        if signature.layout != "rows" or signature.rows.cells.anchors or signature.classes is None:
+        return signature.layout == "rows" and self._recognises_rows(signature.rows, signature)
+
+    def _recognises_rows(self, rows: Rows, signature: Signature) -> bool:
+        """Tell whether a model with one output may have this head; only its number of classes tells."""
+        if signature.classes is None or rows.cells.anchors:
             return False
         # Rows of 6 are boxes and the scores of two classes, or a box, its score and its class.
-        selected = signature.rows.sides[1] == 6 and signature.selects
-        return signature.rows.hold_scores_and(4) and not selected
+        selected = rows.sides[1] == 6 and signature.selects
+        return rows.hold_scores_and(4) and not selected
 
 
 class _RfDetr(_SigmoidQueries):
@@ -559,9 +568,8 @@ def _rows(outputs: _Outputs, canvas: Canvas, *, prefer_columns: bool = False) ->
 
     `prefer_columns` takes its columns as boxes where both sides, or neither, are as many as cells.
     """
-    output = _single(outputs)
+    output = _checked(_single(outputs))
     counts = box_counts(canvas)
-    check_shape(output, "outputs", None, None, None)
     rows_fit, columns_fit = (side in counts for side in output.shape[1:])
-    transposed = (columns_fit and not rows_fit) or (prefer_columns and rows_fit == columns_fit)
-    return output.mT if transposed else output
+    boxes_are_columns = prefer_columns if rows_fit == columns_fit else columns_fit
+    return output.mT if boxes_are_columns else output

@@ -112,19 +112,17 @@ class Signature:
         """
         names = self.shapes.keys()
         selected = selected_outputs(self.shapes)
+        _, first_shape = self.outputs[0]
         # The order tells apart outputs that fit two layouts: the one with more of its own names comes first.
-        if "pred_boxes" in names and names & {*_QUERY_LOGITS}:
-            return "queries"
-        if {"dets", "labels"} <= names and len(self.shapes["labels"]) == 3:
-            return "dets"
-        if "boxes" in selected and len(selected.get("labels", ())) == 2:
-            return "selection"
-        if "boxes" in names and names & {"classes", "scores"}:
-            return "candidates"
-        if len(names) > 1:
-            return "levels"
-        _, shape = self.outputs[0]
-        return "rows" if len(shape) == 3 else "unknown"
+        layouts: dict[Layout, bool] = {
+            "queries": "pred_boxes" in names and not names.isdisjoint(_QUERY_LOGITS),
+            "dets": "dets" in names and len(self.shapes.get("labels", ())) == 3,
+            "selection": "boxes" in selected and len(selected.get("labels", ())) == 2,
+            "candidates": "boxes" in names and not names.isdisjoint(("classes", "scores")),
+            "levels": len(names) > 1,
+            "rows": len(first_shape) == 3,
+        }
+        return next((layout for layout, is_fit in layouts.items() if is_fit), "unknown")
 
     @cached_property
     def rows(self) -> Rows:

@@ -54,7 +54,7 @@ class Preprocessing:
     def __call__(self, canvas: Tensor) -> Tensor:
         """Convert a canvas `(B, 3, H, W)` to the input of the network, a new tensor of the same shape."""
         check_shape(canvas, "canvas", None, 3, None, None)
-        planes = []
+        planes = []  # (B, H, W) each
         # Plane by plane, as each stays in the cache between the operations.
         for plane, mean, std in zip(self._in_channel_order(canvas), self.mean, self.std, strict=True):
             scaled = plane * (self.scale / std)

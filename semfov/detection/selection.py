@@ -81,13 +81,20 @@ def check_numbers(image: int, low: float, high: float, **named: Tensor | None) -
         InputError: some are NaN, infinite or outside the range.
     """
     for name, numbers in named.items():
-        if numbers is None or not numbers.numel() or not values_known(numbers):
+        if numbers is None or _lie_within(numbers, low, high):
             continue
-        least, greatest = map(float, numbers.detach().aminmax())  # one pass; NaN and infinite numbers are among them
-        if not (low <= least and greatest <= high and math.isfinite(greatest - least)):
-            where = f"detector: {name.replace('_', ' ')} in image {image}"
-            check_finite(numbers, where)
-            check(False, where, f"numbers in [{low:g}, {high:g}]", "numbers outside")
+        where = f"detector: {name.replace('_', ' ')} in image {image}"
+        check_finite(numbers, where)
+        check(False, where, f"numbers in [{low:g}, {high:g}]", "numbers outside")
+
+
+def _lie_within(numbers: Tensor, low: float, high: float) -> bool:
+    """Tell whether all numbers are finite and in a range, or are not known yet, as in a graph that is traced."""
+    if not numbers.numel() or not values_known(numbers):
+        return True
+    # One pass tells both, as the least and the greatest number are NaN where one number is.
+    least, greatest = map(float, numbers.detach().aminmax())
+    return low <= least and greatest <= high and math.isfinite(greatest - least)
 
 
 def _select_of_image(
@@ -100,8 +107,9 @@ def _select_of_image(
     check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
     if placement is not None:
         boxes = placement.boxes_to_image(boxes)
-    # Labels are read only where boxes suppress those of their own class.
-    labels = candidates.classes[image, index].argmax(-1) if selection.per_class else index
+    labels = index  # any numbers do where they are not read
+    if selection.per_class:
+        labels = candidates.classes[image, index].argmax(-1)
     survivors = suppress(boxes, confidence.index_select(0, index), labels, selection)
 
     # The scores of a few boxes are read after suppression, not those of all cells before.
@@ -136,7 +144,8 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
         boxes = boxes.float()
         confidence = confidence.float()
     # A box without area overlaps none, so nothing would suppress it.
-    with_area = (boxes[:, 2:] > boxes[:, :2]).all(-1).nonzero()[:, 0]
+    has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
+    with_area = has_area.nonzero()[:, 0]
     ranked, order = confidence[with_area].sort(descending=True, stable=True)
     order = with_area[order]
     boxes = boxes.index_select(0, order)
@@ -145,9 +154,10 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
         return order[_survivors(boxes, labels, selection)]
     from torchvision.ops import batched_nms, nms  # with it comes a compiler, which takes seconds to import
 
-    survivors = (
-        batched_nms(boxes, ranked, labels, selection.iou) if selection.per_class else nms(boxes, ranked, selection.iou)
-    )
+    if selection.per_class:
+        survivors = batched_nms(boxes, ranked, labels, selection.iou)
+    else:
+        survivors = nms(boxes, ranked, selection.iou)
     return order[survivors[: selection.limit]]
 
 
@@ -162,7 +172,7 @@ def _survivors(boxes: Tensor, labels: Tensor, selection: Selection) -> Tensor:
     for start in range(0, len(corners), _BLOCK):
         block = np.arange(start, min(start + _BLOCK, len(corners)))
         rivals = np.concatenate([survivors, block])
-        overlaps = _overlaps(corners[rivals], corners[block], selection.iou)
+        overlaps = _overlaps(corners[rivals], corners[block], selection.iou)  # (rivals, block)
         if selection.per_class:
             overlaps &= classes[rivals, None] == classes[block]
         by_earlier = overlaps[: len(survivors)]

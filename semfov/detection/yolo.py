@@ -81,7 +81,7 @@ def decode_yolo(
     """
     batch, channels, rows, columns = raw.shape
     check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))
-    numbers = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
+    numbers = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)  # (B, h, w, A, 5 + K)
     offset = numbers[..., 0:2].sigmoid()
     growth = numbers[..., 2:4].exp()
     scores = numbers[..., 4:].sigmoid()
@@ -93,8 +93,8 @@ def decode_yolo(
     half = growth * half_anchors
     boxes = torch.cat([centre - half, centre + half], -1)
 
-    objectness = scores[..., 0].flatten(1)
-    classes = scores[..., 1:].flatten(1, 3)
+    objectness = scores[..., 0].flatten(1)  # (B, h w A)
+    classes = scores[..., 1:].flatten(1, 3)  # (B, h w A, K)
     return Candidates(boxes.reshape(batch, -1, 4), classes, objectness)
 
 
@@ -148,10 +148,12 @@ class YoloV3(Detector):
         self, canvas: Tensor, layers: Sequence[str] | None = None
     ) -> tuple[Candidates, dict[str, Tensor]]:
         """Compute all boxes and feature maps in one pass; layers are also named by their number in the cfg."""
-        named = self.network.landmarks()
-        numbers = {**{str(number): number for number in range(len(self.network.layers))}, **named}
-        wanted = [*named] if layers is None else layers
-        return self._compute(canvas, {layer: numbers[layer] for layer in choose_layers(wanted, [*numbers], self.name)})
+        by_place = self.network.landmarks()
+        by_number = {str(number): number for number in range(len(self.network.layers))}
+        numbers = {**by_number, **by_place}
+        wanted = [*by_place] if layers is None else layers
+        chosen = choose_layers(wanted, [*numbers], self.name)
+        return self._compute(canvas, {layer: numbers[layer] for layer in chosen})
 
     def _compute(self, canvas: Tensor, layers: Mapping[str, int]) -> tuple[Candidates, dict[str, Tensor]]:
         """Compute all boxes of all heads, and the maps of layers, by the runtime that this canvas allows.
