@@ -226,8 +226,10 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
         check(inside, "target", f"a class index from 0 to {components - 1}", target.tolist())
     if target.ndim == 0:
         return values[..., target]
+    # `(B, 1, …, 1)`: the class of an episode, at all its places.
     index = target.reshape(*target.shape, *[1] * (values.ndim - target.ndim))
-    return values.take_along_dim(index.expand(*values.shape[:-1], 1), -1)[..., 0]
+    column = values.take_along_dim(index.expand(*values.shape[:-1], 1), -1)
+    return column[..., 0]
 
 
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
@@ -240,9 +242,12 @@ def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     Returns:
         `(B, ...)`.
     """
-    on_cpu = rows[0].device.type == "cpu"
-    together = 1 if on_cpu else max(1, _TOGETHER // max(1, rows[0].shape[1:].numel()))
-    if not values_known(*rows) or len(rows[0]) <= together:
+    first = rows[0]
+    together = 1
+    if first.device.type != "cpu":
+        elements_of_row = max(1, first.shape[1:].numel())
+        together = max(1, _TOGETHER // elements_of_row)
+    if not values_known(*rows) or len(first) <= together:
         return function(*rows)
     parts = zip(*(row.split(together) for row in rows), strict=True)
     return torch.cat([function(*part) for part in parts])

@@ -92,7 +92,8 @@ def product(beta: Tensor, likelihood: Tensor) -> Tensor:
     joint = beta * likelihood
     # The floor keeps parameters positive after any number of likelihoods of 0.
     joint = joint.clamp(min=torch.finfo(joint.dtype).tiny)
-    return (1 + beta.sum(-1, keepdim=True)) * joint / joint.sum(-1, keepdim=True)
+    total = 1 + beta.sum(-1, keepdim=True)
+    return total * joint / joint.sum(-1, keepdim=True)
 
 
 @_rule
@@ -142,7 +143,9 @@ def semba(beta: Tensor, likelihood: Tensor) -> Tensor:
     tensor([1.5000, 1.2500])
     """
     joint = beta * likelihood
-    return torch.addcdiv(beta, joint, joint.sum(-1, keepdim=True) + likelihood.amin(-1, keepdim=True))
+    expected = joint.sum(-1, keepdim=True)  # D
+    least = likelihood.amin(-1, keepdim=True)
+    return torch.addcdiv(beta, joint, expected + least)
 
 
 def check_parameters(beta: Tensor) -> None:
@@ -207,7 +210,8 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     check_parameters(beta)
     _check_footprint(footprint)
     # Kinds of numbers may differ; the result has that of the belief.
-    return fuse_scaled(beta, scale_covering(likelihood.to(beta.dtype), footprint), footprint, rule)
+    scaled = scale_covering(likelihood.to(beta.dtype), footprint)
+    return fuse_scaled(beta, scaled, footprint, rule)
 
 
 def _check_footprint(footprint: Tensor) -> None:
@@ -239,7 +243,8 @@ def fuse_scaled(beta: Tensor, scaled: Tensor, footprint: Tensor, rule: str) -> T
         return _fuse_everywhere(beta, scaled, footprint, update)
     # The gradient of a block that is written into a larger tensor would pass through all of that tensor.
     recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (beta, scaled, footprint))
-    episodes = max(1, _BLOCK // max(1, beta[:1].numel()))
+    elements = max(1, beta[:1].numel())
+    episodes = max(1, _BLOCK // elements)  # of a block, which stays in the cache of the processor
     if recorded or beta.device.type != "cpu" or len(beta) <= episodes:
         return _fuse_covered(beta.clone(memory_format=torch.contiguous_format), scaled, footprint, update)
     fused = torch.empty_like(beta, memory_format=torch.contiguous_format)
@@ -279,11 +284,11 @@ def _fuse_covered(beta: Tensor, scaled: Tensor, footprint: Tensor, update: _Rule
     # The pairs of a cell and a detection that covers it, by the rank of the detection among those of its cell.
     rank = covered.cumsum(1, dtype=torch.int32)[image, detection, cell]
     order = rank.argsort(stable=True)
-    steps = torch.bincount(rank)[1:].tolist()
+    steps = torch.bincount(rank)[1:].tolist()  # pairs of each rank; ranks begin at 1
     cells = (image * beta.shape[1] + cell)[order].split(steps)
     detections = (image * scaled.shape[1] + detection)[order].split(steps)
-    parameters = beta.view(-1, beta.shape[-1])
-    evidence = scaled.reshape(-1, beta.shape[-1])
+    parameters = beta.view(-1, beta.shape[-1])  # (B · X·Y, K+1), the memory of `beta`
+    evidence = scaled.reshape(-1, beta.shape[-1])  # (B · L, K+1)
     exponents = None
     if footprint.is_floating_point():
         exponents = footprint[image, detection, cell][order, None].to(evidence).split(steps)
@@ -306,4 +311,5 @@ def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
     Returns:
         `(B, L, K+1)`, with a maximum of 1 in each row.
     """
-    return _scale_likelihood(torch.where((footprint > 0).any(-1, keepdim=True), likelihood, 1.0))
+    covers_cell = (footprint > 0).any(-1, keepdim=True)  # (B, L, 1)
+    return _scale_likelihood(torch.where(covers_cell, likelihood, 1.0))

@@ -182,12 +182,16 @@ class Grid:
         lines = (layout.start, layout.end, layout.middle, layout.half)
         start, end, middle, half = (line if line.ndim == 1 else line[:, None] for line in lines)
         if rule in ("overlap", "soft"):
-            shared = self._in_cells((start < upper) & (end > lower) & (upper > lower), torch.logical_and)
+            shares_length = (start < upper) & (end > lower) & (upper > lower)
+            shared = self._in_cells(shares_length, torch.logical_and)
             if rule == "overlap":
                 return shared
-            offset = (middle - (lower + upper) / 2) / torch.hypot((upper - lower) / 2, half)
+            # x / √(a² + u²) of the formula, with a factor of 3/2 in the exponent.
+            centre = (lower + upper) / 2
+            offset = (middle - centre) / torch.hypot((upper - lower) / 2, half)
             return self._in_cells(-1.5 * offset.square(), torch.add).exp() * shared
-        central_cell = self.cell_of((boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5)
+        box_centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
+        central_cell = self.cell_of(box_centre)
         covered = central_cell[..., None] == torch.arange(len(self), device=boxes.device)
         if rule == "centre":
             inside = self._in_cells((middle >= lower) & (middle < upper), torch.logical_and)
@@ -197,7 +201,7 @@ class Grid:
     def _in_cells(self, lines: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Join the values of the columns and rows `(..., X+Y)` in every cell, `(..., X·Y)`."""
         columns, rows = lines.split([self.columns, self.rows], -1)
-        return join(columns[..., None, :], rows[..., :, None]).flatten(-2)
+        return join(columns[..., None, :], rows[..., :, None]).flatten(-2)  # row by row
 
     def box_distance(self, boxes: Tensor, fixation: Tensor) -> Tensor:
         """Measure the distance from the centre of each box to the fixation.
@@ -257,8 +261,9 @@ class Grid:
         """
         if self.extent.ndim == 1:
             return self.distance(self.centres)
-        offset = self.centres[..., :, None, :] - self.centres[..., None, :, :]
-        return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1)[..., None, None]
+        offset = self.centres[..., :, None, :] - self.centres[..., None, :, :]  # (B, X·Y, X·Y, 2)
+        longer_side = self.extent.amax(-1)[..., None, None]
+        return torch.linalg.vector_norm(offset, dim=-1) / longer_side
 
 
 def _layout(columns: int, rows: int, extent: Tensor) -> _Layout:
@@ -273,15 +278,25 @@ def _layout(columns: int, rows: int, extent: Tensor) -> _Layout:
         The layout; its tensors have a leading B for a batch of sizes, all but the axis.
     """
     device = extent.device
+    # All columns, and then all rows, `(X+Y,)`: axis 0 or 1, and number along it.
     axis = torch.cat([torch.full((columns,), 0, device=device), torch.full((rows,), 1, device=device)])
     place = torch.cat([torch.arange(columns, device=device), torch.arange(rows, device=device)])
-    cell = extent / extent.new_tensor((columns, rows))
-    step = cell.index_select(-1, axis)
+    cell = extent / extent.new_tensor((columns, rows))  # (..., 2)
+    step = cell.index_select(-1, axis)  # (..., X+Y)
     middle = (place + 0.5) * step - 0.5
     x = middle[..., None, :columns]
     y = middle[..., columns:, None]
     centres = torch.stack(torch.broadcast_tensors(x, y), -1).flatten(-3, -2)
-    return _Layout(axis, place * step, (place + 1) * step, middle + 0.5, step / 2, centres, cell, extent.amax(-1))
+    return _Layout(
+        axis=axis,
+        start=place * step,
+        end=(place + 1) * step,
+        middle=middle + 0.5,
+        half=step / 2,
+        centres=centres,
+        cell=cell,
+        longest=extent.amax(-1),
+    )
 
 
 @constant

@@ -103,13 +103,16 @@ def closer_features(
         Features `(7,)`, and the box of the target `(4,)`: that of detection m if it overlaps the examined one enough.
     """
     before = [presence, cell, evidence]
-    boxes = closer.boxes[0][closer.mask[0]]
-    scores = closer.scores[0][closer.mask[0]]
+    boxes = closer.boxes[0][closer.mask[0]]  # (L, 4)
+    scores = closer.scores[0][closer.mask[0]]  # (L, K+1)
     if not len(boxes):
-        return box.new_tensor([*before, 0.0, 0.0, 0.0, 0.0]).logit(_FLOOR), box
+        nothing = [0.0, 0.0, 0.0, 0.0]
+        return box.new_tensor([*before, *nothing]).logit(_FLOOR), box
     score = scores[:, target]
     best, overlap = _best_detection(boxes, score, box)
-    rival = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
+    # The largest score of another class than the target; background is none.
+    no_rivals = torch.tensor([0, target], device=scores.device)
+    rival = scores.index_fill(1, no_rivals, 0).amax(-1)
     after = [
         float(score[best] * overlap[best]),
         float(score.max()),
@@ -153,5 +156,6 @@ def follow_target(box: Tensor, detections: Detections, target: int) -> Tensor:
     best, overlap = _best_detection(boxes, scores, box)
     if float(overlap[best]) < _MATCHED:
         return box
+    # The mean shift of two opposite corners is that of the middle.
     shift = (boxes[best] - box).view(2, 2).mean(0)
     return box + shift.repeat(2)

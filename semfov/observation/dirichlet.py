@@ -73,7 +73,8 @@ def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
     # A score of 0 counts for nothing where its parameter is 1: 0 · ln 0 is 0 there.
     scores = torch.where((alpha == 1) & log_scores.isneginf(), 0.0, log_scores)
     dtype = torch.promote_types(alpha.dtype, log_scores.dtype)
-    return (((alpha.double() - 1) * scores.double()).sum(-1) - constant).to(dtype)
+    linear = ((alpha.double() - 1) * scores.double()).sum(-1)
+    return (linear - constant).to(dtype)
 
 
 def mean(alpha: Tensor) -> Tensor:

@@ -52,9 +52,10 @@ def fit_tables(
     pools = [_pool(objects, level, minimum) for level in range(len(objects))]
     widened = {level: pool for level, pool in enumerate(pools) if len(pool) > 1}
     if widened:
-        text = ", ".join(f"level {level} from levels {pool[0]} to {pool[-1]}" for level, pool in widened.items())
+        sources = [f"level {level} from levels {pool[0]} to {pool[-1]}" for level, pool in widened.items()]
+        text = f"levels with fewer than {minimum} objects are fitted with neighbours: {', '.join(sources)}"
         # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
-        warnings.warn(f"levels with fewer than {minimum} objects are fitted with neighbours: {text}", stacklevel=4)
+        warnings.warn(text, stacklevel=4)
     cells = _pooled(statistics, pools)
     classes = statistics.sum(1)
 
@@ -123,5 +124,6 @@ def _estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:
     check(shrinkage > 0, "shrinkage", "a positive number of pseudo-counts", shrinkage)
     count = count.to(torch.float64)
     pooled = count.sum(1, keepdim=True) + 1
-    pooled = pooled / pooled.sum()
-    return ((count + shrinkage * pooled) / (count.sum(0) + shrinkage)).log()
+    pooled = pooled / pooled.sum()  # π_k, (K+1, 1)
+    frequency = (count + shrinkage * pooled) / (count.sum(0) + shrinkage)
+    return frequency.log()

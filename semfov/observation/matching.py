@@ -26,7 +26,7 @@ def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
     check_shape(others, "others", None, 4)
     first = as_positions(boxes)
     second = as_positions(others)
-    upper_left = torch.maximum(first[:, None, :2], second[None, :, :2])
+    upper_left = torch.maximum(first[:, None, :2], second[None, :, :2])  # (M, N, 2), of the shared part
     lower_right = torch.minimum(first[:, None, 2:], second[None, :, 2:])
     shared = (lower_right - upper_left).clamp(min=0).prod(-1)
     union = _area(first)[:, None] + _area(second)[None] - shared
@@ -71,7 +71,7 @@ def match(boxes: Tensor, truth: Tensor, labels: Tensor, *, iou: float = 0.5) -> 
         best, index = overlap[detection].max(0)
         if best >= iou:
             matched[detection] = labels[index]
-            overlap[:, index] = -1.0
+            overlap[:, index] = -1.0  # no other detection matches this object
     return matched
 
 
@@ -95,17 +95,20 @@ def right_boxes(objects: Objects, annotation: Annotation) -> Tensor:
         of_one_class = torch.ones(len(single)).long()
         hits = (match(boxes, single.to(boxes), of_one_class, iou=SAME_OBJECT) > 0).long()
         if len(crowds):
-            hits[(hits == 0) & (_share_inside(boxes, crowds) >= SAME_OBJECT).any(-1)] = -1
+            in_crowd = (_share_inside(boxes, crowds) >= SAME_OBJECT).any(-1)
+            hits[in_crowd & (hits == 0)] = -1
         verdicts[numbers] = hits
     return verdicts
 
 
 def _share_inside(boxes: Tensor, others: Tensor) -> Tensor:
     """Compute the share of the area of each box `(N, 4)` that lies in each other box `(M, 4)`, `(N, M)`."""
-    low = torch.maximum(boxes[:, None, :2], others[:, :2])
+    low = torch.maximum(boxes[:, None, :2], others[:, :2])  # (N, M, 2)
     high = torch.minimum(boxes[:, None, 2:], others[:, 2:])
-    area = (boxes[:, 2:] - boxes[:, :2]).prod(-1, keepdim=True).clamp(min=1e-6)
-    return (high - low).clamp(min=0).prod(-1) / area
+    shared = (high - low).clamp(min=0).prod(-1)
+    sides = boxes[:, 2:] - boxes[:, :2]
+    area = sides.prod(-1, keepdim=True).clamp(min=1e-6)
+    return shared / area
 
 
 def inside_frame(boxes: Tensor, size: tuple[int, int]) -> Tensor:

@@ -54,7 +54,7 @@ class MissCounts:
         present[0] = ~objects.any(0)
         for label in labels.unique():
             present[label] = objects[labels == label].any(0)
-        one_hot = torch.nn.functional.one_hot(level, self.total.shape[1])
+        one_hot = torch.nn.functional.one_hot(level, self.total.shape[1])  # (X·Y, N)
         self.total += present.long() @ one_hot
         self.missed += (present & ~detected).long() @ one_hot
         return self
@@ -104,7 +104,9 @@ class MissCounts:
         check(shrinkage > 0, "shrinkage", "a positive number", shrinkage)
         missed = self.missed.double()
         total = self.total.double()
-        pooled = (1 + missed[1:].sum(0)) / (2 + total[1:].sum(0))
-        objects = (missed[1:] + shrinkage * pooled) / (total[1:] + shrinkage)
+        missed_objects = missed[1:]
+        all_objects = total[1:]
+        pooled = (1 + missed_objects.sum(0)) / (2 + all_objects.sum(0))  # (N,)
+        objects = (missed_objects + shrinkage * pooled) / (all_objects + shrinkage)
         background = (1 + missed[:1]) / (2 + total[:1])
         return torch.cat([background, objects]).to(torch.get_default_dtype())

@@ -174,7 +174,9 @@ def inverse_digamma(y: Tensor) -> Tensor:
 
 def _guess(y: Tensor) -> Tensor:
     """Guess the inverse of the digamma function: two asymptotes that meet at `_KNEE`."""
-    return torch.where(y >= _KNEE, y.exp() + 0.5, -1 / (y.clamp(max=_KNEE) + _EULER))
+    of_large = y.exp() + 0.5  # ψ(x) is about ln(x - 1/2)
+    of_small = -1 / (y.clamp(max=_KNEE) + _EULER)  # ψ(x) is about -1/x - γ
+    return torch.where(y >= _KNEE, of_large, of_small)
 
 
 def _at_precision(rows: Tensor, precision: float) -> Tensor:
@@ -267,7 +269,7 @@ def _newton(rows: Tensor) -> Tensor:
     active = torch.arange(len(rows), device=rows.device)
     alpha = result.clone()
     for _ in range(_ROUNDS):
-        step = _response(alpha, _residual(alpha, rows)) / alpha
+        step = _response(alpha, _residual(alpha, rows)) / alpha  # d ln α = dα / α
         length = step.abs().amax(-1)
         # Indices: a GPU is waited for whenever a mask is used.
         going = (length > _tolerance(alpha.sum(-1))).nonzero()[:, 0]
@@ -348,7 +350,8 @@ def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
     """Run L-BFGS on ln α, in coordinates in which the Fisher information `diag(α² ψ'(α)) - ψ'(A) α αᵀ` is 1."""
     rates = torch.polygamma(1, start).reciprocal()
     total = rates.sum(-1, keepdim=True)
-    rest = (1 - torch.polygamma(1, start.sum(-1, keepdim=True)) * total).clamp(min=torch.finfo(rows.dtype).eps)
+    precision = start.sum(-1, keepdim=True)
+    rest = (1 - torch.polygamma(1, precision) * total).clamp(min=torch.finfo(rows.dtype).eps)
     offset_scale = rates.sqrt() / start
     shift_scale = rates / start * (total * rest).rsqrt()
     offset = torch.zeros_like(rows, requires_grad=True)
@@ -370,7 +373,9 @@ def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
         alpha = current()
         # Differences are taken term by term: the difference of two sums would lose digits.
         linear = ((alpha - start) * rows).sum(-1)
-        gain = (alpha.sum(-1).lgamma() - of_total) - (alpha.lgamma() - of_each).sum(-1) + linear
+        gain_of_total = alpha.sum(-1).lgamma() - of_total
+        loss_of_each = (alpha.lgamma() - of_each).sum(-1)
+        gain = gain_of_total - loss_of_each + linear
         decrease = -gain.sum()
         decrease.backward()
         return decrease

@@ -59,7 +59,9 @@ def visibility(model: FovealObservationModel) -> Tensor:
     noise_mean, noise_variance = _mixed(*moments, model.miss_rate[:1])
     deviation = ((signal_variance + noise_variance) / 2).sqrt()
     difference = signal_mean - noise_mean
-    return torch.where(deviation > 0, difference / deviation.clamp(min=torch.finfo(deviation.dtype).tiny), 0.0)
+    # Not divided by 0 where it is replaced, either, as gradients of both branches are computed.
+    divisor = deviation.clamp(min=torch.finfo(deviation.dtype).tiny)
+    return torch.where(deviation > 0, difference / divisor, 0.0)
 
 
 def _log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,7 +70,9 @@ def _log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tup
     mean = kl_divergence(alpha, background) - kl_divergence(alpha, target)
     weight = target - background
     total = torch.polygamma(1, alpha.sum(-1))
-    variance = (weight.square() * torch.polygamma(1, alpha)).sum(-1) - weight.sum(-1).square() * total
+    of_each = (weight.square() * torch.polygamma(1, alpha)).sum(-1)
+    of_total = weight.sum(-1).square() * total
+    variance = of_each - of_total
     # Where the variance is 0, rounding can make the difference negative.
     return mean, variance.clamp(min=0)
 
@@ -76,4 +80,6 @@ def _log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tup
 def _mixed(mean: Tensor, variance: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
     """Compute mean and variance of a variable that is 0 with probability `missed`, and else has these moments."""
     detected = 1 - missed
-    return detected * mean, detected * (variance + missed * mean.square())
+    # E[R²] - E[R]² = (1 - m) (σ² + μ²) - (1 - m)² μ²
+    mixed_variance = detected * (variance + missed * mean.square())
+    return detected * mean, mixed_variance

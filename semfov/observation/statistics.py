@@ -47,7 +47,7 @@ class DirichletStatistics:
     """
 
     def __init__(self, shape: Sequence[int], components: int, *, epsilon: float = 1e-6) -> None:
-        check(all(n >= 1 for n in shape) and len(shape) >= 1, "shape", "positive sizes", tuple(shape))
+        check(min(shape, default=0) >= 1, "shape", "positive sizes", tuple(shape))
         check(components >= 2, "components", "at least 2", components)
         check(0 < epsilon < 1, "epsilon", "a number between 0 and 1", epsilon)
         self.shape = tuple(shape)
@@ -167,9 +167,10 @@ class DirichletStatistics:
         """
         check(len(self.shape) > 1, "dim", "a table of two dimensions or more", self.shape)
         dim = range(len(self.shape))[dim]
-        pooled = DirichletStatistics(self.shape[:dim] + self.shape[dim + 1 :], self.components, epsilon=self.epsilon)
+        shape = self.shape[:dim] + self.shape[dim + 1 :]
+        pooled = DirichletStatistics(shape, self.components, epsilon=self.epsilon)
         pooled.count = self.count.sum(dim)
-        pooled.sums = self.sums.sum(dim + 1)
+        pooled.sums = self.sums.sum(dim + 1)  # before the shape of the table stand the three sums
         self._check_room(pooled.count)
         return pooled
 
@@ -233,7 +234,8 @@ class DirichletStatistics:
 
     def _mean(self, which: int) -> Tensor:
         """Divide one of the three `sums` by the count."""
-        return self.sums[which].to(torch.float64) / 2.0**_FRACTION_BITS / self.count[..., None]
+        total = self.sums[which].to(torch.float64) / 2.0**_FRACTION_BITS
+        return total / self.count[..., None]
 
     def _check_room(self, count: Tensor) -> None:
         """Raise `InputError` if the sums of so many samples could exceed 63 bits."""
