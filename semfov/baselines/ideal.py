@@ -31,8 +31,10 @@ class _SignalSearch(AcquisitionFunction):
         """Compute values `(B, X·Y)`."""
         # As the search went on, the target was not in a fixated cell.
         place = belief.chance(self.target).masked_fill(visited, 0)
-        place = place / place.sum(-1, keepdim=True).clamp(min=torch.finfo(place.dtype).tiny)
-        return one_by_one(self.values, place, self.signal.to(place).expand(len(place), -1, -1))
+        total = place.sum(-1, keepdim=True)
+        place = place / total.clamp(min=torch.finfo(place.dtype).tiny)  # q
+        signal = self.signal.to(place).expand(len(place), -1, -1)
+        return one_by_one(self.values, place, signal)
 
     @abstractmethod
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
@@ -113,8 +115,9 @@ class CorrectLocalisation(_SignalSearch):
         self.nodes = nodes
 
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
-        """Compute the integral, for one fixation at a time."""
-        return torch.stack([_correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)], -1)
+        """Compute the integral, for one fixation at a time: all of them at once would fill the memory."""
+        integrals = [_correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)]
+        return torch.stack(integrals, -1)
 
 
 def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> Tensor:

@@ -19,7 +19,8 @@ def _gaussian_kernel(sigma: float) -> Tensor:
     # Imported when first needed: Kornia takes a quarter of a second.
     from kornia.filters import get_gaussian_kernel1d
 
-    return get_gaussian_kernel1d(round(8 * sigma + 1) | 1, sigma, dtype=torch.float64)[0]
+    taps = round(8 * sigma + 1) | 1  # the next odd number
+    return get_gaussian_kernel1d(taps, sigma, dtype=torch.float64)[0]
 
 
 def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
@@ -57,7 +58,8 @@ def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: t
     kernel = _gaussian_kernel(sigma)
     length = max(count // step, 1)
     reach = len(kernel) // 2
-    index = torch.arange(length)[:, None] * step + torch.arange(len(kernel)) - reach
+    middle = torch.arange(length)[:, None] * step
+    index = middle + torch.arange(len(kernel)) - reach  # (length, taps)
     taps = Taps(index.clamp(0, count - 1), kernel.expand(length, -1))
     return banded(taps, count, _TILE, _TILE * step, reach, dtype, device)
 
@@ -76,7 +78,7 @@ def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device
         The matrix.
     """
     place = (torch.arange(length).double() + 0.5) * (count / length) - 0.5
-    index = place.floor().long()[:, None] + torch.arange(-1, 3)
+    index = place.floor().long()[:, None] + torch.arange(-1, 3)  # (length, 4)
     distance = (place[:, None] - index).abs()
     a = -0.75
     # Keys' two cubics: up to a distance of one pixel, and from one to two.

@@ -48,11 +48,12 @@ def _gabor_kernels(dtype: torch.dtype, device: torch.device) -> Tensor:
     place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
     y = place[:, None]
     x = place[None, :]
-    envelope = torch.exp(-(x**2 + y**2) / (2 * _SIGMA**2))
-    theta = torch.tensor(_ORIENTATIONS, dtype=torch.float64) * (pi / 180)
-    u = x * theta.cos()[:, None, None] + y * theta.sin()[:, None, None]
+    envelope = torch.exp(-(x**2 + y**2) / (2 * _SIGMA**2))  # (9, 9)
+    degrees = torch.tensor(_ORIENTATIONS, dtype=torch.float64)
+    theta = (degrees * (pi / 180))[:, None, None]
+    u = x * theta.cos() + y * theta.sin()  # (n, 9, 9)
     phase = 2 * pi / _PERIOD * u
-    waves = torch.stack([phase.cos(), -phase.sin()], 1).flatten(0, 1)
+    waves = torch.stack([phase.cos(), -phase.sin()], 1).flatten(0, 1)  # (2n, 9, 9), even and odd by turns
     kernels = waves * envelope
     kernels = kernels - kernels.mean((-2, -1), keepdim=True)
     kernels = kernels / kernels.abs().sum((-2, -1), keepdim=True)
@@ -139,8 +140,9 @@ def _conspicuity(image: Tensor) -> Tensor:
 def _with_orientations(level: Tensor) -> Tensor:
     """Append to a level `(B, 3, h, w)` the energy of each orientation of its intensity, |even| + |odd|."""
     intensity = F.pad(level[:, :1], (_TAPS // 2,) * 4, mode="replicate")
-    responses = F.conv2d(intensity, _gabor_kernels(level.dtype, level.device))
-    return torch.cat([level, responses.abs().unflatten(1, (-1, 2)).sum(2)], 1)
+    responses = F.conv2d(intensity, _gabor_kernels(level.dtype, level.device))  # (B, 2n, h, w)
+    even_and_odd = responses.abs().unflatten(1, (-1, 2))
+    return torch.cat([level, even_and_odd.sum(2)], 1)
 
 
 def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:

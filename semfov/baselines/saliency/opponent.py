@@ -27,8 +27,10 @@ def opponent_colours(image: Tensor) -> Tensor:
         Intensity, red minus green and blue minus yellow, `(B, 3, H, W)`.
     """
     _check_image(image)
-    red, green, blue = image.unbind(1)
-    return torch.stack([(red + green + blue) / 3, red - green, blue - (red + green) / 2], 1)
+    red, green, blue = image.unbind(1)  # (B, H, W)
+    intensity = (red + green + blue) / 3
+    yellow = (red + green) / 2
+    return torch.stack([intensity, red - green, blue - yellow], 1)
 
 
 def lab_colours(image: Tensor) -> Tensor:
@@ -44,7 +46,8 @@ def lab_colours(image: Tensor) -> Tensor:
     from kornia.color import rgb_to_lab
 
     _check_image(image)
-    return rgb_to_lab(image) / image.new_tensor([100.0, 255.0, 255.0])[:, None, None]
+    ranges = image.new_tensor([100.0, 255.0, 255.0])[:, None, None]
+    return rgb_to_lab(image) / ranges
 
 
 def double_opponency(image: Tensor) -> Tensor:
@@ -64,8 +67,11 @@ def double_opponency(image: Tensor) -> Tensor:
     _check_image(image)
     intensity = image.mean(1)
     least = intensity.amax((-2, -1), keepdim=True) / 10
-    # So many rows at once that they stay in the processor's cache.
-    rows = max(1, _PIXELS // max(1, len(image) * image.shape[-1])) if values_known(image) else image.shape[-2]
+    rows = image.shape[-2]
+    if values_known(image):  # a graph has no blocks
+        # So many rows at once that they stay in the processor's cache.
+        pixels_of_row = len(image) * image.shape[-1]
+        rows = max(1, _PIXELS // max(1, pixels_of_row))
     blocks = zip(image.split(rows, 2), intensity.split(rows, 1), strict=True)
     return torch.cat([_opponencies(pixels, bright, least) for pixels, bright in blocks], 2)
 

@@ -125,15 +125,17 @@ def vocus2_saliency(
 
 def _mean_contrast(pyramids: list[list[_Twin]], size: tuple[int, int]) -> Tensor:
     """Take the mean of on-off and off-on contrasts over channels, scales and layers, `(B, *size)`."""
-    total: Tensor | None = None
+    layers = []
     for twins in pyramids:
-        # One of on-off and off-on is 0, so their mean is half the difference.
-        contrasts = [(twin.centre - twin.surround).abs_().mean(1, keepdim=True) / 2 for twin in twins]
+        contrasts = []
+        for twin in twins:
+            # One of on-off and off-on is 0, so their mean is half the difference.
+            difference = (twin.centre - twin.surround).abs_()
+            contrasts.append(difference.mean(1, keepdim=True) / 2)
         # Interpolation is linear, so the mean of each size can be taken before it is enlarged.
-        layer = enlarge(torch.cat(contrasts, 1).mean(1), size)
-        total = layer if total is None else total + layer
-    assert total is not None
-    return total / len(pyramids)
+        layers.append(enlarge(torch.cat(contrasts, 1).mean(1), size))
+    coarser = layers[1:]
+    return sum(coarser, layers[0]) / len(layers)
 
 
 def _largest_contrast(pyramids: list[list[_Twin]], size: tuple[int, int]) -> Tensor:
