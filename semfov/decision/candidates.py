@@ -201,16 +201,26 @@ class CandidatePlaces(ABC, Generic[LookType]):
             self._examined = []
             self._places = []
             return
-        if self._places:
-            moved = motion.boxes(torch.stack([place.box for place in self._places]))
-            in_view = inside_frame(moved, size).tolist()
-            judged = zip(self._places, moved, in_view, strict=True)
-            self._places = [place._replace(box=box, in_view=is_in_view) for place, box, is_in_view in judged]
+        self._places = self._moved_places(motion, size)
+        self._examined = self._moved_examined(motion)
+
+    def _moved_places(self, motion: Motion, size: tuple[int, int]) -> list[_CloserPlace]:
+        """Move the places of closer looks with the camera, and note which of them the frame shows."""
+        if not self._places:
+            return []
+        boxes = motion.boxes(torch.stack([place.box for place in self._places]))
+        in_view = inside_frame(boxes, size).tolist()
+        moved = zip(self._places, boxes, in_view, strict=True)
+        return [place._replace(box=box, in_view=is_in_view) for place, box, is_in_view in moved]
+
+    def _moved_examined(self, motion: Motion) -> list[ExaminedPlace]:
+        """Move the examined places with the camera, without those that are behind it now."""
         if not self._examined:
-            return
-        boxes = torch.stack([place.boxes for place in self._examined])
-        places = zip(self._examined, motion.shows(boxes).all(-1).tolist(), motion.boxes(boxes), strict=True)
-        self._examined = [place._replace(boxes=moved) for place, is_shown, moved in places if is_shown]
+            return []
+        boxes = torch.stack([place.boxes for place in self._examined])  # (places, 2, 4)
+        are_ahead = motion.shows(boxes).all(-1).tolist()
+        moved = zip(self._examined, motion.boxes(boxes), are_ahead, strict=True)
+        return [place._replace(boxes=moved_boxes) for place, moved_boxes, is_ahead in moved if is_ahead]
 
     def cell(self, box: Tensor) -> int | None:
         """Find the cell that a box `(4,)` covers most; None where places are no cells."""
@@ -263,7 +273,8 @@ class CandidateCells(CandidatePlaces[Step]):
         # Footprints are computed when a place is chosen for the first time.
         footprint = cache(partial(self.grid.footprint, look.detections.boxes, "soft"))
         self._looks.append((self._now, _LookAtCells(look.detections, footprint)))
-        self._hit_chance = float(look.belief.chance(self._target).masked_fill(look.visited, 0).amax())
+        chance = look.belief.chance(self._target)
+        self._hit_chance = float(chance.masked_fill(look.visited, 0).amax())
 
     @property
     def hit_chance(self) -> float:
@@ -281,7 +292,7 @@ class CandidateCells(CandidatePlaces[Step]):
         boxes = torch.cat([look.detections.boxes[0] for _, look in self._looks])
         if not len(boxes):
             return None
-        evidence = self._evidence(boxes)
+        evidence = self._evidence(boxes)  # (N, X·Y)
         value = probability * evidence.amax(0)
         cell = int(value.argmax())
         chance = float(probability[cell])
@@ -299,11 +310,11 @@ class CandidateCells(CandidatePlaces[Step]):
         Returns:
             `(N, X·Y)`, 0 for objects that were examined.
         """
-        keep = self.forgetting.keep
         faded_scores = []
         for time, look in self._looks:
             scores_of_look = look.detections.scores[0, :, self.target]
-            faded_scores.append(look.detections.mask[0] * (scores_of_look * keep ** (self._now - time)))
+            share = self.forgetting.keep ** (self._now - time)  # of the evidence that is left
+            faded_scores.append(look.detections.mask[0] * (scores_of_look * share))
         scores = torch.cat(faded_scores)
         if self._examined:
             scores = scores * ~self._are_examined(boxes)

@@ -97,7 +97,8 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
         `(A,)`, numbers of `OUTCOMES`, `GO_ON` for a search that goes on.
     """
     located = place_known(step.belief.probability(target), step.visited, thresholds.place)
-    hit_chance = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)
+    chance = step.belief.chance(target)  # (A, X·Y)
+    hit_chance = chance.masked_fill(step.visited, 0).amax(-1)
     return settle(step.belief.presence(target), located, hit_chance, thresholds)
 
 
@@ -136,8 +137,9 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
     Returns:
         `(...)` boolean.
     """
-    fixated = cells.masked_fill(~visited, 0).amax(-1)
-    return (fixated >= _NEARLY * cells.amax(-1)) & (fixated >= place)
+    largest = cells.amax(-1)
+    largest_fixated = cells.masked_fill(~visited, 0).amax(-1)
+    return (largest_fixated >= _NEARLY * largest) & (largest_fixated >= place)
 
 
 def conclude(
@@ -195,8 +197,9 @@ def _strongest_cell(probability: Tensor, evidence: Sequence[Tensor]) -> int:
 
 def _evidence_of_cells(look: Detections, grid: Grid, target: int) -> Tensor:
     """Evidence `(L, X·Y)` of each detection of a look that the target is in each cell: score times footprint."""
-    scores = look.mask[0] * look.scores[0, :, target]
-    return grid.footprint(look.boxes, "soft")[0] * scores[:, None]
+    scores = look.mask[0] * look.scores[0, :, target]  # (L,)
+    footprints = grid.footprint(look.boxes, "soft")[0]  # (L, X·Y)
+    return footprints * scores[:, None]
 
 
 def most_evident_box(looks: Sequence[Detections], grid: Grid, target: int, cell: int) -> Tensor | None:
@@ -214,7 +217,7 @@ def most_evident_box(looks: Sequence[Detections], grid: Grid, target: int, cell:
     highest = 0.0
     box = None
     for look in looks:
-        in_cell = _evidence_of_cells(look, grid, target)[:, cell]
+        in_cell = _evidence_of_cells(look, grid, target)[:, cell]  # (L,)
         if len(in_cell) and float(in_cell.max()) > highest:
             highest = float(in_cell.max())
             box = look.boxes[0, int(in_cell.argmax())]
@@ -266,8 +269,8 @@ def _check_chance(name: str, value: float | None) -> None:
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
     """Whether a detection over each cell `(B,)` gives `target` at least this score, `(B,)`."""
-    has_score = detections.mask & (detections.class_scores[..., target - 1] >= score)
-    footprints = grid.footprint(detections.boxes)
+    has_score = detections.mask & (detections.class_scores[..., target - 1] >= score)  # (B, L)
+    footprints = grid.footprint(detections.boxes)  # (B, L, X·Y)
     is_over_cell = footprints.take_along_dim(cell[:, None, None], -1)[..., 0]
     return (is_over_cell & has_score).any(-1)
 
@@ -289,7 +292,7 @@ def gains_less(step: Step, *, gain: Callable[[Belief, Tensor], Tensor], least: f
 
     Exploration without a least gain, or with no cell left, does not end so.
     """
-    gains = gain(step.belief, step.visited)
+    gains = gain(step.belief, step.visited)  # (A, X·Y)
     best = gains.masked_fill(step.visited, -torch.inf).amax(-1)
     has_cells_left = ~step.visited.all(-1)
     return ((best < least) & (least > 0) & has_cells_left).long()

@@ -92,6 +92,7 @@ class _ByBelief(StoppingCriterion):
     def see(self, step: Step) -> None:
         self._step = step
         self._recent.append((self._now, step.detections))
+        # The look of now is never so old, so that one is always left.
         while self._now - self._recent[0][0] >= self._span:
             self._recent.popleft()
         self.outcome = self._judge(step)
@@ -187,6 +188,7 @@ class ByCloserLooks(StoppingCriterion):
     def decision(self) -> Decision | None:
         if not self._has_looked:
             return None
+        # Once the search is concluded, its decision stands, though verdicts may fade.
         return self.verifier.decision() if self._concluded is None else self._concluded
 
     def conclude(self, room: float = math.inf) -> None:

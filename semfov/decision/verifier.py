@@ -118,34 +118,48 @@ class Verifier(Generic[LookType]):
             self.candidate = None
             self.verdicts = []
             return
-        if self.candidate is not None:
-            # The closer look that is due is made in the next frame, wherever the camera has turned.
-            box = self.candidate.box
-            self.candidate = self.candidate._replace(box=motion.boxes(box)) if bool(motion.shows(box)) else None
+        self.candidate = self._moved_candidate(motion)
+        self.verdicts = self._moved_verdicts(motion, size)
+
+    def _moved_candidate(self, motion: Motion) -> CandidatePlace | None:
+        """Move the candidate with the camera; None if it is behind the camera now, or there is none."""
+        candidate = self.candidate
+        if candidate is None or not bool(motion.shows(candidate.box)):
+            return None
+        # The closer look that is due is made in the next frame, wherever the camera has turned.
+        return candidate._replace(box=motion.boxes(candidate.box))
+
+    def _moved_verdicts(self, motion: Motion, size: tuple[int, int]) -> list[_Verdict]:
+        """Move the places of the verdicts with the camera, without those that are behind it now."""
         if not self.verdicts:
-            return
+            return []
         boxes = torch.stack([verdict.look.box for verdict in self.verdicts])
+        ahead = motion.shows(boxes).tolist()
         moved_boxes = motion.boxes(boxes)
         in_view = inside_frame(moved_boxes, size).tolist()
-        verdicts = zip(self.verdicts, motion.shows(boxes).tolist(), moved_boxes, in_view, strict=True)
-        self.verdicts = [
-            verdict._replace(look=replace(verdict.look, box=box), in_view=is_in_view)
-            for verdict, is_ahead, box, is_in_view in verdicts
-            if is_ahead
-        ]
+        moved_verdicts = []
+        for number, verdict in enumerate(self.verdicts):
+            if ahead[number]:
+                look = replace(verdict.look, box=moved_boxes[number])
+                moved_verdicts.append(verdict._replace(look=look, in_view=in_view[number]))
+        return moved_verdicts
 
     def see(self, look: LookType, *, last: bool = False) -> None:
         """Take in a look of the search, and choose the place that is to be looked at closely."""
         self._judged = None
         self.places.see(look)
-        if self.places.forgetting.rate:
-            for number, verdict in enumerate(self.verdicts):
-                box = follow_target(verdict.look.box, self.places.detections, verdict.look.target)
-                if box is not verdict.look.box:
-                    moved = replace(verdict.look, box=box, cell=self.places.cell(box))
-                    self.verdicts[number] = verdict._replace(look=moved, in_view=True)
+        if self.places.forgetting.rate:  # in a stream, in which objects move
+            self.verdicts = [self._followed(verdict) for verdict in self.verdicts]
         self._is_last = last
         self._choose()
+
+    def _followed(self, verdict: _Verdict) -> _Verdict:
+        """Move the place of a verdict to the detection of the last look that shows its target; it is in view then."""
+        box = follow_target(verdict.look.box, self.places.detections, verdict.look.target)
+        if box is verdict.look.box:  # no detection shows it
+            return verdict
+        look = replace(verdict.look, box=box, cell=self.places.cell(box))
+        return verdict._replace(look=look, in_view=True)
 
     def look(self) -> CloseUp:
         """Look closely at the candidate, and choose the next one."""
@@ -220,7 +234,7 @@ class Verifier(Generic[LookType]):
         """Probability that the picture holds the target: after the closer looks, or that without them."""
         without = self.places.presence
         telling = self._recent
-        if self.places.exhaustive:
+        if self.places.exhaustive:  # the best place alone tells
             telling = sorted(telling, key=_probability)[-1:]
         faded = (self._faded(judged.verdict.look.presence, without, judged.verdict.age) for judged in telling)
         return max(faded, default=without)
@@ -285,14 +299,16 @@ class Verifier(Generic[LookType]):
         if verdict.age <= self.places.forgetting.span:
             return False
         in_its_cell = verdict.look.cell == look.cell
-        return in_its_cell or float(box_iou(verdict.look.box[None], look.box[None])) >= SAME
+        overlap = box_iou(verdict.look.box[None], look.box[None])
+        return in_its_cell or float(overlap) >= SAME
 
     def _place(self, verdict: _Verdict) -> float:
         """Probability that the target is still at the place of a closer look."""
         look = verdict.look
         if self.places.forgetting.keep**verdict.age == 1:
             return look.place
-        return min(look.place, self._faded(look.place, self.places.probability(look), verdict.age))
+        faded = self._faded(look.place, self.places.probability(look), verdict.age)
+        return min(look.place, faded)
 
     def _faded(self, fresh: float, without: float, age: float) -> float:
         """Let a probability after a closer look fade towards that without closer looks.

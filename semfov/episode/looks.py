@@ -160,7 +160,8 @@ class StoredLooks(Looks):
         """Take the stored looks of the cells; the fixations must be their centres."""
         watch = Stopwatch()
         targets = None if self.targets is None else self.targets[episodes]
-        look = self.weighed(observer)[self.first_row(observer, targets) + cell]
+        row = self.first_row(observer, targets) + cell
+        look = self.weighed(observer)[row]
         watch.lap("weigh")
         return EpisodeLook(look, lambda: self.detections[cell], watch.seconds)
 
@@ -176,8 +177,9 @@ class StoredLooks(Looks):
         """
         if not observer.by_target or targets is None:
             return torch.zeros((), dtype=torch.int64)
-        # One row for each target and cell.
-        return torch.searchsorted(targets.new_tensor(self._classes), targets) * len(self.grid)
+        # `weighed` has all cells of the first class, then all of the second one, and so on.
+        place_of_class = torch.searchsorted(targets.new_tensor(self._classes), targets)
+        return place_of_class * len(self.grid)
 
     def rows(self, observer: Observer) -> int:
         """Count the rows of `weighed`.
@@ -188,7 +190,9 @@ class StoredLooks(Looks):
         Returns:
             The number of looks.
         """
-        return len(self.grid) * (len(self._classes) if observer.by_target and self._classes else 1)
+        by_target = observer.by_target and len(self._classes) > 0
+        classes = len(self._classes) if by_target else 1
+        return len(self.grid) * classes
 
     def weighed(self, observer: Observer) -> Look:
         """Evidence of the looks from all cells, computed on the first call.
@@ -201,6 +205,7 @@ class StoredLooks(Looks):
         """
         if observer not in self._weighed:
             centres = self.grid.centres.to(self.like)
+            # What does not depend on the target is weighed once for all of them.
             targets = self._classes if observer.by_target else [None]
             looks = [observer.weigh(self.detections, centres, self.grid, target) for target in targets]
             self._weighed[observer] = looks[0] if len(looks) == 1 else type(looks[0]).join(looks)

@@ -85,8 +85,10 @@ def attend(
     belief = memory.belief
     age = memory.age
     if forgetting is not None:
+        # What was seen before fades first: the new look counts in full.
         age = age + look.passed
-        belief = observer.fade(belief, look.evidence, forgetting.keep**look.passed, forgetting.visited(age))
+        share_left = forgetting.keep**look.passed
+        belief = observer.fade(belief, look.evidence, share_left, forgetting.visited(age))
     belief = observer.update(belief, look.evidence)
     watch.lap("update belief")
     visited = memory.visited.scatter(-1, cell[:, None], True)
@@ -147,7 +149,8 @@ def rollout(
     acquire = acquisition
     if isinstance(acquisition, AcquisitionFunction):
         acquire = _always(acquisition)
-    centres = looks.grid.centres.to(looks.like)
+    centres = looks.grid.centres.to(looks.like)  # (X·Y, 2)
+    # Of the episodes that have not ended, of which there are fewer and fewer: A of the B at the start.
     episodes = torch.arange(len(start), device=start.device)
     cell = start
     fixation = centres[start]
@@ -172,7 +175,7 @@ def rollout(
             seconds=watch.seconds,
         )
         yield step
-        over = memory.visited.all(-1)
+        over = memory.visited.all(-1)  # (A,)
         if ends is not None:
             over = over | ends(step)
         going = ~over

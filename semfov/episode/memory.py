@@ -53,9 +53,11 @@ class Forgetting:
         >>> Forgetting(0.5).visited(torch.tensor([[0.0, 1.0, 2.0, torch.inf]]))
         tensor([[ True,  True, False, False]])
         """
+        # Without forgetting the span is infinite, too: a cell that was never fixated is not recent.
         recent = (age <= self.span) & age.isfinite()
         oldest = age == age.amax(-1, keepdim=True)
-        return recent & ~(recent.all(-1, keepdim=True) & oldest)
+        is_all_recent = recent.all(-1, keepdim=True)
+        return recent & ~(is_all_recent & oldest)
 
 
 @dataclass(frozen=True)
