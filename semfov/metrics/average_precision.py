@@ -55,11 +55,12 @@ def average_precision(
     boxes = [box for box in boxes if box["image_id"] not in of_lvis or _pair(box) in verified]
 
     partial = _named(annotations, PARTIAL, image_ids, class_ids)
-    precision = _precision(truth, boxes, partial, len(image_ids), limit)
-    judged = precision[..., (precision > -1).all((0, 1))]
-    if not judged.size:
+    precision = _precision(truth, boxes, partial, len(image_ids), limit)  # (overlaps, recalls, K)
+    has_objects = (precision > -1).all((0, 1))
+    if not has_objects.any():
         return None
-    return float(judged.mean()), float(judged[0].mean())
+    judged = precision[..., has_objects]
+    return float(judged.mean()), float(judged[0].mean())  # the first overlap is .50
 
 
 def _objects(annotations: Annotations, images: Iterable[Id]) -> list[Entry]:
@@ -67,8 +68,8 @@ def _objects(annotations: Annotations, images: Iterable[Id]) -> list[Entry]:
     objects: list[Entry] = []
     for image in images:
         for entry in annotations.objects[image]:
-            width_and_height = entry["bbox"][2:]
-            if min(width_and_height) > 0:
+            _, _, width, height = entry["bbox"]
+            if width > 0 and height > 0:
                 objects.append({**entry, "image_id": image})
     return objects
 
@@ -76,9 +77,9 @@ def _objects(annotations: Annotations, images: Iterable[Id]) -> list[Entry]:
 def _class_ids(annotations: Annotations, classes: Collection[str] | None) -> dict[Id, int]:
     """Give the classes of the categories that are judged numbers from 1; categories of one name are one class."""
     names = {category: canonical_name(entry["name"]) for category, entry in annotations.categories.items()}
-    judged = set(names.values()) if classes is None else set(map(canonical_name, classes))
-    numbers = {name: number for number, name in enumerate(sorted(judged), 1)}
-    return {category: numbers[name] for category, name in names.items() if name in judged}
+    judged = names.values() if classes is None else map(canonical_name, classes)
+    numbers = {name: number for number, name in enumerate(sorted(set(judged)), 1)}
+    return {category: numbers[name] for category, name in names.items() if name in numbers}
 
 
 def _copies(entries: Iterable[Entry], image_ids: Mapping[Id, int], class_ids: Mapping[Id, int]) -> list[Entry]:
@@ -118,9 +119,8 @@ def _named(
     """List the images, each with a class that one of their fields names."""
     pairs = set()
     for image, number in image_ids.items():
-        for category in annotations.images[image].get(field) or ():
-            if category in class_ids:
-                pairs.add((number, class_ids[category]))
+        categories = annotations.images[image].get(field) or ()  # LVIS has the field, COCO has none
+        pairs |= {(number, class_ids[category]) for category in categories if category in class_ids}
     return pairs
 
 
@@ -152,16 +152,19 @@ def _precision(
         side.createIndex()
         return side
 
+    if limit is None:
+        limit = max(len(boxes), 1)  # so many boxes at most are there
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
         judge = COCOeval(indexed(truth), indexed(boxes), "bbox")
         # One range of areas, all of them, whose label COCOeval expects beside it.
         judge.params.areaRng = [[0, math.inf]]
         judge.params.areaRngLbl = ["all"]
-        judge.params.maxDets = [max(len(boxes), 1) if limit is None else limit]
+        judge.params.maxDets = [limit]
         judge.evaluate()
-        for result in judge.evalImgs:
+        results = filter(None, judge.evalImgs)  # None where an image has neither objects nor boxes of a class
+        for result in results:
             # Where not every object is annotated, boxes without an object are no errors.
-            if result is not None and _pair(result) in partial:
+            if _pair(result) in partial:
                 result["dtIgnore"] |= result["dtMatches"] == 0
         judge.accumulate()
-    return judge.eval["precision"][..., 0, 0]
+    return judge.eval["precision"][..., 0, 0]  # of one range of areas, and one limit

@@ -61,7 +61,7 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
     high = int(classes.max())
     check(low >= 0 and high <= last, "labels", f"numbers of classes from 0 to {last}", f"{low} to {high}")
 
-    p_true = p.gather(1, classes[:, None])[:, 0]
+    p_true = p.gather(1, classes[:, None])[:, 0]  # (M,)
     # Σ_k (p_k - y_k)², with y = 1 for the true class and 0 for all others.
     brier = p.square().sum(1) - 2 * p_true + 1
     confidence, predicted = p.max(1)
@@ -171,7 +171,7 @@ def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) ->
     came_true = as_outcomes(correct, "correct")
     _check_row(came_true, "correct", len(p))
     bin_of_prediction = torch.bucketize(p, edges)
-    values = torch.stack([torch.ones_like(p), p, came_true.to(p)])
+    values = torch.stack([torch.ones_like(p), p, came_true.to(p)])  # (3, M)
     sums = torch.zeros(3, len(edges) + 1, dtype=torch.float64)
     return sums.index_add_(1, bin_of_prediction, values)
 

@@ -34,7 +34,7 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> FloatArr
     numbers = as_numbers(found_at, "found_at").detach().double().cpu().numpy()
     check(numbers.ndim > 0, "found_at", "a number for each search", numbers)
     shift = numbers[..., None]
-    found = (shift >= 0) & (shift <= steps)
+    found = (shift >= 0) & (shift <= steps)  # (..., episodes, shifts + 1)
     if not found.shape[-2]:
         return np.full((*found.shape[:-2], len(steps)), np.nan)
     return np.asarray(found.mean(-2), dtype=np.float64)
@@ -77,8 +77,10 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
     """
     positive, negative = scores_by_presence(score, present)
     negative = negative.sort().values
-    twice_below = torch.searchsorted(negative, positive) + torch.searchsorted(negative, positive, right=True)
-    return float(twice_below.double().mean() / (2 * len(negative)))
+    # For each s₊ the number of s₋ below it, and of those up to it: one that equals it counts for one half.
+    below = torch.searchsorted(negative, positive)
+    up_to = torch.searchsorted(negative, positive, right=True)
+    return float((below + up_to).double().mean() / (2 * len(negative)))
 
 
 def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
@@ -92,9 +94,10 @@ def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
     Returns:
         `(X·Y, K+1)` boolean.
     """
-    overlap = grid.footprint(annotation.boxes)
-    classes = F.one_hot(annotation.labels, components)
-    return overlap.T.float() @ classes.float() > 0
+    overlap = grid.footprint(annotation.boxes)  # (M, X·Y)
+    classes = F.one_hot(annotation.labels, components)  # (M, K+1)
+    objects_of_class = overlap.T.float() @ classes.float()
+    return objects_of_class > 0
 
 
 def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
@@ -107,9 +110,11 @@ def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
     Returns:
         `(B, X·Y)` boolean.
     """
-    best = beta == beta.amax(-1, keepdim=True)
+    best = beta == beta.amax(-1, keepdim=True)  # (B, X·Y, C)
+    right = best & as_outcomes(answers, "answers")
     # Sums of a short dimension take a seventh of the time of `any`.
-    return ((best & as_outcomes(answers, "answers")).sum(-1) > 0) & (best.sum(-1) == 1)
+    is_single = best.sum(-1) == 1
+    return (right.sum(-1) > 0) & is_single
 
 
 def standard_error(values: FloatArray) -> FloatArray:
@@ -125,4 +130,5 @@ def standard_error(values: FloatArray) -> FloatArray:
     check(values.ndim > 0, "values", "several values", values)
     if len(values) < 2:
         return np.full(values.shape[1:], np.nan)
-    return np.asarray(values.std(0, ddof=1) / np.sqrt(len(values)))
+    deviation = values.std(0, ddof=1)
+    return np.asarray(deviation / np.sqrt(len(values)))

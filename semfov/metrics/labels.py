@@ -75,25 +75,36 @@ def as_labels(labels: Iterable[object], argument: str, *, least: int = 0) -> lis
         check(labels.ndim == 1, argument, "labels in a row", f"shape {tuple(np.shape(labels))}")
         values = labels.tolist()
     else:
-        values = [_plain(label) for label in labels]
-    has_nan = any(isinstance(value, float) and math.isnan(value) for value in values)
-    check(not has_nan, argument, "labels", "NaN")
+        values = list(map(_plain, labels))
+    check(not any(map(_is_nan, values)), argument, "labels", "NaN")
     check(len(values) >= least, argument, "at least one label", "none")
     return values
 
 
+def _is_nan(value: object) -> bool:
+    """Tell whether a value is NaN, which does not even equal itself."""
+    return isinstance(value, float) and math.isnan(value)
+
+
 def _plain(label: Any) -> Hashable:
     """Take a scalar of NumPy or torch as a number of Python; refuse what cannot be compared."""
-    is_scalar = isinstance(label, np.generic) or (isinstance(label, Tensor | np.ndarray) and label.ndim == 0)
+    # A scalar of NumPy has no dimensions, as an array or a tensor of one number.
+    is_scalar = isinstance(label, np.generic | np.ndarray | Tensor) and label.ndim == 0
     value = label.item() if is_scalar else label
-    try:
-        hash(value)
-    except TypeError:
-        value = None
-    is_comparable = value is not None and not isinstance(value, Tensor)
+    # A tensor has a hash, but equals itself alone.
+    is_comparable = _has_hash(value) and not isinstance(value, Tensor | None)
     got = f"a {type(label).__name__} of shape {tuple(np.shape(label))}"
     check(is_comparable, "labels", "names or numbers", got)
     return value
+
+
+def _has_hash(value: object) -> bool:
+    """Tell whether a value has a hash, also if it holds others, as a tuple does."""
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
 
 
 def _as_tensor(values: object, argument: str) -> Tensor:
@@ -101,7 +112,8 @@ def _as_tensor(values: object, argument: str) -> Tensor:
     if isinstance(values, Tensor):
         return values.to_dense() if values.layout != torch.strided else values
     try:
-        array = np.asarray([*values] if isinstance(values, Sequence) else values)
+        listed = list(values) if isinstance(values, Sequence) else values  # sequences that NumPy does not know, too
+        array = np.asarray(listed)
         if not array.flags.writeable:
             array = array.copy()  # torch warns of memory that it may not write to
         return torch.as_tensor(array)
