@@ -3,8 +3,9 @@
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import NotRequired, Self, TypedDict
 
 import numpy as np
 import torch
@@ -35,7 +36,6 @@ from semfov.runs.results import SceneResults
 from semfov.viz.style import save_figure
 
 _DENSITIES = (".npy", ".tif", ".tiff", ".png")
-
 _PICTURES = "pictures.csv"  # name of the table of pictures, after that of the scanpaths
 _COMPARED = Path("semfov-compare.html")  # page of a comparison for which no file is named
 
@@ -69,12 +69,47 @@ def predict_gaze(options: GazeOptions) -> int:
         return _look_at_pictures(job)
 
 
+@dataclass(frozen=True)
+class _Outputs:
+    """Files that the command writes; None for those that it does not.
+
+    Attributes:
+        table: scanpaths of all pictures.
+        pictures: table of the pictures.
+        density: density of the only picture.
+        folder: folder of the densities.
+        figure: figure of a comparison.
+    """
+
+    table: Path | None = None
+    pictures: Path | None = None
+    density: Path | None = None
+    folder: Path | None = None
+    figure: Path | None = None
+
+    @classmethod
+    def of(cls, out: Path | None, *, several: bool, compared: bool) -> Self:
+        """Find the files by the name that `out` gives: that of a table, of a figure or density, or of a folder."""
+        if out is None:
+            return cls()
+        kind = "" if out.is_dir() else out.suffix.lower()
+        if compared:
+            check(kind in ("", ".csv", ".png"), "out", "a folder, or a file .csv or .png", out)
+        else:
+            check(kind in ("", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", out)
+            check(kind not in _DENSITIES or not several, "out", "a .csv file or a folder for several pictures", out)
+        if kind == "":
+            return cls(out / "scanpaths.csv", out / _PICTURES, folder=out, figure=out / "compare.png")
+        if kind == ".csv":
+            return cls(out, out.with_name(f"{out.stem}-{_PICTURES}"))
+        return cls(figure=out) if compared else cls(density=out)
+
+
 class _GazeJob:
     """Predicts where people look in pictures; what an interrupted command has predicted is read again.
 
     Attributes:
-        kind: end of the name of the file that is written; empty for a folder or nothing.
-        table: file of the scanpaths; None where none are written.
+        outputs: the files that are written beside the page.
         outcomes: what is known of the pictures so far, by number.
         report: the page that is written; None for none.
         areas: areas of interest; None for none.
@@ -88,9 +123,8 @@ class _GazeJob:
         self.several = len(self.sources) > 1
         if options.compare:
             check(len(self.sources) == 2, "compare", "two pictures", len(self.sources))
-        self.kind = _kind_of_output(options.out, several=self.several, compared=options.compare)
+        self.outputs = _Outputs.of(options.out, several=self.several, compared=options.compare)
         check_apart(options.out, "out", [source.file for source in self.sources])
-        self.table = _table_of(options.out, self.kind)
         self.areas = None if options.areas is None else boxes_of(options.areas)
         self.report = options.report
         if options.compare and options.out is None and options.report is None:
@@ -104,8 +138,8 @@ class _GazeJob:
         self.predictions: dict[int, GazePrediction] = {}
         self.outcomes: dict[int, _Outcome] = {}
         self.finished: SceneResults | None = None
-        if self.several and self.table is not None and not options.compare:
-            self.finished = self._take_up(self.table)
+        if self.several and not options.compare and self.outputs.table is not None:
+            self.finished = self._take_up(self.outputs.table)
 
     def _take_up(self, table: Path) -> SceneResults:
         """Read what an interrupted command has predicted of the same pictures."""
@@ -142,27 +176,26 @@ class _GazeJob:
             "facts": _facts(prediction, shares),
             "part": None if self.report is None else gaze_part(prediction, paths, self.areas),
         }
-        # A comparison writes a folder with both maps, or the file of its own figure.
-        is_figure_of_comparison = options.compare and bool(self.kind)
-        if options.out is not None and self.kind != ".csv" and not is_figure_of_comparison:
-            outcome["density"] = str(self._save_density(options.out, number, prediction))
+        density = self._density_path(number, prediction)
+        if density is not None:
+            outcome["density"] = str(self._save_density(density, prediction))
         if options.compare:
             self.predictions[number] = prediction
         self.outcomes[number] = outcome
 
-    def _save_density(self, out: Path, number: int, prediction: GazePrediction) -> Path:
+    def _density_path(self, number: int, prediction: GazePrediction) -> Path | None:
+        """Name the file of a density: the one that is given, or one in the folder, numbered if there are several."""
+        folder = self.outputs.folder
+        if folder is None:
+            return self.outputs.density
+        name = f"{plain_name(Path(prediction.name).stem)}.png"
+        return folder / (f"{number:03d}-{name}" if self.several else name)
+
+    def _save_density(self, path: Path, prediction: GazePrediction) -> Path:
         """Write the density of a picture, a heat map with the areas."""
-        path = self._density_path(out, number, prediction)
         if path.suffix.lower() == ".png":
             return save_figure(prediction.plot(areas=self.areas), path)
         return prediction.save_density(path)
-
-    def _density_path(self, out: Path, number: int, prediction: GazePrediction) -> Path:
-        """Name the file of a density: the one that is given, or one in the folder, numbered if there are several."""
-        if self.kind:
-            return out
-        name = f"{plain_name(Path(prediction.name).stem)}.png"
-        return out / (f"{number:03d}-{name}" if self.several else name)
 
     def keep(self, number: int) -> None:
         """Keep what was predicted of a picture for the same command, until all pictures are looked at."""
@@ -173,13 +206,14 @@ class _GazeJob:
         """Write scanpaths, table of pictures and page of the pictures so far, and list all files."""
         outcomes = dict(sorted(self.outcomes.items()))
         written: list[object] = []
-        if self.table is not None and outcomes:
-            written += self._write_tables(self.table, outcomes)
+        if outcomes:
+            written += self._write_tables(outcomes)
         written += [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
         drafts = Drafts(*self.predictions.values()) if len(self.predictions) == 2 else None
         if drafts is not None:
             print(drafts.describe(self.areas))
-            written += self._figure_of(drafts)
+            if self.outputs.figure is not None:
+                written.append(save_figure(drafts.plot(areas=self.areas), self.outputs.figure))
         # Where one of two drafts cannot be read, an earlier comparison is not replaced by half of one.
         lacks_draft = self.options.compare and drafts is None
         if self.report is not None and outcomes and not lacks_draft:
@@ -187,14 +221,19 @@ class _GazeJob:
         progress = None if complete else f"{len(outcomes)} of {len(self.sources)}"
         tell_written(written, self.finished, progress)
 
-    def _write_tables(self, table: Path, outcomes: Mapping[int, _Outcome]) -> list[Path]:
+    def _write_tables(self, outcomes: Mapping[int, _Outcome]) -> list[Path]:
         """Write the table of scanpaths, and beside it that of the pictures."""
         from semfov.human.fixations.table import write_table
 
+        table = self.outputs.table
+        pictures = self.outputs.pictures
+        if table is None or pictures is None:
+            return []
         names = self._names()
-        paths = [path for number, outcome in outcomes.items() for path in _fixations(names[number], outcome)]
+        paths: list[Fixations] = []
+        for number, outcome in outcomes.items():
+            paths += _fixations(names[number], outcome)
         write_table(table, paths)
-        pictures = table.with_name(f"{table.stem}-{_PICTURES}" if self.kind else _PICTURES)
         facts = {names[number]: outcome["facts"] for number, outcome in outcomes.items()}
         write_text(pictures, _table_of_pictures(facts))
         return [table, pictures]
@@ -210,13 +249,6 @@ class _GazeJob:
             parts.append(part)
         before = "" if drafts is None else drafts_section(drafts, self.areas)
         return write_html(report, gaze_page_html("semfov: where people look", parts, before))
-
-    def _figure_of(self, drafts: Drafts) -> list[Path]:
-        """Write the figure of two drafts, where one is asked for."""
-        out = self.options.out
-        if out is None or self.kind == ".csv":
-            return []
-        return [save_figure(drafts.plot(areas=self.areas), out if self.kind else out / "compare.png")]
 
     def _names(self) -> list[str]:
         """Name the pictures as in their folder, or as they were named where two would have the same."""
@@ -287,24 +319,6 @@ def _table_of_pictures(facts: Mapping[str, Mapping[str, object]]) -> str:
     return csv_text(rows)
 
 
-def _kind_of_output(out: Path | None, *, several: bool, compared: bool) -> str:
-    """Find the end of the name of the file that is written; empty for a folder or nothing."""
-    kind = "" if out is None or out.is_dir() else out.suffix.lower()
-    if compared:
-        check(kind in ("", ".csv", ".png"), "out", "a folder, or a file .csv or .png", out)
-        return kind
-    check(kind in ("", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", out)
-    check(kind not in _DENSITIES or not several, "out", "a .csv file or a folder for several pictures", out)
-    return kind
-
-
-def _table_of(out: Path | None, kind: str) -> Path | None:
-    """Name the file of the scanpaths; None where none are written."""
-    if out is None or kind in _DENSITIES:
-        return None
-    return out if kind else out / "scanpaths.csv"
-
-
 def _viewer(path: Fixations) -> tuple[str, list[list[float]], list[float]]:
     """List name, points and durations of a drawn viewer, from which `_fixations` makes the scanpath again."""
     return path.subject, path.points.tolist(), np.asarray(path.durations).tolist()
@@ -330,18 +344,24 @@ def _look_at_pictures(job: _GazeJob) -> int:
     complete = False
     try:
         for number in tqdm(numbers, unit="picture", leave=False, disable=hidden):
-            try:
-                job.look(number)
-            except Exception as error:
-                # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
-                fault = sources[number].fault(error, several=job.several)
-                if not job.several:
-                    raise
-                tqdm.write(f"skipped {sources[number].name}: {fault}", file=sys.stderr)
-            else:
-                job.keep(number)
-                tqdm.write(job.outcomes[number]["text"], file=sys.stdout)
+            _look_at_picture(job, number)
         complete = True
     finally:
         job.write(complete=complete)
     return int(len(job.outcomes) < len(sources))
+
+
+def _look_at_picture(job: _GazeJob, number: int) -> None:
+    """Predict where people look in a picture; one of several that cannot be looked at is skipped."""
+    source = job.sources[number]
+    try:
+        job.look(number)
+    except Exception as error:
+        # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
+        fault = source.fault(error, several=job.several)
+        if not job.several:
+            raise
+        tqdm.write(f"skipped {source.name}: {fault}", file=sys.stderr)
+    else:
+        job.keep(number)
+        tqdm.write(job.outcomes[number]["text"], file=sys.stdout)
