@@ -52,42 +52,67 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code.
     """
-    command_line = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, TextIOWrapper):
         # Files of Windows may have another encoding, without the signs of a text or the letters of a picture's name.
         sys.stdout.reconfigure(errors="backslashreplace")
-    if command_line[:1] == ["help"]:
-        command_line = [*command_line[1:2], "--help"]
-    name, *rest = command_line or ["--help"]
+    name, *rest = _in_usual_order(sys.argv[1:] if arguments is None else arguments)
     text = _text(name, rest)
     if text is not None:
         print(text, end="")
         return 0
-    if name in SUBCOMMANDS:
-        rest = _with_present_names(name, rest)
-    refused = _of_others(name, rest) if name in SUBCOMMANDS else _unknown(name)
-    if refused is not None:
-        print(f"error: {refused}", file=sys.stderr)
-        return 2
-    from semfov.runs.command import make_parser, run_command
-
-    options = _options_of(name)
-    command = SUBCOMMANDS[name]
-    positional = None if command.positional is None else (command.positional, command.positional_help)
-    program = f"semfov {name}"
-    if "--help-all" in rest or "--help_all" in rest:
-        make_parser(options, command.help.partition("\nusage:")[0], positional, program).print_help()
+    if name not in SUBCOMMANDS:
+        return _refuse(_unknown(name))
+    rest = _with_present_names(name, rest)
+    refusal = _of_others(name, rest)
+    if refusal is not None:
+        return _refuse(refusal)
+    if {"--help-all", "--help_all"}.intersection(rest):
+        _print_all_options(name)
         return 0
+    return _parse_and_run(name, rest)
+
+
+def _in_usual_order(words: Sequence[str]) -> Sequence[str]:
+    """Write `semfov help NAME` as `semfov NAME --help`; without words it asks for help, too."""
+    if words[:1] == ["help"]:
+        words = [*words[1:2], "--help"]
+    return words or ["--help"]
+
+
+def _refuse(message: str) -> int:
+    """Print what is wrong with a command line; returns the exit code."""
+    print(f"error: {message}", file=sys.stderr)
+    return 2
+
+
+def _positional(name: str) -> tuple[str, str] | None:
+    """Find the setting of a subcommand that has no option before it, and its help; None where all have."""
+    command = SUBCOMMANDS[name]
+    return None if command.positional is None else (command.positional, command.positional_help)
+
+
+def _print_all_options(name: str) -> None:
+    """Print the help of a subcommand with all of its options."""
+    from semfov.runs.command import make_parser
+
+    description = SUBCOMMANDS[name].help.partition("\nusage:")[0]
+    make_parser(_options_of(name), description, _positional(name), f"semfov {name}").print_help()
+
+
+def _parse_and_run(name: str, rest: Sequence[str]) -> int:
+    """Read the options of a subcommand, and run it; returns the exit code."""
+    from semfov.runs.command import run_command
+
     words = partial(_in_command_words, options=_message_options(name))
     with warnings.catch_warnings():  # each is one line in the words of the command, without the place in the code
         warnings.showwarning = lambda message, *_, **__: print(f"warning: {words(str(message))}", file=sys.stderr)
         return run_command(
             partial(_run, name),
-            options,
-            command.help,
+            _options_of(name),
+            SUBCOMMANDS[name].help,
             rest,
-            positional=positional,
-            program=program,
+            positional=_positional(name),
+            program=f"semfov {name}",
             words=words,
             goes_on=name == "fit",
         )
@@ -99,15 +124,13 @@ def _text(name: str, rest: Sequence[str]) -> str | None:
         return f"semfov {__version__}\n"
     if name in ("--help", "-h", "--help-all"):
         return OVERVIEW
-    if name in SUBCOMMANDS and ("--help" in rest or "-h" in rest):
-        return SUBCOMMANDS[name].help
     if name == "completion":
-        return _completion(rest[0] if rest else None, {command: _option_names(command) for command in SUBCOMMANDS})
-    return None
+        return _completion("".join(rest[:1]), {command: _option_names(command) for command in SUBCOMMANDS})
+    asks_for_help = name in SUBCOMMANDS and {"--help", "-h"}.intersection(rest)
+    return SUBCOMMANDS[name].help if asks_for_help else None
 
 
-_SHELLS = {
-    "bash": """\
+_BASH = """\
 _semfov() {{
   local words=""
   case "${{COMP_WORDS[1]}}" in
@@ -117,26 +140,31 @@ _semfov() {{
   COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
 }}
 complete -o bashdefault -o default -F _semfov semfov
-""",
+"""
+
+_SHELLS = {
+    "bash": _BASH,
+    # zsh reads scripts of bash once it is told to.
+    "zsh": f"autoload -Uz compinit bashcompinit && compinit && bashcompinit\n{_BASH}",
     "fish": """\
 complete -c semfov -n __fish_use_subcommand -a "{commands}"
 {lines}
 """,
 }
-"""Scripts of shells that complete commands and options; that of zsh is that of bash."""
+"""Scripts of shells that complete commands and options."""
 
 
-def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
+def _completion(shell: str, options: Mapping[str, Iterable[str]]) -> str:
     """Write the script with which a shell completes the command.
 
     Args:
-        shell: `bash`, `zsh` or `fish`.
+        shell: `bash`, `zsh` or `fish`; empty where none is named.
         options: names of the options of each subcommand.
 
     Returns:
         The script; how to ask for one, where it is no such shell.
     """
-    script = _SHELLS.get("bash" if shell == "zsh" else shell or "")
+    script = _SHELLS.get(shell)
     if script is None:
         return "usage: semfov completion bash|zsh|fish, for example: semfov completion bash >> ~/.bashrc\n"
     bash_cases = []
@@ -149,10 +177,7 @@ def _completion(shell: str | None, options: Mapping[str, Iterable[str]]) -> str:
         fish_lines += [f"{fish_start} {word}" for word in words]
     cases = "\n".join(bash_cases)
     lines = "\n".join(fish_lines)
-    filled = script.format(cases=cases, commands=" ".join(options), lines=lines)
-    if shell == "zsh":  # which reads scripts of bash once it is told to
-        return f"autoload -Uz compinit bashcompinit && compinit && bashcompinit\n{filled}"
-    return filled
+    return script.format(cases=cases, commands=" ".join(options), lines=lines)
 
 
 def _unknown(name: str) -> str:
@@ -169,10 +194,8 @@ def _unknown(name: str) -> str:
 def _option_names(name: str) -> list[str]:
     """Names of the options of a subcommand, without the positional one."""
     options = _options_of(name)
-    names = [
-        field.name for field in fields(options) if field.name not in (SUBCOMMANDS[name].positional, *options.unused)
-    ]
-    return [name.rstrip("_") for name in names]  # `try_` is --try
+    no_options = {SUBCOMMANDS[name].positional, *options.unused}
+    return [field.name.rstrip("_") for field in fields(options) if field.name not in no_options]  # `try_` is --try
 
 
 def _message_options(name: str) -> list[str]:
@@ -181,7 +204,8 @@ def _message_options(name: str) -> list[str]:
     if name != "fit":
         return names
     detector = resolve_name("semfov.runs.config:DetectorConfig")
-    return [*(f"detector.{field.name}" for field in fields(detector) if field.name not in names), *names]
+    names_of_detector = [field.name for field in fields(detector)]
+    return [*(f"detector.{setting}" for setting in names_of_detector if setting not in names), *names]
 
 
 def _with_present_names(command: str, words: Sequence[str]) -> list[str]:
@@ -201,12 +225,9 @@ def _with_present_names(command: str, words: Sequence[str]) -> list[str]:
 
 def _of_others(command: str, words: Sequence[str]) -> str | None:
     """Say what is wrong with an option that other subcommands or other programs have; None if there is none."""
-    for word in words:
-        option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else ""
-        refusal = _refusal(command, option)
-        if refusal is not None:
-            return refusal
-    return None
+    options = [word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")]
+    refusals = (_refusal(command, option) for option in options)
+    return next(filter(None, refusals), None)
 
 
 def _refusal(command: str, option: str) -> str | None:
@@ -221,8 +242,8 @@ def _refusal(command: str, option: str) -> str | None:
         singular = positional.removesuffix("s")
         usage = f"semfov {command} {singular.upper()}"
         return f"unknown option --{option}; the {singular} has no option before it: {usage}"
-    looks = command in (*_LOOKING, "gaze")
-    return _meant_instead(command, option) if is_unknown and looks else None
+    is_advised = is_unknown and command in (*_LOOKING, "gaze")
+    return _meant_instead(command, option) if is_advised else None
 
 
 def _means_positional(option: str, positional: str) -> bool:
