@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
-from inspect import signature
+from inspect import Signature, signature
 from numbers import Integral, Real
 from typing import ParamSpec, TypeVar
 
@@ -122,18 +122,24 @@ def check_device(device: object) -> None:
 
 def devices_here() -> list[str]:
     """List the kinds of devices that PyTorch has on this machine."""
-    return ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
+    is_here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.mps.is_available()}
+    return [device for device in is_here if is_here[device]]
 
 
 def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
     """Raise `InputError` unless the last dimensions of a tensor have the given sizes; None stands for any."""
     check_tensor(tensor, argument)
     sizes = tuple(tensor.shape[-len(shape) :])
-    if tensor.ndim >= len(shape) and all(s is None or s == n for s, n in zip(shape, sizes, strict=True)):
-        return
-    # The message is built only now, because a graph with dynamic sizes cannot write the sizes out.
-    expected = ", ".join("any" if s is None else str(s) for s in shape)
-    check(False, argument, f"a tensor of shape (..., {expected})", tuple(tensor.shape))
+    has_shape = len(sizes) == len(shape) and all(_is_size(*pair) for pair in zip(sizes, shape, strict=True))
+    if not has_shape:
+        # The message is built only now, because a graph with dynamic sizes cannot write the sizes out.
+        expected = ", ".join("any" if size is None else str(size) for size in shape)
+        check(False, argument, f"a tensor of shape (..., {expected})", tuple(tensor.shape))
+
+
+def _is_size(size: int, expected: int | None) -> bool:
+    """Tell whether a dimension has the size that is expected; None stands for any."""
+    return expected is None or size == expected
 
 
 def check_tensor(value: object, argument: str) -> None:
@@ -271,10 +277,7 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
     """Decorate a method so that unknown or missing arguments raise `InputError` with a suggestion."""
     form = signature(function)
     name = function.__qualname__.removesuffix(".__init__").rpartition(".")[-1]
-    _, *parameters = form.parameters.values()  # without `self`
-    known = [parameter.name for parameter in parameters]
-    words = [p.name if p.default is p.empty else f"{p.name}=" for p in parameters]
-    most = sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in form.parameters.values())
+    known = [*form.parameters][1:]  # without `self`
 
     @wraps(function)
     def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
@@ -283,10 +286,26 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
         try:
             form.bind(*arguments, **options)
         except TypeError as error:
-            maker = f"; {MAKERS[name]} makes one" if name in MAKERS else ""
-            # What is given without a name, beside the picture, is what others look for.
-            elsewhere = other_method(name, "target", known) if len(arguments) > most else None
-            raise InputError(f"{name}: {error}; {elsewhere or 'expected ' + ', '.join(words)}{maker}") from None
+            remedy = _right_form(name, form, len(arguments))
+            raise InputError(f"{name}: {error}; {remedy}") from None
         return function(*arguments, **options)
 
     return call
+
+
+def _right_form(name: str, form: Signature, number: int) -> str:
+    """Say how a method is called, or what else takes what it was given.
+
+    Args:
+        name: name of the method.
+        form: its signature.
+        number: number of arguments, with `self`, that were given without a name.
+    """
+    _, *parameters = form.parameters.values()  # without `self`
+    words = [p.name if p.default is p.empty else f"{p.name}=" for p in parameters]
+    remedy = f"expected {', '.join(words)}"
+    unnamed = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if number > 1 + len(unnamed):
+        # What is given without a name, beside the picture, is what others look for.
+        remedy = other_method(name, "target", [p.name for p in parameters]) or remedy
+    return f"{remedy}; {MAKERS[name]} makes one" if name in MAKERS else remedy

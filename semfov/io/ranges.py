@@ -2,9 +2,10 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
+from itertools import repeat
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
@@ -53,19 +54,22 @@ class Range:
         """
         if isinstance(value, str) and value == self.word:
             return True
-        kind = Integral if whole else Real
-        if isinstance(value, bool) or not isinstance(value, kind):
-            return False
-        try:
-            # A whole number stays one: 10**400 is out of any range, and no float.
-            number = int(value) if isinstance(value, Integral) else float(value)
-        except (OverflowError, ValueError):
-            return False
-        if self.above is not None and not number > self.above:
-            return False
-        if self.below is not None and not number < self.below:
-            return False
-        return self.low <= number <= self.high
+        number = _as_number(value, whole=whole)
+        is_above = self.above is None or number > self.above
+        is_below = self.below is None or number < self.below
+        return is_above and is_below and self.low <= number <= self.high
+
+
+def _as_number(value: object, *, whole: bool) -> float:
+    """Convert a value to a number of Python; NaN, which no range holds, for a value that is none."""
+    kind = Integral if whole else Real
+    if isinstance(value, bool) or not isinstance(value, kind):
+        return math.nan
+    try:
+        # A whole number stays one: 10**400 is out of any range, and no float.
+        return int(value) if isinstance(value, Integral) else float(value)
+    except (OverflowError, ValueError):
+        return math.nan
 
 
 @dataclass(frozen=True)
@@ -149,13 +153,17 @@ def _check_value(hint: object, value: object, name: str) -> None:
     if kind is Annotated:
         _check_ranges(hint, value, name)
     elif kind is tuple and isinstance(value, list | tuple):
-        item_hints = get_args(hint)
-        is_open_ended = item_hints[-1] is Ellipsis  # `tuple[int, ...]`
-        for place, item in enumerate(value):
-            item_hint = item_hints[0] if is_open_ended else item_hints[place]
-            _check_value(item_hint, item, f"{name}[{place}]")
+        _check_items(get_args(hint), value, name)
     else:
         _check_alternatives(get_args(hint), value, name)
+
+
+def _check_items(hints: Sequence[object], items: Sequence[object], name: str) -> None:
+    """Raise `InputError` if an item of a list is out of the range of its type."""
+    is_open_ended = hints[-1] is Ellipsis  # `tuple[int, ...]`
+    hints_of_items = repeat(hints[0]) if is_open_ended else hints
+    for place, (hint, item) in enumerate(zip(hints_of_items, items, strict=False)):
+        _check_value(hint, item, f"{name}[{place}]")
 
 
 def _check_ranges(hint: object, value: object, name: str) -> None:
