@@ -135,6 +135,15 @@ def counted(number: int, name: str) -> str:
     return f"{number or 'no'} {name if number < 2 else plural(name)}"
 
 
+def number_of(count: int, noun: str) -> str:
+    """Write how many there are of a thing, in figures.
+
+    >>> number_of(0, "look"), number_of(1, "look"), number_of(3, "pass")
+    ('0 looks', '1 look', '3 passes')
+    """
+    return f"{count} {noun if count == 1 else plural(noun)}"
+
+
 def plural(name: str) -> str:
     """Write the plural of a class name; a name that does not end in a small letter has none."""
     word = re.split(r"[\s_-]", name)[-1]

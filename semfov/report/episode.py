@@ -113,16 +113,16 @@ def episode_data(
 
 def _outcome_data(scanpath: Scanpath) -> Data:
     """Tell why the episode ended, and where the target was found, or is most likely."""
+    cell = None
+    box = None
     decision = scanpath.decision
-    found = decision if decision is not None and decision.outcome == "found" else None
-    box, _ = (None, 0.0) if scanpath.best_place is None else scanpath.best_place
-    if found is not None:
-        box = found.box
-    return {
-        "why": scanpath.why_it_ended(),
-        "cell": None if found is None else found.cell,
-        "box": None if box is None else [round(edge, 1) for edge in box.tolist()],
-    }
+    if decision is not None and decision.outcome == "found":
+        cell = decision.cell
+        box = decision.box
+    elif scanpath.best_place is not None:
+        box, _ = scanpath.best_place
+    edges = None if box is None else [round(edge, 1) for edge in box.tolist()]
+    return {"why": scanpath.why_it_ended(), "cell": cell, "box": edges}
 
 
 def _fixation_data(scanpath: Scanpath, views: Sequence[Tensor] | None, width: int, quality: int) -> list[Data]:
@@ -270,7 +270,7 @@ def tagged(
 
 def _map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
     """Quantise the maps `(n, X·Y)` of the target, of the classes most probable anywhere, and of background."""
-    probabilities = scanpath.probabilities.detach().cpu()
+    probabilities = scanpath.probabilities.detach().cpu()  # (n, X·Y, K+1)
     labels = (1 + probabilities[..., 1:].amax((0, 1)).argsort(descending=True, stable=True)).tolist()
     target = scanpath.target
     maps = []

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 
+from semfov.data.classes import number_of
 from semfov.detection.objects import box_text
 from semfov.paths.look import CONFIDENT
 from semfov.report.episode import Data
@@ -96,7 +97,7 @@ def _overview(data: Data, place: str) -> str:
     for (number, box), tag in zip(windows, tags, strict=True):
         shapes.append(_window_shape(number, box, tag, unit))
 
-    objects = f"{data['count']} object{'s' if data['count'] != 1 else ''}"
+    objects = number_of(data["count"], "object")
     label = f"The picture with {len(windows)} numbered {_view_word(data)}s and {objects}"
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
@@ -195,7 +196,7 @@ def _look(data: Data, index: int, place: str) -> str:
     number = index + 1
     width, height = look["size"]
     count = look["count"]
-    label = f"The window of look {number} with {count} detection{'s' if count != 1 else ''}"
+    label = f"The window of look {number} with {number_of(count, 'detection')}"
     title = f"Look {number}{': the whole picture' if look['whole'] else ''}"
     return (
         f'<section class="look" data-look="{index}" id="{place}" aria-labelledby="{place}-title">'
@@ -255,7 +256,9 @@ def _look_facts(look: Data, number: int) -> dict[str, str]:
         warm_up = ", with the warm-up of the detector" if look["warm"] else ""
         facts["End"] = f"after {look['seconds']:.2f} s{warm_up}"
     if look["closer"] is not None:
-        facts["Closer look" if number > 1 else "Close enough to tell"] = look["closer"]
+        # A first look is at the whole picture, and may be close enough.
+        kind = "Closer look" if number > 1 else "Close enough to tell"
+        facts[kind] = look["closer"]
     return facts
 
 

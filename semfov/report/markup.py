@@ -33,6 +33,11 @@ def facts_html(facts: Mapping[str, str]) -> str:
     return "".join(f"<div><dt>{name}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts.items())
 
 
+def hidden_unless(shown: object) -> str:
+    """Write the attribute that hides an element, unless what it shows is there."""
+    return "" if shown else " hidden"
+
+
 def left_out(count: int, what: str) -> str:
     """Say how many objects or detections a list leaves out; empty for none."""
     if not count:

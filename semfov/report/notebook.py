@@ -68,10 +68,13 @@ def _object_shapes(record: Record, unit: float) -> list[str]:
     shapes = []
     for row in record.object_rows()[:_MOST]:
         name = escape(f"{row['class']} {row['score']:.2f}")
-        confirmed = ", confirmed" if row["confirmed"] else ""
-        title = f"<title>{name}{confirmed}</title>"
-        colour = FOUND if row["confirmed"] else TARGET
-        line = 2 * unit if row["confirmed"] else 1.2 * unit
+        title = f"<title>{name}</title>"
+        colour = TARGET
+        line = 1.2 * unit
+        if row["confirmed"]:
+            title = f"<title>{name}, confirmed</title>"
+            colour = FOUND
+            line = 2 * unit
         box = (row["x1"], row["y1"], row["x2"], row["y2"])
         shapes += [_rect(part, colour, line, title) for part in at_both_ends(box, width)]
     if record.best_place is not None:

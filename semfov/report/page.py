@@ -11,6 +11,7 @@ from pathlib import Path
 
 from semfov.paths.look import CONFIDENT
 from semfov.report.episode import Data
+from semfov.report.markup import hidden_unless
 from semfov.report.overview import overview_html
 from semfov.report.parts import ABOUT, EpisodePart, Part, part_of
 from semfov.report.template import colour_steps, filled, write_html
@@ -59,17 +60,18 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     ('<!DOCTYPE html>', True)
     """
     parts = [part_of(episode, number) for number, episode in enumerate(episodes)]
-    script_draws = not episodes or any(isinstance(part, EpisodePart) for part in parts)
+    is_drawn_by_script = [isinstance(part, EpisodePart) for part in parts]
     # A single episode begins with its outcome, and one of several has it where it is chosen.
-    is_single = not sections and len(episodes) == 1
-    overview = overview_html(episodes, [part.article for part in parts]) if len(parts) > 1 and not sections else ""
+    is_single = len(episodes) == 1 and not sections
+    if len(episodes) > 1 and not sections:
+        sections = overview_html(episodes, [part.article for part in parts])
     contents = {
         "title": escape(title),
-        "sections": sections or overview,
+        "sections": sections,
         "looks": "".join(part.looks_html(is_named=not is_single) for part in parts),
         "objects": "".join(part.section_html for part in parts),
         "least": f"{CONFIDENT:g}",
-        "fixations": "" if script_draws else " hidden",
+        "fixations": hidden_unless(any(is_drawn_by_script) or not parts),
         **(_of_single(episodes[0]) if is_single else _of_several(episodes)),
     }
     return filled("page", _script_data(parts), contents)
@@ -113,8 +115,7 @@ def _of_several(episodes: Sequence[Data]) -> dict[str, str]:
 def _outcome_html(episode: Data) -> str:
     """Say what came of a single episode, below the title."""
     fact = escape(episode.get("decision") or "")
-    hidden = "" if fact else " hidden"
-    return f'<div{hidden}><p class="outcome" data-about="decision">{fact}</p></div>'
+    return f'<div{hidden_unless(fact)}><p class="outcome" data-about="decision">{fact}</p></div>'
 
 
 def _details_html(episode: Data) -> str:
@@ -130,7 +131,7 @@ def _facts_html(episodes: Sequence[Data], facts: Iterable[str]) -> str:
     rows = []
     for key in facts:
         if any(key in episode for episode in episodes):
-            fact = episodes[0].get(key) or ""
-            hidden = "" if fact else " hidden"
-            rows.append(f'<div{hidden}><dt>{ABOUT[key]}</dt><dd data-about="{key}">{escape(fact)}</dd></div>')
+            fact = escape(episodes[0].get(key) or "")
+            definition = f'<dt>{ABOUT[key]}</dt><dd data-about="{key}">{fact}</dd>'
+            rows.append(f"<div{hidden_unless(fact)}>{definition}</div>")
     return f'<dl id="about" class="facts">{"".join(rows)}</dl>'

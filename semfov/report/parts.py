@@ -111,10 +111,7 @@ class Part(ABC):
             heads.insert(heads.index(self.look), "pan, tilt")
         if self.data["confirmable"]:
             heads.insert(heads.index("box"), "confirmed")
-        titles = "".join(
-            f'<th scope="col"><button type="button" class="sort">{head}</button></th>' if head else "<td></td>"
-            for head in heads
-        )
+        titles = "".join(map(_sortable_head, heads))
         rows = "".join(self._object_row(order, found) for order, found in enumerate(objects, 1))
         label = f"Objects with boxes x1,y1–x2,y2 in picture pixels and the {self.nearest}"
         return (
@@ -151,6 +148,11 @@ class Part(ABC):
         rem = min(4.0, 3 * width / height)  # a crop is 3 rem high, and narrower where it is wide
         style = f"width: {rem:.2f}rem"
         return f'<svg class="crop" viewBox="{view}" style="{style}" aria-hidden="true"><use href="#{source}"/></svg>'
+
+
+def _sortable_head(title: str) -> str:
+    """Make the head of a column that sorts the rows; a column without a title, the pictures, has none."""
+    return f'<th scope="col"><button type="button" class="sort">{title}</button></th>' if title else "<td></td>"
 
 
 class EpisodePart(Part):

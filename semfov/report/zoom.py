@@ -94,7 +94,6 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
     detections = _detections(path, look, view)
     closer = _closer_look(path, look)
     turned = _pose_in_words(look) if path.kind.turns else None
-    brought = _brought_in_words(path, look)
     return {
         "view": jpeg_uri(view.pixels, max(1, round((x2 - x1) * magnification)), quality),
         "box": [round(side) for side in look.region],
@@ -108,16 +107,23 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
         "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
         "detections": detections[:_MOST_DETECTIONS],
         "count": len(detections),
-        "brought": brought,
-        "status": " ".join(
-            [
-                f"{_number_in_words(path, look)}{_where_in_words(path, look, magnification, turned)}.",
-                *([] if look.value is None else [f"Its value was {look.value:.2g}."]),
-                *([] if closer is None else [_closer_in_words(look, closer)]),
-                *([f"Best seen in this look: {brought}."] if brought else []),
-            ]
-        ),
+        "brought": _brought_in_words(path, look),
+        "status": _status(path, look, magnification, turned),
     }
+
+
+def _status(path: Record, look: RecordedLook, magnification: float, turned: str | None) -> str:
+    """Tell of a look where it was, its value, and what came of it."""
+    sentences = [f"{_number_in_words(path, look)}{_where_in_words(path, look, magnification, turned)}."]
+    if look.value is not None:
+        sentences.append(f"Its value was {look.value:.2g}.")
+    closer = _closer_look(path, look)
+    if closer is not None:
+        sentences.append(_closer_in_words(look, closer))
+    brought = _brought_in_words(path, look)
+    if brought:
+        sentences.append(f"Best seen in this look: {brought}.")
+    return " ".join(sentences)
 
 
 def _closer_look(path: Record, look: RecordedLook) -> CloseUp | None:
@@ -198,16 +204,18 @@ def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
     rows = []
     for number in range(detections.confidence.shape[1]):
         label, score = _label_and_score(detections, number, path.target)
-        if score >= CONFIDENT:
-            entry = {
-                "box": view.boxes[number].tolist(),
-                "place": detections.boxes[0, number].tolist(),
-                "label": path.classes[label],
-                "score": score,
-            }
-            rows.append((label == path.target, score, entry))
+        if score < CONFIDENT:
+            continue
+        entry = {
+            "box": view.boxes[number].tolist(),
+            "place": detections.boxes[0, number].tolist(),
+            "label": path.classes[label],
+            "score": score,
+        }
+        rows.append((label == path.target, score, entry))
     rows.sort(key=lambda row: row[:2], reverse=True)
     entries = [entry for _, _, entry in rows]
+    drawn = entries[:_MOST_DETECTIONS]
     # Names would cover small objects. The table has them.
-    numbers = [str(number) for number in range(1, min(len(entries), _MOST_DETECTIONS) + 1)]
-    return [*tagged(entries[:_MOST_DETECTIONS], numbers, view.size), *entries[_MOST_DETECTIONS:]]
+    numbers = [str(number) for number in range(1, len(drawn) + 1)]
+    return [*tagged(drawn, numbers, view.size), *entries[_MOST_DETECTIONS:]]

@@ -99,15 +99,8 @@ def plot_belief(
     photograph = scanpath.image if image is None else image
     columns = len(fixations) if axes is not None else min(columns, len(fixations))
     rows = -(-len(fixations) // columns)
-    figure_width = 5.6
-    figure_height = 4.6
-    if fixation is None:
-        width, height = scanpath.grid.extent.tolist()
-        figure_width = max(2.6 * columns, 3.2) + 0.6
-        figure_height = max(rows * (2.6 * height / width + 0.3), 2.2)
-    figure, panels = make_figure(
-        rows, columns, width=figure_width, height=figure_height, layout="compressed", axes=axes
-    )
+    width, height = (5.6, 4.6) if fixation is not None else _inches_of_panels(scanpath, rows, columns)
+    figure, panels = make_figure(rows, columns, width=width, height=height, layout="compressed", axes=axes)
     used = panels[: len(fixations)]
     for panel, number in zip(used, fixations, strict=True):
         drawn = draw_belief(panel, scanpath, number, target, photograph)
@@ -118,6 +111,12 @@ def plot_belief(
     for panel in panels[len(fixations) :]:
         panel.remove()
     return figure
+
+
+def _inches_of_panels(scanpath: Scanpath, rows: int, columns: int) -> tuple[float, float]:
+    """Compute width and height of a figure with several pictures, of which each has a title, beside a scale."""
+    width, height = scanpath.grid.extent.tolist()
+    return max(2.6 * columns, 3.2) + 0.6, max(rows * (2.6 * height / width + 0.3), 2.2)
 
 
 @styled

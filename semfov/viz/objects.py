@@ -59,9 +59,9 @@ def draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Ten
         boxes: `(M, 4)`, true boxes; None for none.
     """
     grid = Grid(1, 1, record.size)
-    if isinstance(record, Record) and record.kind.grid:
-        believed = record.belief_map(0)
-        grid = grid if believed is None else believed[0]
+    grid_and_belief = record.belief_map(0) if isinstance(record, Record) and record.kind.grid else None
+    if grid_and_belief is not None:
+        grid, _ = grid_and_belief
     draw_image(axes, image, grid)
     draw_grid(axes, grid)
     if boxes is not None:
@@ -85,12 +85,15 @@ def object_entries(record: Record) -> list[LegendEntry]:
         entries.append(LegendEntry(FOUND, "-", f"confirmed: {name} ({confirmed})"))
     if others:
         # Where nothing can be confirmed, that an object was not goes without saying.
-        rest = "not confirmed: " if confirmed or record.decision is not None else ""
-        entries.append(LegendEntry(TARGET, "-", f"{rest}{name} from {record.words.threshold} ({others})"))
-    best = record.best_place
-    if best is not None:
+        can_be_confirmed = bool(confirmed) or record.decision is not None
+        doubt = "not confirmed: " if can_be_confirmed else ""
+        entries.append(LegendEntry(TARGET, "-", f"{doubt}{name} from {record.words.threshold} ({others})"))
+    refuted = [look.box for look in record.refuted]
+    if record.best_place is not None:
+        best, _ = record.best_place
         entries.append(LegendEntry(FOUND, "--", "best place, not sure enough"))
-    if any(best is None or not look.box.equal(best[0]) for look in record.refuted):
+        refuted = [box for box in refuted if not box.equal(best)]
+    if refuted:
         entries.append(LegendEntry(FOUND, ":", "not confirmed by a closer look"))
     return entries
 
@@ -129,7 +132,8 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
     Returns:
         The boxes, with labels for objects and for the best place.
     """
-    last = len(record) if last is None else last
+    if last is None:
+        last = len(record)
     marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.of_look <= last]
     rows = [row for row in record.object_rows() if row["look"] - 1 <= last]
     for row in reversed(rows):
@@ -157,9 +161,11 @@ def _marks_of_object(row: Values, record: Record, *, many: bool) -> list[Mark]:
     # The name would only repeat the class that was searched for, and take room that many labels do not have.
     one_class = many and record.target is not None
     text = score if one_class else f"{row['class']} {score}"
-    colour = FOUND if row["confirmed"] else TARGET
-    thin = 0.8 if many else 1.2
-    line_width = 2.0 if row["confirmed"] else thin
+    colour = TARGET
+    line_width = 0.8 if many else 1.2
+    if row["confirmed"]:
+        colour = FOUND
+        line_width = 2.0
     box = (row["x1"], row["y1"], row["x2"], row["y2"])
     return [Mark(part, colour, "-", line_width, text) for part in at_both_ends(box, record.size[0])]
 
