@@ -36,12 +36,18 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     if classes is not None and names is not None:
         expected = f"none for {options.detector}, which has its own; `semfov find --target CLASS` looks for one of them"
         raise InputError(f"classes: expected {expected}, got {', '.join(names)}")
+    _check_kind_of_weights(options)
+    return names if classes is None else classes
+
+
+def _check_kind_of_weights(options: AgentOptions) -> None:
+    """Raise `InputError` for a file of ONNX as the weights of a registered detector that takes those of Darknet."""
     weights = options.weights
     registered = WEIGHTS.get(options.detector.lower())
-    takes_onnx = registered is None or registered.file.endswith(".onnx")
+    if registered is None or weights is None or weights.suffix != ".onnx":
+        return
     expected = f"Darknet weights for {options.detector}; an ONNX file is a detector of its own, --detector FILE"
-    check(weights is None or weights.suffix != ".onnx" or takes_onnx, "weights", expected, weights)
-    return names if classes is None else classes
+    check(registered.file.endswith(".onnx"), "weights", expected, weights)
 
 
 def detector_options(options: DetectorOptions) -> dict[str, Any]:
@@ -85,12 +91,13 @@ def check_onnx_options(options: DetectorOptions, detector: str) -> None:
         detector: name or file of the detector.
     """
     registered = WEIGHTS.get(detector.lower())
-    is_file = detector.endswith(".onnx")
-    is_onnx = is_file or (registered is not None and registered.file.endswith(".onnx"))
+    file = detector if registered is None else registered.file
+    expected = "none for a detector that is no ONNX file"
     for name in _OF_ONNX:
         # Settings are remembered beside a file of one's own.
-        suits = is_file if name == "remember" else is_onnx
-        check(suits or not getattr(options, name), name, "none for a detector that is no ONNX file", detector)
+        file_of_option = detector if name == "remember" else file
+        if getattr(options, name):
+            check(file_of_option.endswith(".onnx"), name, expected, detector)
 
 
 def remember(options: DetectorOptions, detector: str) -> Path | None:
@@ -117,19 +124,19 @@ def make_agent(options: AgentOptions) -> ActivePerception:
     Returns:
         The agent, ready for use.
     """
-    device = options.device
+    device = options.device or "cpu"
     if options.models is None:
         check_onnx_options(options, options.detector)
     agent = _load_agent(options, detector_options(options))
     remember(options, options.detector)
     if options.half:
         agent = agent.half()
-        if torch.device(device or "cpu").type == "cpu":
+        if torch.device(device).type == "cpu":
             warnings.warn(
                 "half: numbers of 16 bits make a processor several times slower; leave it out, or give device='cuda'",
                 stacklevel=2,
             )
-    return agent if device is None else agent.to(device)
+    return agent if options.device is None else agent.to(device)
 
 
 def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePerception:

@@ -13,6 +13,7 @@ from semfov.cli.outcome import table_lines
 from semfov.cli.rivals import ALL_SLICES, SEMFOV, Point, Scores, Way, all_slices, best_slices, by_semfov, warm_up
 from semfov.cli.sources import PictureSource, example_source, picture_sources
 from semfov.cli.truth import Truth
+from semfov.data.classes import number_of
 from semfov.data.large import open_large
 from semfov.errors import SemfovError, check
 from semfov.io.files import check_writable, write_text
@@ -145,8 +146,7 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
 def _agreement(last: Point, slices: Point) -> list[str]:
     """Say what semfov lists after its last pass of what all slices list, which stand for the truth."""
     found = f"{last.right} of the {last.reference} objects that all slices list"
-    number = last.listed - last.right
-    others = f"{number} other{'s' if number != 1 else ''}"
+    others = number_of(last.listed - last.right, "other")
     share = last.seconds / slices.seconds
     return [
         f"After {_passes(last)} semfov lists {found} and {others}, in {share:.2f} of their time.",
@@ -157,10 +157,10 @@ def _agreement(last: Point, slices: Point) -> list[str]:
 
 def _about(options: CompareOptions, pictures: int, targets: Sequence[str] | None) -> str:
     """Say what was compared: how many pictures, which classes, and what is taken as the truth."""
-    counted = f"{pictures} picture{'s' if pictures != 1 else ''}"
-    has_truth = options.annotations is not None
-    judge = f"the truth is {options.annotations}" if has_truth else "all slices are taken as the truth"
-    return f"{counted}, {', '.join(targets or ['all classes'])}; {judge}"
+    judge = "all slices are taken as the truth"
+    if options.annotations is not None:
+        judge = f"the truth is {options.annotations}"
+    return f"{number_of(pictures, 'picture')}, {', '.join(targets or ['all classes'])}; {judge}"
 
 
 def _passes(point: Point) -> str:

@@ -1,6 +1,6 @@
 """Subcommand detectors: lists the detectors that can be named, or the classes of one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from os import fspath
 from pathlib import Path
 
@@ -37,12 +37,7 @@ def _show_one(options: DetectorsOptions, path: Path) -> int:
     """List the classes of a detector, or try it out in a photograph."""
     name = fspath(path)
     loading = detector_options(options)
-    if path.is_dir():
-        classes = Manifest.read(path).classes
-    else:
-        check_onnx_options(options, name)
-        registered = check_detector(name)
-        classes = load_detector(name, **loading).classes if registered is None or loading else registered
+    classes = Manifest.read(path).classes if path.is_dir() else _classes_of(name, options)
     written = remember(options, name)
     if written is not None:
         print(f"wrote {written}")
@@ -53,6 +48,16 @@ def _show_one(options: DetectorsOptions, path: Path) -> int:
         return 0
     print("\n".join([f"{name} knows {len(classes)} classes:", *_in_columns(classes)]))
     return 0
+
+
+def _classes_of(name: str, options: DetectorsOptions) -> Sequence[str]:
+    """Find the classes of a detector; one whose classes are registered is loaded only to try the options."""
+    check_onnx_options(options, name)
+    loading = detector_options(options)
+    registered = check_detector(name)
+    if registered is None or loading:
+        return load_detector(name, **loading).classes
+    return registered
 
 
 def _in_columns(names: Sequence[str]) -> list[str]:
@@ -78,16 +83,24 @@ def show(options: DetectorsOptions) -> int:
         check(not getattr(options, name), name.strip("_"), "the name or the file of a detector before it", "none")
     rows = [["name", "size", "weights", "models shipped for", "licence"]]
     for name, weights in WEIGHTS.items():
-        elsewhere = "downloaded when needed" if weights.sources else "given by --weights"
-        place = "here" if weights_path(name).is_file() else elsewhere
-        purposes = [
-            purpose
-            for purpose, (kind, model) in _PURPOSES.items()
-            if (kind.shipped / f"{model(name)}.safetensors").is_file()
-        ]
-        rows.append([name, f"{weights.size / 1e6:.0f} MB", place, ", ".join(purposes) or "none", weights.licence])
+        purposes = ", ".join(_purposes(name)) or "none"
+        rows.append([name, f"{weights.size / 1e6:.0f} MB", _place_of_weights(name), purposes, weights.licence])
     print("\n".join(table_lines(rows)))
     print(f"\nDownloaded weights are kept in {cache_folder()}.")
     print("Others: torchvision:MODEL, hf:OWNER/NAME, a .onnx file, a .cfg and its weights, or a folder of semfov fit.")
     print("A detector without shipped models runs with --agent raw, or after semfov fit.")
     return 0
+
+
+def _place_of_weights(name: str) -> str:
+    """Say where the weights of a registered detector are, or come from."""
+    if weights_path(name).is_file():
+        return "here"
+    return "downloaded when needed" if WEIGHTS[name].sources else "given by --weights"
+
+
+def _purposes(name: str) -> Iterator[str]:
+    """Yield what models are shipped for, of those of a detector."""
+    for purpose, (kind, model) in _PURPOSES.items():
+        if (kind.shipped / f"{model(name)}.safetensors").is_file():
+            yield purpose

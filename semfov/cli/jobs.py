@@ -35,7 +35,6 @@ from semfov.io.pretrained import Pretrained
 from semfov.io.ranges import CheckedSettings
 from semfov.kinds import Drawing
 from semfov.paths import Record
-from semfov.report.template import page_path
 from semfov.runs.config import WHERE
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 
@@ -72,9 +71,11 @@ class PictureJob(ABC, Generic[_Options_co]):
         self.truth = None if options.annotations is None else Truth(options.annotations)
         self._check_before_loading()
 
-        # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
-        self.aim(detector_classes(options) if agent is None else agent.classes[1:])
-        self.agent = make_agent(options) if agent is None else agent
+        if agent is None:
+            # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
+            self.aim(detector_classes(options))
+            agent = make_agent(options)
+        self.agent = agent
         classes = self.agent.classes[1:]
         self.aim(classes)
         if self.truth is not None:
@@ -101,9 +102,10 @@ class PictureJob(ABC, Generic[_Options_co]):
         """Raise `InputError` where files that are named as their pictures would have the same name."""
         counts = Counter(str(source.place.with_suffix("")) for source in self.sources)
         repeated = ", ".join([place for place, times in counts.items() if times > 1][:3])
-        for name, folder in (("crops", self.options.crops), ("labels", self.options.labels)):
+        folders = {"crops": self.options.crops, "labels": self.options.labels}
+        for name in [name for name, folder in folders.items() if folder is not None]:
             expected = f"pictures of different names with --{name}, whose files have their names"
-            check(not repeated or folder is None, name, expected, repeated)
+            check(not repeated, name, expected, repeated)
 
     def aim(self, classes: Sequence[str] | None) -> None:
         """Take the target from the options; before the names of the classes are known it is not checked.
@@ -182,13 +184,16 @@ class PictureJob(ABC, Generic[_Options_co]):
 
     def check_drawings(self) -> None:
         """Raise `InputError` where a picture is looked at in a way that has no figure of a kind that is wanted."""
-        for source in self.sources if self.options.draw else ():
+        wanted = self.options.draw
+        if not wanted:
+            return
+        for source in self.sources:
             try:
                 kind = self.agent.kind_of_look(source.picture(), self.options.how, every=self.every)
             except Exception:
                 continue  # it is reported when the picture is looked at
             possible = [drawing for drawing in KINDS_OF_LOOK[kind].kind.drawings if drawing in self.drawings]
-            impossible = ", ".join(drawing for drawing in self.options.draw or () if drawing not in possible)
+            impossible = ", ".join(drawing for drawing in wanted if drawing not in possible)
             expected = f"{' or '.join(possible)} for {source.name}, which is looked at by {kind!r}"
             check(not impossible, "draw", expected, impossible)
 
@@ -212,19 +217,25 @@ class SearchJob(PictureJob[SearchOptions]):
             self.title = f"search for “{self.target}”"
 
     def look(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
-        """Search a picture."""
+        """Search a picture, for several classes with a fovea; elsewhere for the most likely one of them."""
         weights = self.weights or {}
         several = len(weights) > 1
-        foveal = several or self.options.start is not None or self.options.shifts is not None
-        is_fovea = self.agent.kind_of_look(picture, settings["how"], foveal=foveal) == "fovea"
-        if several and not is_fovea:
+        foveal = several or self.options.is_for_fovea
+        if self.agent.kind_of_look(picture, settings["how"], foveal=foveal) == "fovea":
+            return self._search_with_fovea(picture, settings, source)
+        if several:
             print(
                 f"large pictures and scenes are searched only for the most likely class: {self.target}",
                 file=sys.stderr,
             )
-        if is_fovea and settings["start"] is None:
+        return self.agent.search(picture, next(iter(weights)), **settings)
+
+    def _search_with_fovea(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
+        """Search a picture for the classes with their weights; the first look at an example is off the target."""
+        weights = self.weights or {}
+        if settings["start"] is None:
             settings = {**settings, "start": self._start_off_target(source)}
-        if several and is_fovea:
+        if len(weights) > 1:
             return self.agent.search(picture, weights, **{**settings, "how": "fovea"})
         return self.agent.search(picture, next(iter(weights)), **settings)
 
@@ -290,19 +301,19 @@ def _plain_attributes(part: torch.nn.Module) -> dict[str, object]:
 
 def _check_outputs(options: PictureOptions) -> None:
     """Raise an error for outputs that cannot be written or do not go together, before anything is loaded."""
-    if options.figure is not None:
-        check_writable(options.figure)
     out = options.results
-    if out is not None and out != STDOUT:
-        check_writable(out, folder=kind_of(out) is None)
-    if options.report is not None:
-        check_writable(page_path(options.report))
+    kind = None if out is None else kind_of(out)
+    for file in (options.figure, options.page):
+        check_writable(file)
     for folder in (options.crops, options.labels):
-        if folder is not None:
-            check_writable(folder, folder=True)
-    is_coco = out is not None and kind_of(out) == ".coco.json"
-    check(options.annotations is None or is_coco, "annotations", "--out FILE.coco.json beside it", out)
-    check(not options.draw or out not in (None, STDOUT), "draw", "--out FOLDER beside --draw", "none")
+        check_writable(folder, folder=True)
+    has_file_of_results = out not in (None, STDOUT)
+    if has_file_of_results:
+        check_writable(out, folder=kind is None)
+    if options.annotations is not None:
+        check(kind == ".coco.json", "annotations", "--out FILE.coco.json beside it", out)
+    if options.draw:
+        check(has_file_of_results, "draw", "--out FOLDER beside --draw", "none")
 
 
 def meant_classes(options: SearchOptions, classes: Sequence[str]) -> dict[str, float]:
@@ -338,7 +349,7 @@ def _any_of_classes(options: SearchOptions, classes: Sequence[str], error: Input
     with suppress(InputError):
         names = [classes[class_index(name.strip(), classes) - 1] for name in (options.target or "").split(",")]
     if len(names) > 1:
-        if options.how == "fovea" or options.start is not None or options.shifts is not None:
+        if options.how == "fovea" or options.is_for_fovea:
             return dict.fromkeys(names, 1.0)
         raise InputError(
             f"{error}; a search is for one class: for any of several add --how fovea, for all use `semfov find`"

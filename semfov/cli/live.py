@@ -1,7 +1,7 @@
 """Subcommand live: looks at a video, a camera or a network stream, and writes a video of the looks."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
@@ -11,7 +11,7 @@ from time import perf_counter
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, white_of
 from semfov.cli.results import held_outputs
-from semfov.data.classes import class_index
+from semfov.data.classes import class_index, number_of
 from semfov.data.sources import Picture, Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.io.files import check_apart, check_writable, write_text
@@ -39,12 +39,12 @@ def look_live(options: LiveOptions) -> int:
         The exit code, 1 if a frame was left out.
     """
     source = _source_of(options)
-    check(options.target is None or options.find is None, "find", "a target or classes to find, not both", options.find)
+    if options.target is not None:
+        check(options.find is None, "find", "a target or classes to find, not both", options.find)
     _check_outputs(options)
     # What is wrong with the target is reported before the agent is loaded, where its classes are known by then.
     _sought(options, detector_classes(options))
-    if options.tracks is not None:
-        check_writable(options.tracks)
+    check_writable(options.tracks)
     stream = open_stream(source, options.frames, white_of(options.white))
     agent = make_agent(options)
     settings = {setting.name: getattr(options, setting.name) for setting in fields(StreamSettings)}
@@ -61,22 +61,26 @@ def look_live(options: LiveOptions) -> int:
 
 def _source_of(options: LiveOptions) -> str | int:
     """Take the video or address, or the number of the camera; `semfov live 0` is a camera, too, as in OpenCV."""
-    check(options.source is None or options.camera is None, "camera", "a video or a camera, not both", options.camera)
-    if options.camera is not None:
-        return options.camera
-    if options.source is None:
+    source = options.source
+    camera = options.camera
+    if camera is not None:
+        check(source is None, "camera", "a video or a camera, not both", camera)
+        return camera
+    if source is None:
         raise InputError("source: expected a video, an address or --camera 0, got none")
-    is_number = options.source.isdecimal() and not Path(options.source).exists()
-    return int(options.source) if is_number else options.source
+    is_number = source.isdecimal() and not Path(source).exists()
+    return int(source) if is_number else source
 
 
 def _check_outputs(options: LiveOptions) -> None:
     """Raise `InputError` for files of another kind than a video and a text of tracks."""
     out = options.out
-    is_video = out is None or out.is_dir() or out.suffix.lower() in ("", *VIDEO_CODECS)
-    check(is_video, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", out)
+    if out is not None:
+        is_video = out.is_dir() or out.suffix.lower() in ("", *VIDEO_CODECS)
+        check(is_video, "out", f"a folder, or a file that ends in {' or '.join(VIDEO_CODECS)}", out)
     tracks = options.tracks
-    check(tracks is None or tracks.suffix.lower() == ".txt", "tracks", "a file that ends in .txt", tracks)
+    if tracks is not None:
+        check(tracks.suffix.lower() == ".txt", "tracks", "a file that ends in .txt", tracks)
 
 
 def _video_path(out: Path | None) -> Path | None:
@@ -105,14 +109,10 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
     """Look at every frame until Ctrl-C, print detections and belief, and write the video and the tracks, if wanted."""
     speed = _Speed()
     mot_lines: list[str] = []
-    size = None
     print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add_frame:
         try:
-            for picture in stream.frames:
-                size = size or picture.image.shape[-2:]
-                _check_same_size(picture, size)
-                moment = live.step(picture.image, picture.passed)
+            for picture, moment in _moments(live, stream):
                 speed.count_frame()
                 if tracks is not None:
                     mot_lines.append(_mot_lines(moment))
@@ -129,9 +129,18 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
     print(_totals(stream, speed))
 
 
+def _moments(live: LivePerception, stream: Stream) -> Iterator[tuple[Picture, Moment]]:
+    """Look at every frame of a stream; all frames have the size `(H, W)` of the first one."""
+    size = None
+    for picture in stream.frames:
+        size = size or picture.image.shape[-2:]
+        _check_same_size(picture, size)
+        yield picture, live.step(picture.image, picture.passed)
+
+
 def _totals(stream: Stream, speed: "_Speed") -> str:
     """Say how many frames were looked at, how many were not, and how fast it was."""
-    totals = [f"{speed.frames} frame{'' if speed.frames == 1 else 's'}"]
+    totals = [number_of(speed.frames, "frame")]
     totals += [f"{number} {kind}" for kind, number in stream.gaps.items() if number]
     mean = speed.mean()
     if mean:

@@ -12,6 +12,7 @@ from semfov.data.tone import White
 from semfov.errors import InputError
 from semfov.io.ranges import Count, Form, Range, Seed, Whole, Workers
 from semfov.kinds import Drawing, Quality
+from semfov.report.template import page_path
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 from semfov.settings import (
@@ -146,6 +147,11 @@ class PictureOptions(LookSettings, AgentOptions):
         """File or folder of results, where `out` names one."""
         return self.out if self.figure is None else None
 
+    @property
+    def page(self) -> Path | None:
+        """File of the page, where `report` names one or its folder."""
+        return None if self.report is None else page_path(self.report)
+
 
 @dataclass(frozen=True)
 class SearchOptions(SearchSettings, PictureOptions):
@@ -161,6 +167,11 @@ class SearchOptions(SearchSettings, PictureOptions):
 
     target: str | None = None
     embeddings: Path | None = None
+
+    @property
+    def is_for_fovea(self) -> bool:
+        """Whether a setting is given that only a fovea has."""
+        return self.start is not None or self.shifts is not None
 
 
 @dataclass(frozen=True)

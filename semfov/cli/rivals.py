@@ -1,10 +1,12 @@
 """Ways to look at pictures beside each other: by semfov, at all slices, and at the best slices first."""
 
 import time
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
+from statistics import fmean
 from typing import NamedTuple
 
 import torch
@@ -197,6 +199,115 @@ def _slices_of(lattice: Lattice, side: int, overlap: float) -> list[Window]:
     return slices(lattice, side, max(1, int(side * (1 - overlap))))
 
 
+class Reference(ABC):
+    """What objects count as right.
+
+    Args:
+        classes: names of the detector's classes.
+        labels: classes 1..K that are sought.
+
+    Attributes:
+        ids: ids of the categories by the labels of the classes that are judged.
+        pictures: annotation of each picture so far, by its id.
+    """
+
+    def __init__(self, classes: Sequence[str], labels: Sequence[int]) -> None:
+        self.classes = classes
+        self.ids: dict[int, Id] = {label: label for label in labels}
+        self.pictures: dict[Id, Annotation] = {}
+
+    @abstractmethod
+    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+        """Find the id of a picture.
+
+        Args:
+            name: path of the picture.
+            size: `(width, height)` in pixels.
+        """
+
+    @abstractmethod
+    def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
+        """Add the annotation of a picture.
+
+        Args:
+            image: its id.
+            size: `(width, height)` in pixels.
+            findings: what each way has found in it.
+        """
+
+    @abstractmethod
+    def annotations(self) -> Annotations:
+        """Return the annotations of all pictures in the form of a file."""
+
+    @property
+    def objects(self) -> int:
+        """Number of objects that can be found."""
+        return sum(int((~annotation.crowd).sum()) for annotation in self.pictures.values())
+
+
+class SlicesReference(Reference):
+    """The objects that all slices list; pictures are counted."""
+
+    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+        return len(self.pictures) + 1
+
+    def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
+        (finding,) = findings[ALL_SLICES]
+        objects = finding.objects.above(finding.threshold)
+        crowd = torch.zeros(len(objects), dtype=torch.bool)
+        self.pictures[image] = Annotation(objects.boxes, objects.labels, crowd, size)
+
+    def annotations(self) -> Annotations:
+        objects: dict[Id, list[Entry]] = {}
+        for image, annotation in self.pictures.items():
+            scores = torch.ones(len(annotation.labels))
+            rows = coco_results(image, annotation.boxes, annotation.labels, scores, self.ids)
+            objects[image] = [{**row, "iscrowd": 0} for row in rows]
+        images: dict[Id, Entry] = {image: {"file_name": str(image)} for image in self.pictures}
+        categories: dict[Id, Entry] = {id_: {"name": self.classes[label - 1]} for label, id_ in self.ids.items()}
+        return Annotations(images, categories, objects, "")
+
+
+class AnnotatedReference(Reference):
+    """The boxes of an annotation file, whose ids pictures and categories have.
+
+    Args:
+        classes: names of the detector's classes.
+        labels: classes 1..K that are sought.
+        truth: the annotations.
+    """
+
+    def __init__(self, classes: Sequence[str], labels: Sequence[int], truth: Truth) -> None:
+        super().__init__(classes, labels)
+        self.truth = truth
+        sought = {canonical_name(classes[label - 1]): label for label in labels}
+        categories = truth.categories([classes[label - 1] for label in labels])
+        self.ids = {sought[name]: id_ for name, id_ in categories.items()}
+
+    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+        """Find the id of a picture; raises `DataError` where the file lacks it, or has it twice or in another size."""
+        image = self.truth.image_id(name, size)
+        check_data(image not in self.pictures, name, "a picture that was not named before", "it again")
+        return image
+
+    def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
+        """Add the entries of the file, those of the classes that are sought, without boxes that have no area."""
+        label_of_category = {category: label for label, category in self.ids.items()}
+        sought = []
+        for entry in self.truth.annotations.objects[image]:
+            has_area = min(entry["bbox"][2:]) > 0
+            if has_area and entry["category_id"] in label_of_category:
+                sought.append(entry)
+        boxes = torch.tensor([entry["bbox"] for entry in sought], dtype=torch.float32).view(-1, 4)  # (N, 4)
+        boxes[:, 2:] += boxes[:, :2]  # a file has width and height, and not the right lower corner
+        labels = torch.tensor([label_of_category[entry["category_id"]] for entry in sought], dtype=torch.long)
+        crowd = torch.tensor([bool(entry["iscrowd"]) for entry in sought], dtype=torch.bool)
+        self.pictures[image] = Annotation(boxes, labels, crowd, size)
+
+    def annotations(self) -> Annotations:
+        return self.truth.annotations
+
+
 class Scores:
     """What ways of looking find in pictures, beside a reference: annotations, or the objects that all slices list.
 
@@ -211,21 +322,16 @@ class Scores:
 
     def __init__(self, classes: Sequence[str], labels: Sequence[int], truth: Truth | None) -> None:
         self.classes = classes
-        self.truth = truth
         sought = [*labels] or [*range(1, len(classes) + 1)]
-        categories = {canonical_name(classes[label - 1]): label for label in sought}
-        if truth is None:
-            self._ids: dict[int, Id] = {label: label for label in sought}
-        else:
-            found = truth.categories([classes[label - 1] for label in sought])
-            self._ids = {categories[name]: id_ for name, id_ in found.items()}
-        self._annotations: dict[Id, Annotation] = {}
+        self._reference: Reference = SlicesReference(classes, sought)
+        if truth is not None:
+            self._reference = AnnotatedReference(classes, sought, truth)
         self._found: dict[str, dict[Id, list[Finding]]] = defaultdict(dict)
 
     @property
     def pictures(self) -> int:
         """Number of pictures so far."""
-        return len(self._annotations)
+        return len(self._reference.pictures)
 
     def image_of(self, name: str, size: tuple[int, int]) -> Id:
         """Find the id of a picture in the annotations; without these they are counted.
@@ -240,11 +346,7 @@ class Scores:
         Raises:
             DataError: the annotations lack it, or have it twice or in another size.
         """
-        if self.truth is None:
-            return self.pictures + 1
-        image = self.truth.image_id(name, size)
-        check_data(image not in self._annotations, name, "a picture that was not named before", "it again")
-        return image
+        return self._reference.image_of(name, size)
 
     def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
         """Add a picture.
@@ -254,37 +356,9 @@ class Scores:
             size: `(width, height)` in pixels.
             findings: what each way has found in it.
         """
-        if self.truth is None:
-            (slices_finding,) = findings[ALL_SLICES]
-            reference = slices_finding.objects.above(slices_finding.threshold)
-            crowd = torch.zeros(len(reference), dtype=torch.bool)
-            self._annotations[image] = Annotation(reference.boxes, reference.labels, crowd, size)
-        else:
-            self._annotations[image] = self._annotated(self.truth.annotations.objects[image], size)
-        for way, of_way in findings.items():
-            self._found[way][image] = of_way
-
-    def _annotated(self, entries: Iterable[Entry], size: tuple[int, int]) -> Annotation:
-        """Make the annotation of a picture from the entries of the file, those of the classes that are sought.
-
-        Args:
-            entries: the entries of the picture.
-            size: `(width, height)` of the picture.
-
-        Returns:
-            The annotation, without boxes that have no area.
-        """
-        label_of_category = {category: label for label, category in self._ids.items()}
-        sought = []
-        for entry in entries:
-            has_area = min(entry["bbox"][2:]) > 0
-            if entry["category_id"] in label_of_category and has_area:
-                sought.append(entry)
-        boxes = torch.tensor([entry["bbox"] for entry in sought], dtype=torch.float32).view(-1, 4)
-        boxes[:, 2:] += boxes[:, :2]  # a file has width and height, and not the right lower corner
-        labels = torch.tensor([label_of_category[entry["category_id"]] for entry in sought], dtype=torch.long)
-        crowd = torch.tensor([bool(entry["iscrowd"]) for entry in sought], dtype=torch.bool)
-        return Annotation(boxes, labels, crowd, size)
+        self._reference.add(image, size, findings)
+        for way, findings_of_way in findings.items():
+            self._found[way][image] = findings_of_way
 
     def points(self) -> list[Point]:
         """List what each way finds after each number of passes.
@@ -293,64 +367,57 @@ class Scores:
             The points, way by way in the order of their passes.
         """
         points = []
-        reference = self._reference()
+        annotations = self._reference.annotations()
         for way, found in self._found.items():
-            numbers = sorted({finding.passes for of_picture in found.values() for finding in of_picture})
-            if way == ALL_SLICES:
-                numbers = numbers[-1:]
-            else:
-                numbers = [number for number in numbers if number in _AFTER or number == numbers[-1]]
-            for number in numbers:
+            for passes in _compared_passes(way, found.values()):
                 # A picture in which a way ended before has the objects that it had then.
-                found_by_then = {image: _after(number, of_picture) for image, of_picture in found.items()}
-                points.append(self._point(way, found_by_then, reference))
+                found_by_then = {image: _after(passes, findings) for image, findings in found.items()}
+                points.append(self._point(way, found_by_then, annotations))
         return points
 
-    def _point(self, way: str, found: Mapping[Id, Finding], reference: Annotations) -> Point:
+    def _point(self, way: str, found: Mapping[Id, Finding], annotations: Annotations) -> Point:
         """Judge what was found in all pictures."""
+        ids = self._reference.ids
         results: list[Entry] = []
         listed = 0
         right = 0
         for image, finding in found.items():
-            objects = _of_classes(finding.objects, self._ids)
-            rows = coco_results(image, objects.boxes, objects.labels, objects.scores, self._ids)
+            objects = _of_classes(finding.objects, ids)
+            rows = coco_results(image, objects.boxes, objects.labels, objects.scores, ids)
             results += [dict(row) for row in rows]
-            verdicts = right_boxes(objects.above(finding.threshold), self._annotations[image])
+            # For each object 1 is right, 0 is wrong, and -1 is not judged.
+            verdicts = right_boxes(objects.above(finding.threshold), self._reference.pictures[image])
             listed += int((verdicts >= 0).sum())
             right += int((verdicts > 0).sum())
-        names = [self.classes[label - 1] for label in self._ids]
-        precision = average_precision(reference, results, images=[*found], classes=names)
+        names = [self.classes[label - 1] for label in ids]
+        precision = average_precision(annotations, results, images=[*found], classes=names)
         return Point(
             way,
-            sum(finding.passes for finding in found.values()) / len(found),
-            sum(finding.seconds for finding in found.values()) / len(found),
-            None if precision is None else precision[1],
-            listed,
-            right,
-            sum(int((~annotation.crowd).sum()) for annotation in self._annotations.values()),
+            passes=fmean(finding.passes for finding in found.values()),
+            seconds=fmean(finding.seconds for finding in found.values()),
+            ap50=None if precision is None else precision[1],
+            listed=listed,
+            right=right,
+            reference=self._reference.objects,
         )
 
-    def _reference(self) -> Annotations:
-        """Return the annotations, or what all slices list in their form."""
-        if self.truth is not None:
-            return self.truth.annotations
-        objects: dict[Id, list[Entry]] = {}
-        for image, annotation in self._annotations.items():
-            scores = torch.ones(len(annotation.labels))
-            rows = coco_results(image, annotation.boxes, annotation.labels, scores, self._ids)
-            objects[image] = [{**row, "iscrowd": 0} for row in rows]
-        images: dict[Id, Entry] = {image: {"file_name": str(image)} for image in self._annotations}
-        categories: dict[Id, Entry] = {id_: {"name": self.classes[label - 1]} for label, id_ in self._ids.items()}
-        return Annotations(images, categories, objects, "")
+
+def _compared_passes(way: str, findings_of_pictures: Iterable[Sequence[Finding]]) -> list[int]:
+    """List the numbers of passes after which a way is compared: those of `_AFTER`, and the last one."""
+    findings = chain.from_iterable(findings_of_pictures)
+    numbers = sorted({finding.passes for finding in findings})
+    if way == ALL_SLICES:  # which are looked at together: fewer passes are those of smaller pictures
+        return numbers[-1:]
+    return [number for number in numbers if number in _AFTER or number == numbers[-1]]
 
 
 def _after(passes: int, findings: Sequence[Finding]) -> Finding:
     """Take the last finding with at most so many passes, or the first one."""
-    before = [finding for finding in findings if finding.passes <= passes]
-    return before[-1] if before else findings[0]
+    until_then = [finding for finding in findings if finding.passes <= passes]
+    return until_then[-1] if until_then else findings[0]
 
 
 def _of_classes(objects: Objects, labels: Iterable[int]) -> Objects:
     """Take the objects of classes that are judged."""
-    kept = [label in labels for label in objects.labels.tolist()]
-    return objects[torch.tensor(kept, dtype=torch.bool)]
+    is_judged = [label in labels for label in objects.labels.tolist()]
+    return objects[torch.tensor(is_judged, dtype=torch.bool)]

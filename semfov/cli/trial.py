@@ -129,17 +129,7 @@ def _about_scores(bare: Trial, detector: Detector) -> list[str]:
     """Say what the scores of the proposals tell of the export, its head and its background."""
     confidence = bare.proposals.confidence[0]
     if not len(bare.scores):
-        best = float(confidence.amax()) if len(confidence) else 0.0
-        values = len(confidence.unique())
-        if len(confidence) >= _ENOUGH and values <= _FEW:
-            return [
-                f"its {len(confidence):,} boxes have {values} different score{'s' if values > 1 else ''}: an export to "
-                "int8 with one scale for boxes and scores loses the scores; leave its last layers out of the conversion"
-            ]
-        return [
-            f"the best score is {best:.2f}; if the photograph shows objects of its classes, the head or the colours "
-            "may be wrong: give --head, --colour or --logits"
-        ]
+        return [_about_low_scores(confidence)]
     best_box = confidence.argmax()[None]
     share = float(score_vectors(bare.proposals.take(0, best_box), detector.background)[0, 1:].max())
     score = float(confidence.max())
@@ -149,6 +139,21 @@ def _about_scores(bare: Trial, detector: Detector) -> list[str]:
         f"in the score vectors, which beliefs read, the best class has {share:.2f} of {score:.2f}, since many small "
         "scores share it; lists have the score itself, and semfov fit learns the difference"
     ]
+
+
+def _about_low_scores(confidence: Tensor) -> str:
+    """Say why all scores may be so low that nothing is shown: they were lost, or are read in the wrong way."""
+    values = len(confidence.unique())
+    if len(confidence) >= _ENOUGH and values <= _FEW:
+        return (
+            f"its {len(confidence):,} boxes have {values} different score{'s' if values > 1 else ''}: an export to "
+            "int8 with one scale for boxes and scores loses the scores; leave its last layers out of the conversion"
+        )
+    best = float(confidence.amax()) if len(confidence) else 0.0
+    return (
+        f"the best score is {best:.2f}; if the photograph shows objects of its classes, the head or the colours "
+        "may be wrong: give --head, --colour or --logits"
+    )
 
 
 def _about_colours(bare: Trial, agent: ActivePerception, photo: Path) -> list[str]:

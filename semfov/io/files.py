@@ -219,16 +219,18 @@ def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None
     check_data(stat.S_ISREG(mode), name, "a file", kinds.get(stat.S_IFMT(mode), "a device"))
 
 
-def check_writable(path: Path, *, folder: bool = False) -> None:
+def check_writable(path: Path | None, *, folder: bool = False) -> None:
     """Check that a file can be written later, without making anything now.
 
     Args:
-        path: the file, or with `folder` the folder of files.
+        path: the file, or with `folder` the folder of files; None for nothing.
         folder: whether it is a folder.
 
     Raises:
         DataError: it cannot.
     """
+    if path is None:
+        return
     place = next((ancestor for ancestor in (path, *path.parents) if ancestor.exists()), Path())
     if place == path and not folder:
         check_regular(path)
