@@ -81,10 +81,10 @@ def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path
         if file is None or file in files:
             continue
         files.add(file)
-        is_package = file.name == "__init__.py"
-        if not is_package:
+        package = name
+        if file.name != "__init__.py":
             single_files.add(name)
-        package = name if is_package else parent
+            package = parent  # the one that relative imports start from
         for statement in read_source(file).imports:
             todo += filter(belongs, statement.modules(package))
     return files

@@ -84,9 +84,11 @@ def check_background(fitted: Settings, background: str | None, what: str) -> Non
         InputError: it is another one.
     """
     policy = fitted.get("background")
+    if policy is None or background is None:
+        return
     remedy = f"load the detector with background={policy!r}, or fit a model for {background!r}"
     expected = f"the background policy {policy!r} of the scores that the {what} was fitted on"
-    check(background is None or policy in (None, background), "background", expected, f"{background!r}; {remedy}")
+    check(policy == background, "background", expected, f"{background!r}; {remedy}")
 
 
 def check_same_detector(fitted: Settings, detector: Settings, what: str) -> None:
@@ -109,9 +111,9 @@ def check_same_detector(fitted: Settings, detector: Settings, what: str) -> None
             got, remedy = _other_file(detector)
         raise InputError(f"detector: the {what} was fitted for {_described(fitted)}, got {got}; {remedy}")
     check_background(fitted, detector.get("background"), what)
-    others = _differences(fitted, detector, _NOT_COMPARED)
-    if others:
-        warnings.warn(f"the {what} was fitted for another detector: {'; '.join(others)}", stacklevel=3)
+    differences = "; ".join(_differences(fitted, detector, _NOT_COMPARED))
+    if differences:
+        warnings.warn(f"the {what} was fitted for another detector: {differences}", stacklevel=3)
 
 
 def _is_same_network(fitted: Settings, detector: Settings) -> bool:
@@ -153,12 +155,13 @@ def check_sensor(fitted: Settings, sensor: Settings, what: str, *, strict: bool 
     """
     if not sensor or not fitted:
         return
-    others = _differences(fitted, sensor, set())
-    remedy = "make the sensor with these settings, or fit a model for this one (semfov fit)"
-    got = f"another: {'; '.join(others)}; {remedy}"
-    check(not (others and strict), "eye", f"the sensor that the {what} was fitted for", got)
-    if others:
-        warnings.warn(f"the {what} was fitted for another sensor: {'; '.join(others)}", stacklevel=3)
+    differences = "; ".join(_differences(fitted, sensor, set()))
+    if differences and strict:
+        remedy = "make the sensor with these settings, or fit a model for this one (semfov fit)"
+        expected = f"the sensor that the {what} was fitted for"
+        raise InputError(f"eye: expected {expected}, got another: {differences}; {remedy}")
+    if differences:
+        warnings.warn(f"the {what} was fitted for another sensor: {differences}", stacklevel=3)
 
 
 def check_grid(fitted: Settings, grid: tuple[int, int], what: str) -> None:
@@ -178,7 +181,8 @@ def check_grid(fitted: Settings, grid: tuple[int, int], what: str) -> None:
     rows = fitted.get("rows")
     if columns is None or rows is None:
         return
-    if columns / 2 <= grid[0] <= 2 * columns and rows / 2 <= grid[1] <= 2 * rows:
+    is_alike = columns / 2 <= grid[0] <= 2 * columns and rows / 2 <= grid[1] <= 2 * rows
+    if is_alike:
         return
     raise InputError(
         f"grid: the {what} was fitted on {columns} × {rows} cells and is valid for half to twice as many "
@@ -189,9 +193,11 @@ def check_grid(fitted: Settings, grid: tuple[int, int], what: str) -> None:
 
 def _differences(fitted: Settings, used: Settings, exempt: set[str]) -> list[str]:
     """List the settings that differ, in words."""
-    return [
-        f"{key} is {used.get(key)}, the model was fitted with {fitted.get(key)}"
-        for key in sorted((fitted.keys() | used.keys()) - exempt)
+    differences = []
+    for key in sorted((fitted.keys() | used.keys()) - exempt):
+        ours = used.get(key)
+        theirs = fitted.get(key)
         # As JSON, where lists and tuples look the same.
-        if json.dumps(fitted.get(key), sort_keys=True) != json.dumps(used.get(key), sort_keys=True)
-    ]
+        if json.dumps(ours, sort_keys=True) != json.dumps(theirs, sort_keys=True):
+            differences.append(f"{key} is {ours}, the model was fitted with {theirs}")
+    return differences

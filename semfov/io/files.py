@@ -71,15 +71,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(path)
     check_data(bool(path.name), f"cannot write {str(path)!r}", "the name of a file", "none")
-    temporary = None
+    temporary = _beside(path, f"{secrets.token_hex(4)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path.parent.resolve())
-        temporary = _beside(path, f"{secrets.token_hex(4)}.part")
         # Known before it exists: a signal may end the process while the file is created.
         _unfinished.add(temporary)
         temporary.touch(0o600, exist_ok=False)
         yield temporary
+        # The content is on the disk before the name is: else a loss of power could leave an empty file.
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.chmod(0o644)
@@ -87,10 +87,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     except OSError as error:
         raise DataError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
-        if temporary is not None:
-            with suppress(OSError):
-                temporary.unlink()
-            _unfinished.discard(temporary)
+        with suppress(OSError):
+            temporary.unlink()
+        _unfinished.discard(temporary)
 
 
 def _beside(path: Path, end: str) -> Path:
@@ -155,12 +154,18 @@ def _locked(place: Path, path: Path) -> Iterator[None]:
 @cache
 def _sweep(folder: Path) -> None:
     """Remove old parts from a folder, once in each process: a writer that was killed could not."""
+    oldest = time.time() - _ABANDONED
     with suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            if _PART.fullmatch(entry.name):
-                with suppress(OSError):
-                    if time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
-                        Path(entry.path).unlink()
+        for part in entries:
+            if _PART.fullmatch(part.name):
+                _remove_older(part, oldest)
+
+
+def _remove_older(file: os.DirEntry[str], time_of_change: float) -> None:
+    """Remove a file that was last changed before some time; one that another process removes meanwhile is gone."""
+    with suppress(OSError):
+        if file.stat(follow_symlinks=False).st_mtime < time_of_change:
+            Path(file.path).unlink()
 
 
 def inside(folder: str | os.PathLike[str], name: str, *, links: bool = False) -> Path:
@@ -178,14 +183,16 @@ def inside(folder: str | os.PathLike[str], name: str, *, links: bool = False) ->
         DataError: the name leads out of the folder.
     """
     folder = Path(folder)
-    is_inside = False
-    with suppress(OSError, ValueError, RuntimeError):  # no name of a file, or links in a circle
+    try:
         path = folder / name
         target = path.resolve()
-        within = folder.resolve()
-        is_plain = not Path(name).anchor and ".." not in Path(name).parts
-        is_inside = target != within and (target.is_relative_to(within) or (links and is_plain))
-    check_data(is_inside, folder, "the name of a file in this folder", f"{name!a}, which leads out of it")
+        resolved_folder = folder.resolve()
+    except (OSError, ValueError, RuntimeError):  # no name of a file, or links in a circle
+        target = resolved_folder = folder
+    name_stays_inside = not Path(name).anchor and ".." not in Path(name).parts
+    is_inside = target.is_relative_to(resolved_folder) or (links and name_stays_inside)
+    is_other = target != resolved_folder
+    check_data(is_inside and is_other, folder, "the name of a file in this folder", f"{name!a}, which leads out of it")
     return path
 
 
@@ -251,8 +258,9 @@ def check_apart(path: Path | None, argument: str, files: Iterable[Path | None]) 
     """
     if path is None or not path.is_file():
         return
-    same = any(file is not None and file.is_file() and file.samefile(path) for file in files)
-    check(not same, argument, "a file other than the one that is looked at", path)
+    for file in files:
+        if file is not None and file.is_file():
+            check(not file.samefile(path), argument, "a file other than the one that is looked at", path)
 
 
 @contextmanager
@@ -267,12 +275,13 @@ def reading(path: str | os.PathLike[str], name: str | None = None) -> Iterator[N
         DataError: it is not there, is no regular one, or cannot be read.
     """
     check_regular(path, name)
+    where = name or path
     try:
         yield
     except FileNotFoundError:
-        raise DataError(f"{name or path}: no such file; check the path") from None
+        raise DataError(f"{where}: no such file; check the path") from None
     except OSError as error:
-        raise DataError(f"{name or path}: cannot be read ({error.strerror or error})") from None
+        raise DataError(f"{where}: cannot be read ({error.strerror or error})") from None
 
 
 def read_bytes(path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None) -> bytes:

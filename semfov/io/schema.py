@@ -59,15 +59,14 @@ class Field:
 
     def _check_shape(self, name: str, tensor: Tensor, sizes: _Sizes) -> None:
         """Raise `InputError` unless a tensor has the shape; add the sizes that it determines to `sizes`."""
-        has_shape = tensor.ndim == len(self.shape) and all(
-            _agrees(size, number, sizes) for size, number in zip(self.shape, tensor.shape, strict=True)
+        shape = tuple(tensor.shape)
+        has_shape = len(shape) == len(self.shape) and all(
+            _agrees(size, number, sizes) for size, number in zip(self.shape, shape, strict=True)
         )
         symbols = ", ".join(map(str, self.shape))
-        expected = f"shape ({symbols})"
-        if sizes:
-            meanings = ", ".join(f"{symbol} = {number}" for symbol, number in sizes.items())
-            expected += f" with {meanings}"
-        check(has_shape, name, expected, tuple(tensor.shape))
+        meanings = ", ".join(f"{symbol} = {number}" for symbol, number in sizes.items())
+        expected = f"shape ({symbols}) with {meanings}" if meanings else f"shape ({symbols})"
+        check(has_shape, name, expected, shape)
 
     def _check_values(self, name: str, values: Tensor) -> None:
         """Raise `InputError` unless values meet the requirements."""
@@ -75,9 +74,9 @@ class Field:
         check(infinite == 0, name, "finite numbers", f"{infinite} of {values.numel()} that are not finite")
         least = float(values.min())
         most = float(values.max())
-        is_inside = self.low <= least and most <= self.high and least > self.above
+        # All values are inside if these two are, and one that is too large is told first.
         outlier = most if most > self.high else least
-        check(is_inside, name, interval(self.low, self.high, self.above), outlier)
+        check(_is_inside(outlier, self), name, interval(self.low, self.high, self.above), outlier)
         if self.ascending:
             is_ascending = bool((values.diff() > 0).all())
             check(is_ascending, name, "ascending numbers", "unsorted ones")
@@ -120,8 +119,12 @@ class Number(Json):
         if self.size is not None:
             agrees = number >= 1 and _agrees(self.size, int(number), sizes)
             check(agrees, name, f"{self.size}, at least 1", excerpt(value))
-        is_inside = self.low <= number <= self.high and number > self.above
-        check(is_inside, name, interval(self.low, self.high, self.above), excerpt(value))
+        check(_is_inside(number, self), name, interval(self.low, self.high, self.above), excerpt(value))
+
+
+def _is_inside(number: float, limits: Field | Number) -> bool:
+    """Tell whether a number is in the range of a requirement."""
+    return limits.low <= number <= limits.high and number > limits.above
 
 
 class Flag(Json):
@@ -218,9 +221,9 @@ class Object(Json):
             check(key in values, f"{name}.{key}", "a value", "nothing")
         for key, item in values.items():
             kind = self.keys.get(key, self.others)
-            check(kind is not None, name, f"no other keys than {', '.join(self.keys)}", excerpt(key))
-            if kind is not None:
-                kind.check(f"{name}.{key}", item, sizes)
+            if kind is None:
+                raise InputError(f"{name}: expected no other keys than {', '.join(self.keys)}, got {excerpt(key)}")
+            kind.check(f"{name}.{key}", item, sizes)
 
 
 @dataclass(frozen=True)
@@ -272,9 +275,10 @@ class Schema:
         for name in tensors:
             check(name in self.tensors, "tensors", f"no others than {', '.join(self.tensors)}", excerpt(name))
         for name, requirement in self.tensors.items():
-            check(name in tensors or requirement.optional, name, "a tensor", "nothing")
             if name in tensors:
                 requirement.check(name, tensors[name], sizes)
+            else:
+                check(requirement.optional, name, "a tensor", "nothing")
         self._check_one_type(tensors)
 
     def _check_one_type(self, tensors: Mapping[str, Tensor]) -> None:
@@ -337,12 +341,14 @@ def interval(low: float, high: float, above: float = -math.inf) -> str:
     Returns:
         The words.
     """
-    most = f" to {_bound(high)}" if high < math.inf else ""
+    is_bounded = high < math.inf
+    most = f" to {_bound(high)}" if is_bounded else ""
     if above > -math.inf:
-        return f"numbers above {above:g}, up{most}" if most else f"numbers above {above:g}"
+        comma = ", up" if is_bounded else ""
+        return f"numbers above {above:g}{comma}{most}"
     if low > -math.inf:
         return f"numbers from {_bound(low)}{most}"
-    return f"numbers up{most}" if most else "numbers"
+    return f"numbers up{most}" if is_bounded else "numbers"
 
 
 def _bound(number: float) -> str:

@@ -33,6 +33,10 @@ _GOES_ON = "; give the same command again to continue"
 _PACKAGES = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless", "yaml": "pyyaml", "PIL": "pillow",
              "jsonargparse": "'jsonargparse[signatures]'"}  # fmt: skip
 """Names under which packages are installed, where they are not those of their modules."""
+
+_NOT_INSTALLED = ("", "semfov", "eval", "train", "benchmarks")
+"""Packages that are here without pip, and the name of a module whose loading failed in another way."""
+
 _HANGUP = getattr(signal, "SIGHUP", signal.SIGTERM)
 _ENDINGS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", _HANGUP: "terminated"}
 """What is said after each signal: a terminal that closes ends a command (SIGHUP) as SIGTERM does."""
@@ -163,7 +167,7 @@ def run_command(
             sys.stdout.flush()
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if not package or package in ("semfov", "eval", "train", "benchmarks"):
+        if package in _NOT_INSTALLED:
             raise
         install = f"pip install {_PACKAGES.get(package, package)}"
         print(f"error: this command needs {package}, which is not installed: {install}", file=sys.stderr)

@@ -26,9 +26,12 @@ _OPTIONAL = "background", "weights", "classes", "head", "stride", "input_size", 
 
 def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> None:
     """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
+    paths = {"data.root": data.root, "data.annotations": data.annotations}
+    absent = [name for name, path in paths.items() if path is None]
+    present = [name for name in paths if name not in absent]
     expected = "both data.root and data.annotations, or neither for the embedded scenes"
-    check(data.root is None or data.annotations is not None, "data", expected, "data.root alone; add data.annotations")
-    check(data.annotations is None or data.root is not None, "data", expected, "data.annotations alone; add data.root")
+    if absent and present:
+        raise InputError(f"data: expected {expected}, got {present[0]} alone; add {absent[0]}")
     if data.root is not None and not data.root.is_dir():
         raise DataError(f"data.root: no such folder: {data.root}; check the path")
     if data.annotations is not None and not data.annotations.exists():
@@ -105,10 +108,11 @@ def detector_options(detector: DetectorConfig) -> dict[str, Any]:
     Raises:
         InputError: an option of ONNX files is given for a detector that is none.
     """
-    for name in ("head", "colour", "logits"):
-        value = getattr(detector, name)
+    if not detector.name.endswith(".onnx"):
         expected = f"none, since detector.name {detector.name!r} is not an ONNX file"
-        check(detector.name.endswith(".onnx") or not value, f"detector.{name}", expected, repr(value))
+        for name in ("head", "colour", "logits"):
+            value = getattr(detector, name)
+            check(not value, f"detector.{name}", expected, repr(value))
     default = DetectorConfig()
     changed = [name for name in _OPTIONAL if getattr(detector, name) != getattr(default, name)]
     options = {name: getattr(detector, name) for name in ("threshold", "iou", "limit", *changed)}

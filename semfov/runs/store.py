@@ -135,7 +135,9 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
         store: DetectionStore | None = None,
         digest: Callable[[], str] = lambda: "",
     ) -> None:
-        self._open, self._store, self._digest = open_scene, store, digest
+        self._open = open_scene
+        self._store = store
+        self._digest = digest
         self._look: Callable[[_Action], _StoredLook] | None = None
         self._looks: dict[_Action, _StoredLook] | None = None
         self._stored = 0
@@ -158,9 +160,10 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
 
     def save(self) -> None:
         """Store the looks at the scene if there are new ones."""
-        if self._store is not None and self._looks is not None and len(self._looks) > self._stored:
-            self._store.save(self._digest(), self._looks)
-            self._stored = len(self._looks)
+        looks = self._looks or {}
+        if self._store is not None and len(looks) > self._stored:
+            self._store.save(self._digest(), looks)
+            self._stored = len(looks)
 
     def close(self) -> None:
         """Store new looks, and free the opened scene and the stored looks; a later look reads them again."""

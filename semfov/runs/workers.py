@@ -142,7 +142,7 @@ def run_tasks(
         def tell(task: _Task) -> None:
             bar.update(count(task))
 
-        if isinstance(processes, int) and (processes <= 1 or len(tasks) == 1):
+        if isinstance(processes, int) and min(processes, len(tasks)) <= 1:
             if made is None:
                 prepare_worker()
                 made = make(*settings)
@@ -150,6 +150,7 @@ def run_tasks(
                 yield task, function(made, task)
                 tell(task)
             return
+        # Workers of other machines may have another version of the code.
         code = None if isinstance(processes, int) else package_digest()
         job = _Job(function, make, settings, Path.cwd(), code).run
         if isinstance(processes, int):
