@@ -4,7 +4,7 @@ import os
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from html import escape
 from pathlib import Path
@@ -193,30 +193,39 @@ class _Calls:
         with _errors_on_page():
             picture = _read(path)
             if task == "gaze":
-                prediction = self.agent.gaze(picture)
-                part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
-                return "", _framed(gaze_page_html("Where people look", [part]))
-            stop = self._stops[visitor] = threading.Event()
-
-            def go_on(_: Record) -> bool:
-                return not stop.is_set()
-
-            limits: dict[str, Any] = {"passes": int(passes), "seconds": _SECONDS, "on_look": go_on}
-            if task == "search":
-                limits["prior"] = _share(prior)
-            try:
-                record = self._record(picture, target, task, limits)
-            finally:
-                self._stops.pop(visitor, None)
+                return "", _framed(self._gaze_page(picture))
+            with self._stoppable(visitor) as go_on:
+                limits = {"passes": int(passes), "seconds": _SECONDS, "on_look": go_on}
+                record = self._record(picture, target, task, prior, limits)
             return "", _framed(_record_page(record, picture))
 
-    def _record(self, picture: Tensor, target: str, task: str, options: Mapping[str, Any]) -> Record:
+    @contextmanager
+    def _stoppable(self, visitor: str) -> Iterator[Callable[[Record], bool]]:
+        """Open a block in which `stop` of a visitor ends a search; yields what tells after each look to go on."""
+        stop = threading.Event()
+        self._stops[visitor] = stop
+
+        def go_on(_: Record) -> bool:
+            return not stop.is_set()
+
+        try:
+            yield go_on
+        finally:
+            self._stops.pop(visitor, None)
+
+    def _record(self, picture: Tensor, target: str, task: str, prior: str, limits: Mapping[str, Any]) -> Record:
         """Search a picture, find all objects in it or explore it."""
         if task == "search":
-            return self.agent.search(picture, target, **options)
+            return self.agent.search(picture, target, prior=_share(prior), **limits)
         if task == "find all":
-            return self.agent.find_all(picture, None if target == _EVERY else target, **options)
-        return self.agent.explore(picture, **options)
+            return self.agent.find_all(picture, None if target == _EVERY else target, **limits)
+        return self.agent.explore(picture, **limits)
+
+    def _gaze_page(self, picture: Tensor) -> str:
+        """Make the page of where people look in a picture."""
+        prediction = self.agent.gaze(picture)
+        part = gaze_part(prediction, prediction.scanpaths(_VIEWERS))
+        return gaze_page_html("Where people look", [part])
 
     def stop(self, visitor: str = "") -> None:
         """End a visitor's search after the look that it is at; what was found is shown."""

@@ -73,16 +73,20 @@ class Doorkeeper:
         """Tell whether a request may enter, by the address that it was sent to and the page that it comes from."""
         try:
             name = urlsplit(f"//{address}").hostname or ""
+            # Browsers name the page that a request comes from, where it is not this one alone.
             is_own_page = origin is None or urlsplit(origin).netloc.lower() == address.lower()
         except ValueError:
             return False
-        if not is_own_page:
-            return False
+        return is_own_page and self._is_served_as(name)
+
+    def _is_served_as(self, name: str) -> bool:
+        """Tell whether the page is served under a name or a number of a machine."""
         if name in ("localhost", self._host.lower()):
             return True
         try:
             number = ip_address(name)
         except ValueError:
+            # Any other name may be that of a stranger, who lets it lead to this address.
             return self._everywhere and name == socket.gethostname().lower()
         return number.is_loopback or self._everywhere
 

@@ -127,8 +127,8 @@ class _GazeJob:
         check_apart(options.out, "out", [source.file for source in self.sources])
         self.areas = None if options.areas is None else boxes_of(options.areas)
         self.report = options.report
-        if options.compare and options.out is None and options.report is None:
-            self.report = _COMPARED  # a comparison is always written somewhere
+        if options.compare and options.out is None:
+            self.report = options.report or _COMPARED  # a comparison is always written somewhere
         if self.report is not None:
             check_writable(page_path(self.report))
         self.detector, self.model = _load(options)

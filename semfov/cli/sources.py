@@ -4,6 +4,7 @@ import os
 import traceback
 from collections.abc import Iterable, Sequence
 from glob import glob
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, TypedDict, cast
 
@@ -157,7 +158,7 @@ def picture_sources(options: PictureOptions | GazeOptions | CompareOptions) -> l
 
 def _names_of_pictures(words: Iterable[str]) -> list[str]:
     """List the files and folders that words name or match; of several, those that may be photographs."""
-    names = [name for word in words for name in _matching(word)]
+    names = [*chain.from_iterable(map(_matching, words))]
     if len(names) <= 1:
         return names
     # What a shell makes of `flight/*` is what is in a folder, where other files than photographs are left out.
@@ -169,7 +170,9 @@ def _matching(word: str) -> list[str]:
     """Find the files that match a pattern; what is none, or matches nothing, stands for itself."""
     # A file may have brackets in its name, as copies do: photo[1].jpg.
     is_pattern = bool(set(word) & set("*?[")) and not os.path.lexists(word)
-    return (sorted(glob(word, recursive=True)) if is_pattern else []) or [word]
+    if not is_pattern:
+        return [word]
+    return sorted(glob(word, recursive=True)) or [word]
 
 
 def _check_may_be_picture(name: str, *, has_target: bool) -> None:

@@ -12,7 +12,7 @@ import yaml
 
 from semfov.errors import check
 from semfov.io.ranges import CheckedSettings
-from semfov.runs.setting_types import SettingType, setting_types
+from semfov.runs.setting_types import FlagType, ListType, SettingType, setting_types
 from semfov.runs.settings import Settings, load_yaml
 from semfov.words import FORMER, dashed, note_of_dropped, note_of_former
 
@@ -47,10 +47,10 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         if option in dropped:
             _leave_out(word, words)
         elif option in options:
-            setting_type = types.get(option[2:], _NO_SETTING)
-            _check_once(option, setting_type, usual)
-            value = _value_of(word, setting_type, words)
-            usual.append(option if value is None else f"{option}={setting_type.in_brackets(value)}")
+            kind = types.get(option[2:], _NO_SETTING)
+            _check_once(option, kind, usual)
+            value = _value_of(word, kind, words)
+            usual.append(option if value is None else f"{option}={kind.in_brackets(value)}")
         else:
             usual.append(word)  # left to the parser, with its messages
     return usual
@@ -85,25 +85,25 @@ def _leave_out(word: str, words: deque[str]) -> None:
         words.popleft()
 
 
-def _check_once(option: str, setting_type: SettingType, before: Iterable[str]) -> None:
+def _check_once(option: str, kind: SettingType, before: Iterable[str]) -> None:
     """Raise `InputError` for an option that is given again; flags and `--config` may be."""
-    if setting_type.is_flag or option == "--config":
+    if isinstance(kind, FlagType) or option == "--config":
         return
     is_repeated = any(word.partition("=")[0] == option for word in before)
     # Text may be a list in one word, as the classes of `--target a,b`.
-    takes_several = setting_type.is_list or setting_type.hint is str
+    takes_several = isinstance(kind, ListType) or kind.hint is str
     remedy = "; where it takes several, as a,b" if takes_several else ""
     check(not is_repeated, _in_messages(option), "once", f"it again{remedy}")
 
 
-def _value_of(word: str, setting_type: SettingType, words: deque[str]) -> str | None:
+def _value_of(word: str, kind: SettingType, words: deque[str]) -> str | None:
     """Find the value of an option in its own word, or take it from those after it; None leaves it to the parser."""
     name, has_value, value = word.partition("=")
-    if setting_type.hint is Path:
+    if kind.hint is Path:
         # As `--out "$FOLDER"` is where the variable is not set; it would be the present folder.
         path = value if has_value else next(iter(words), None)
         check(path != "", _in_messages(_option_of(name)), "the name of a file or folder", "an empty one")
-    return value if has_value else setting_type.value_after(words)
+    return value if has_value else kind.value_after(words)
 
 
 def in_present_names(text: str, config: type[Settings]) -> str:
@@ -173,20 +173,20 @@ def mistake(message: str, config: type[CheckedSettings], options: Iterable[str],
     value = re.search(r"(?:Given|Got) value: (.*)", message)
     if setting and value:
         name = setting[1]
-        setting_type = setting_types(config).get(name, _NO_SETTING)
-        refusal = _refusal(setting_type, value[1].strip())
+        kind = setting_types(config).get(name, _NO_SETTING)
+        refusal = _refusal(kind, value[1].strip())
         if refusal is not None:
             return f"{_in_messages(name)}: {refusal}"
     return " ".join(message.split())
 
 
-def _refusal(setting_type: SettingType, value: str) -> str | None:
+def _refusal(kind: SettingType, value: str) -> str | None:
     """Say why a value is refused, with the word that may be meant; None for types that need more words."""
-    expected = setting_type.expected()
+    expected = kind.expected()
     if expected is None:
         return None
     # All words are listed anyway, and far ones only look like what was meant: `best` for `fast`.
-    matches = get_close_matches(value, setting_type.words(), n=1, cutoff=0.7)
+    matches = get_close_matches(value, kind.words(), n=1, cutoff=0.7)
     suggestion = f"; did you mean {matches[0]!r}?" if matches else ""
     return f"expected {expected}, got {value!r}{suggestion}"
 

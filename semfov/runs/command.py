@@ -19,7 +19,7 @@ from semfov.errors import InputError, SemfovError
 from semfov.io.files import discard_unfinished
 from semfov.io.ranges import check_settings
 from semfov.runs.arguments import in_present_names, mistake, usual_form
-from semfov.runs.setting_types import setting_types
+from semfov.runs.setting_types import ListType, setting_types
 from semfov.runs.settings import Settings, load_yaml
 
 if TYPE_CHECKING:
@@ -113,12 +113,13 @@ def make_parser(
         parser.add_class_arguments(config, as_group=True, skip={*config.unused})
         return parser
     name, text = positional
-    setting_type = setting_types(config)[name]
+    kind = setting_types(config)[name]
+    takes_several = isinstance(kind, ListType)
     parser.add_argument(
         name,
         help=text,
-        nargs="*" if setting_type.is_list else "?",
-        type=str if setting_type.is_list or setting_type.hint is str else Path,
+        nargs="*" if takes_several else "?",
+        type=str if takes_several or kind.hint is str else Path,
         default=SUPPRESS,  # without one of its own it leaves what a file of --config says
     )
     parser.add_class_arguments(config, as_group=True, skip={*config.unused, name})

@@ -204,10 +204,15 @@ def label(choice: str | PolicyConfig, task: Task) -> str:
     }
     base = _based_on(settings, settings.scores)
     differences = []
-    for field in fields(PolicyConfig)[2:]:
+    for field in fields(PolicyConfig)[2:]:  # after the policy and its scores, which the base has
         value = getattr(settings, field.name)
-        if value is None or value == getattr(base, field.name):
-            continue
-        text = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
-        differences.append(field.name if value is True else f"{field.name} {text}")
+        if value not in (None, getattr(base, field.name)):
+            differences.append(_setting_in_words(field.name, value))
     return ", ".join([names[base], *differences])
+
+
+def _setting_in_words(name: str, value: object) -> str:
+    """Write a setting with its value; one that is on has its name alone."""
+    if value is True:
+        return name
+    return f"{name} {value:.15g}" if isinstance(value, float) else f"{name} {value}".lower()

@@ -15,74 +15,141 @@ _FLAGS = ("true", "false", "yes", "no", "True", "False")
 
 
 class SettingType:
-    """Type of a setting, of which a command line asks how its value is written.
+    """Type of a setting whose value is one word, which the parser takes as it stands.
 
-    Attributes:
-        hint: the type as it is written, without None where another one is left.
-        base: the type without its annotations.
-        annotations: its annotations, ranges and forms.
-        is_flag: whether it is true or false, and needs no value.
-        is_list: whether it is a list of words, paths or numbers of any length, as `tuple[str, ...]`.
-        may_be_tuple: whether it is one value or a tuple of several, as a cell by its number or its column and row.
+    Args:
+        hint: the type as it is written.
     """
 
-    def __init__(self, hint: object) -> None:
-        self.hint = _without_none(hint)
-        self.base, self.annotations = _taken_apart(self.hint)
-        self.is_flag = self.hint is bool
-        self.is_list = _is_list(self.hint)
-        self.may_be_tuple = _is_union(self.base) and any(get_origin(item) is tuple for item in get_args(self.base))
+    def __init__(self, hint: Any) -> None:
+        self.hint = hint
 
     def value_after(self, words: deque[str]) -> str | None:
         """Take the value of an option from the words after it; None leaves it to the parser.
 
         Args:
-            words: the words after the option, without those that are taken.
+            words: the words after the option, from which those of the value are taken.
         """
-        if self.is_flag:
-            return words.popleft() if words and words[0] in _FLAGS else "true"
-        if not words or words[0].startswith("--"):
-            return None
-        further_words = self._further_words()
-        if further_words:
-            value = [words.popleft()]
-            while words and re.fullmatch(further_words, words[0]):
-                value.append(words.popleft())
-            return " ".join(value)
-        return words.popleft() if self.is_list or self.may_be_tuple else None
-
-    def _further_words(self) -> str:
-        """Return the pattern of further words that belong to a value; empty for none."""
-        return "".join(annotation.more for annotation in self.annotations if isinstance(annotation, Form))
+        return None
 
     def in_brackets(self, value: str) -> str:
-        """Put several words or numbers in brackets, which users leave out and the parser needs."""
-        if value.startswith("["):
-            return value
-        if self.is_list:
-            return "[]" if value in ("none", "") else f"[{value}]"
-        is_tuple = self.may_be_tuple and "," in value
-        return f"[{value}]" if is_tuple else value
+        """Write a value as the parser needs it: several words or numbers have brackets, which users leave out."""
+        return value
 
     def words(self) -> list[str]:
-        """List the words that a value, or an item of a list, may be."""
-        base = get_args(self.hint)[0] if self.is_list else self.hint
-        return [str(word) for word in get_args(base)] if get_origin(base) is Literal else []
+        """List the words that a value, or an item of a list, may be; empty where it may be any."""
+        return []
 
     def expected(self) -> str | None:
         """Say what a value must be; None for types that need more words."""
-        words = [repr(word) for word in self.words()]
-        if words:
-            return f"some of {', '.join(words)}" if self.is_list else " or ".join(words)
-        if self.annotations:
-            nouns = [annotation.noun for annotation in self.annotations if annotation.noun is not None]
-            noun = nouns[0] if nouns else NOUNS[self.base]
-            return " ".join([noun, *map(repr, self.annotations)])
-        return _PLAIN_TYPES.get(self.hint)
+        return NOUNS[self.hint] if self.hint in (int, float) else None
 
 
-_PLAIN_TYPES: dict[object, str] = {bool: "true or false", int: NOUNS[int], float: NOUNS[float]}
-"""What a value must be, by types that say all of it."""
+class FlagType(SettingType):
+    """Type of a setting that is true or false; the option alone makes it true."""
+
+    def value_after(self, words: deque[str]) -> str | None:
+        return words.popleft() if words and words[0] in _FLAGS else "true"
+
+    def expected(self) -> str | None:
+        return "true or false"
+
+
+class ChoiceType(SettingType):
+    """Type of a setting that is one of some words: `Literal["rgb", "bgr"]`."""
+
+    def words(self) -> list[str]:
+        return [str(word) for word in get_args(self.hint)]
+
+    def expected(self) -> str | None:
+        return " or ".join(map(repr, self.words()))
+
+
+class ListType(SettingType):
+    """Type of a list of words, paths or numbers of any length: `tuple[str, ...]`."""
+
+    def value_after(self, words: deque[str]) -> str | None:
+        return _next_value(words)
+
+    def in_brackets(self, value: str) -> str:
+        if value.startswith("["):
+            return value
+        return "[]" if value in ("none", "") else f"[{value}]"
+
+    def words(self) -> list[str]:
+        item, _ = get_args(self.hint)
+        return setting_type(item).words()
+
+    def expected(self) -> str | None:
+        words = ", ".join(map(repr, self.words()))
+        return f"some of {words}" if words else None
+
+
+class OneOrTupleType(SettingType):
+    """Type of one value or a tuple of several, as a cell by its number or its column and row."""
+
+    def value_after(self, words: deque[str]) -> str | None:
+        return _next_value(words)
+
+    def in_brackets(self, value: str) -> str:
+        has_several = "," in value and not value.startswith("[")
+        return f"[{value}]" if has_several else value
+
+
+class AnnotatedType(SettingType):
+    """Type with annotations, which say its range or how it is written: `Annotated[int, Range(1, 100)]`."""
+
+    def __init__(self, hint: object) -> None:
+        super().__init__(hint)
+        base, *annotations = get_args(hint)
+        self.base = setting_type(base)
+        self.annotations = annotations
+
+    def value_after(self, words: deque[str]) -> str | None:
+        """Take the value, with the further words that its form says belong to it."""
+        pattern = "".join(annotation.more for annotation in self.annotations if isinstance(annotation, Form))
+        if not pattern:
+            return self.base.value_after(words)
+        value = _next_value(words)
+        while value is not None and words and re.fullmatch(pattern, words[0]):
+            value = f"{value} {words.popleft()}"
+        return value
+
+    def in_brackets(self, value: str) -> str:
+        return self.base.in_brackets(value)
+
+    def expected(self) -> str | None:
+        nouns = [annotation.noun for annotation in self.annotations if annotation.noun is not None]
+        noun = nouns[0] if nouns else NOUNS[self.base.hint]
+        return " ".join([noun, *map(repr, self.annotations)])
+
+
+def _next_value(words: deque[str]) -> str | None:
+    """Take the next word, unless it is an option or there is none."""
+    return words.popleft() if words and not words[0].startswith("--") else None
+
+
+def setting_type(hint: object) -> SettingType:
+    """Find the kind of a type.
+
+    Args:
+        hint: the type as it is written; None beside another one does not count.
+
+    Returns:
+        The type.
+    """
+    hint = _without_none(hint)
+    if hint is bool:
+        return FlagType(hint)
+    if get_origin(hint) is Annotated:
+        return AnnotatedType(hint)
+    if get_origin(hint) is Literal:
+        return ChoiceType(hint)
+    if _is_list(hint):
+        return ListType(hint)
+    if any(get_origin(alternative) is tuple for alternative in _alternatives(hint)):
+        return OneOrTupleType(hint)
+    return SettingType(hint)
 
 
 def setting_types(config: type[CheckedSettings]) -> dict[str, SettingType]:
@@ -102,37 +169,27 @@ def _named_types(config: type[CheckedSettings], prefix: str) -> Iterator[tuple[s
     hints = get_type_hints(config, include_extras=True)
     for setting in fields(config):
         name = prefix + setting.name
-        setting_type = SettingType(hints[setting.name])
-        yield name, setting_type
-        if isinstance(setting_type.hint, type) and issubclass(setting_type.hint, CheckedSettings):
-            yield from _named_types(setting_type.hint, f"{name}.")
+        hint = _without_none(hints[setting.name])
+        yield name, setting_type(hint)
+        if isinstance(hint, type) and issubclass(hint, CheckedSettings):
+            yield from _named_types(hint, f"{name}.")
 
 
-def _is_union(hint: object) -> bool:
-    """Tell whether a type is one of several, as `int | str`."""
-    return get_origin(hint) in (Union, UnionType)
+def _alternatives(hint: object) -> tuple[Any, ...]:
+    """List the types of which a type is one, as `int | str`; empty where it is no such type."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else ()
 
 
 def _without_none(hint: object) -> object:
     """Find the type of a setting that may also be None; others stay as they are."""
-    if not _is_union(hint):
-        return hint
-    alternatives = [alternative for alternative in get_args(hint) if alternative is not type(None)]
+    alternatives = [alternative for alternative in _alternatives(hint) if alternative is not type(None)]
     return alternatives[0] if len(alternatives) == 1 else hint
 
 
-def _taken_apart(hint: object) -> tuple[Any, tuple[Any, ...]]:
-    """Separate a type from its annotations."""
-    if get_origin(hint) is not Annotated:
-        return hint, ()
-    base, *annotations = get_args(hint)
-    return base, tuple(annotations)
-
-
 def _is_list(hint: object) -> bool:
-    """Tell whether a type is a list of words, paths or numbers of any length."""
-    arguments = get_args(hint)
-    if get_origin(hint) is not tuple or arguments[1:] != (Ellipsis,):
+    """Tell whether a type is a list of words, paths or numbers of any length; other lists are left to the parser."""
+    if get_origin(hint) is not tuple or get_args(hint)[1:] != (Ellipsis,):
         return False
-    item, _ = _taken_apart(arguments[0])
-    return item in (str, Path, float) or get_origin(item) is Literal
+    item = setting_type(get_args(hint)[0])
+    base = item.base if isinstance(item, AnnotatedType) else item
+    return isinstance(base, ChoiceType) or base.hint in (str, Path, float)
