@@ -127,14 +127,14 @@ def render(figures: Iterable[Figure], dpi: int = 90) -> list[_Frame]:
         figure.set_dpi(dpi)
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
-        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())  # without opacity
     return frames
 
 
 def _write_gif(frames: Sequence[_Frame], file: BinaryIO, seconds: float, hold: float) -> None:
     """Write frames as a GIF with a common palette of 256 colours."""
     first, *following = _in_one_palette(frames)
-    times = [int(1000 * seconds)] * len(frames)
+    times = [int(1000 * seconds)] * len(frames)  # milliseconds
     times[-1] += int(1000 * hold)
     first.save(file, format="GIF", save_all=True, append_images=following, duration=times, loop=0, comment=MADE_HERE)
 

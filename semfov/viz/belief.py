@@ -18,8 +18,9 @@ from semfov.viz.drawing import (
     choose_fixations,
     draw_cells,
     draw_cross,
-    draw_image,
+    draw_grey,
     draw_scale,
+    rows_and_columns,
 )
 from semfov.viz.style import PROBABILITY, make_figure, root, styled
 
@@ -97,8 +98,7 @@ def plot_belief(
     else:
         fixations = [check_fixation(len(scanpath.fixated), fixation)]
     photograph = scanpath.image if image is None else image
-    columns = len(fixations) if axes is not None else min(columns, len(fixations))
-    rows = -(-len(fixations) // columns)
+    rows, columns = rows_and_columns(len(fixations), columns, axes)
     width, height = (5.6, 4.6) if fixation is not None else _inches_of_panels(scanpath, rows, columns)
     figure, panels = make_figure(rows, columns, width=width, height=height, layout="compressed", axes=axes)
     used = panels[: len(fixations)]
@@ -108,7 +108,8 @@ def plot_belief(
             panel.set_title(f"fixation {number + 1}: {panel.get_title()}", parse_math=False)
     _, name = class_posterior(scanpath, target)
     draw_scale(used, drawn, f"probability of {name}")
-    for panel in panels[len(fixations) :]:
+    unused = panels[len(fixations) :]  # the end of the last row
+    for panel in unused:
         panel.remove()
     return figure
 
@@ -182,7 +183,7 @@ def _draw_bars(panel: Axes3D, grid: Grid, bars: NDArray[np.float32], highest: fl
 
     columns = np.arange(grid.columns)
     rows = np.arange(grid.rows)
-    column, row = (index.ravel() for index in np.meshgrid(columns, rows))
+    column, row = (index.ravel() for index in np.meshgrid(columns, rows))  # (X·Y,) each, in the order of the cells
     # Rows grow downwards in the picture and backwards in the plot.
     depth = grid.rows - 1 - row
     colours = colormaps[PROBABILITY](bars / highest)
@@ -204,8 +205,7 @@ def draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | Non
     """Draw the probability of a class in every cell, from 0 to 1, over a photograph."""
     posterior, name = class_posterior(scanpath, target)
     chances = posterior[fixation]
-    if image is not None:
-        draw_image(axes, image, scanpath.grid, grey=True)
+    draw_grey(axes, image, scanpath.grid)
     drawn = draw_cells(axes, scanpath.grid, chances)
     draw_cross(axes, scanpath.fixations[fixation])
     axes.set_title(f"p({name}) up to {float(chances.max()):.2f}", parse_math=False)

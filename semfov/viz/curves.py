@@ -135,7 +135,7 @@ def plot_reliability(
     above.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfectly calibrated")
     borders = np.linspace(0, 1, bins + 1)
     for order, (name, (probabilities, labels)) in enumerate(predictions.items()):
-        confidence, predicted = probabilities.detach().cpu().max(-1)
+        confidence, predicted = probabilities.detach().cpu().max(-1)  # (M,) each
         is_right = predicted == labels.cpu()
         count, confidence_sum, right = reliability(confidence, is_right, bins).numpy()
         enough = count >= _LEAST_IN_BIN

@@ -36,7 +36,7 @@ def plot_drafts(drafts: Drafts, *, areas: AreasLike | None = None) -> Figure:
     Returns:
         The figure.
     """
-    predictions = drafts.first, drafts.second
+    predictions = (drafts.first, drafts.second)
     panels = 2 if drafts.difference is None else 3
     heights = [_WIDTH * prediction.size[1] / prediction.size[0] for prediction in predictions]
     height = max(heights) + 0.9  # with the titles
@@ -86,6 +86,7 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
     inches = _WIDTH * height / width + 0.6
     figure, (axes,) = make_figure(1, 1, width=_WIDTH, height=inches, layout="compressed", axes=only(ax))
     draw_image(axes, _mean_picture(drafts), Grid(1, 1, drafts.second.size), grey=True)
+    # The scale is symmetric, so that its middle colour is no difference.
     most = max(float(difference.abs().max()), 1e-12)  # equal drafts have none
     axes.imshow(
         difference.numpy(),
@@ -106,6 +107,7 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
 
 def _mean_picture(drafts: Drafts) -> Tensor:
     """Mean of both pictures, of the size of the second one's."""
-    first, second = drafts.first.image, drafts.second.image
+    first = drafts.first.image  # (3, H, W)
+    second = drafts.second.image  # (3, h, w)
     size = tuple(second.shape[-2:])
     return (F.interpolate(first[None], size, mode="bilinear", antialias=True)[0] + second) / 2

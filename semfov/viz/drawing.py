@@ -91,9 +91,22 @@ def picture_array(image: Tensor, *, grey: bool = False) -> NDArray[np.float32]:
     """Convert a picture `(3, h, w)` to an array `(h, w, 3)` for matplotlib; grey is the luma of Rec. 601."""
     check_shape(image, "image", 3, None, None)
     pixels = image.detach().cpu().clamp(0, 1)
-    if grey:
+    if grey:  # in three channels, since matplotlib would give one channel the colours of a map
         pixels = (pixels * pixels.new_tensor(_LUMA)[:, None, None]).sum(0).clamp(0, 1).expand(3, -1, -1)
     return pixels.permute(1, 2, 0).numpy()
+
+
+def draw_grey(axes: Axes, image: Tensor | None, grid: Grid) -> None:
+    """Draw a photograph `(3, H, W)` in grey, on which colours stand out; nothing where there is none."""
+    if image is not None:
+        draw_image(axes, image, grid, grey=True)
+
+
+def rows_and_columns(count: int, columns: int, axes: Sequence[Axes] | None) -> tuple[int, int]:
+    """Arrange panels in rows of at most so many columns; given axes count as one row."""
+    columns = count if axes is not None else min(columns, count)
+    rows = -(-count // columns)  # rounded up
+    return rows, columns
 
 
 def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = None, **style: Any) -> AxesImage:
@@ -119,9 +132,10 @@ def draw_grid(axes: Axes, grid: Grid) -> None:
     from matplotlib.collections import LineCollection
 
     width, height = grid.extent.tolist()
-    across = [n * width / grid.columns for n in range(1, grid.columns)]
-    down = [n * height / grid.rows for n in range(1, grid.rows)]
-    lines = [[(x, 0), (x, height)] for x in across] + [[(0, y), (width, y)] for y in down]
+    between_columns = [n * width / grid.columns for n in range(1, grid.columns)]
+    between_rows = [n * height / grid.rows for n in range(1, grid.rows)]
+    lines = [[(x, 0), (x, height)] for x in between_columns]
+    lines += [[(0, y), (width, y)] for y in between_rows]
     axes.add_collection(LineCollection(lines, colors="white", linewidths=0.4, alpha=0.45), autolim=False)
 
 
@@ -138,6 +152,7 @@ def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: f
 
 def draw_cross(axes: Axes, point: Tensor | Sequence[float]) -> list[Artist]:
     """Draw a cross at the point of gaze, `(x, y)` in pixels."""
+    # From pixel centres at integers to a picture whose corner is at 0.
     x, y = (float(side) + 0.5 for side in point)
     return [
         *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),

@@ -96,7 +96,7 @@ def draw_gaze(axes: Axes, prediction: GazePrediction, cells: Tensor) -> None:
     # Between cells the logarithm is interpolated, as for the density over the pixels.
     log_density = cells.double().log()
     finer = F.interpolate(log_density[None, None], scale_factor=_FINER, mode="bilinear")[0, 0].exp()
-    shares = shares_around(finer / finer.sum()).numpy()
+    shares = shares_around(finer / finer.sum()).numpy()  # (rows, columns) of the finer cells
     rows, columns = shares.shape
     x = (np.arange(columns) + 0.5) * width / columns
     y = (np.arange(rows) + 0.5) * height / rows
@@ -110,8 +110,10 @@ def draw_gaze(axes: Axes, prediction: GazePrediction, cells: Tensor) -> None:
 def draw_first_fixations(axes: Axes, prediction: GazePrediction) -> None:
     """Draw the first three fixations as numbers in circles, with a line from one to the next."""
     first = prediction.first_fixations(_FIRST)
+    # From pixel centres at integers to a picture whose corner is at 0.
     x = [place["x"] + 0.5 for place in first]
     y = [place["y"] + 0.5 for place in first]
+    # A light line below the coloured one shows it on any picture.
     axes.plot(x, y, color="white", linewidth=2.4)
     axes.plot(x, y, color=GAZE, linewidth=1.2)
     for number, place in enumerate(first, 1):
@@ -132,9 +134,10 @@ def draw_areas(axes: Axes, prediction: GazePrediction, areas: AreasLike) -> None
 
     shares = prediction.share(areas)
     for name, (left, top, right, bottom) in prediction.areas(areas).items():
-        corner, sides = (left, top), (right - left, bottom - top)
-        axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor="white", linewidth=2.6))
-        axes.add_patch(Rectangle(corner, *sides, fill=False, edgecolor=TARGET, linewidth=1.4))
+        width = right - left
+        height = bottom - top
+        axes.add_patch(Rectangle((left, top), width, height, fill=False, edgecolor="white", linewidth=2.6))
+        axes.add_patch(Rectangle((left, top), width, height, fill=False, edgecolor=TARGET, linewidth=1.4))
         # Above the box, where it hides nothing of it, unless there is no room.
         is_above = top > prediction.size[1] / _LABELS
         axes.text(

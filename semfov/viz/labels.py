@@ -113,6 +113,7 @@ def place_within(
     """
     placed = list(obstacles)
     for points, (width, height) in zip(candidates, sizes, strict=True):
+        # A label without a free place moves down, below what it would cover, and at last below the picture.
         inside = [_into(x, y, width, height, frame) for x, y in points]
         free = (label for label in inside if not _covered(label, placed))
         label = next(free, inside[0])

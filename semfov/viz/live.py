@@ -94,6 +94,7 @@ class _MomentDrawing:
         grid, chances = believed
         size = self.picture.size
         table = chances.detach().float().clamp(0, 1).reshape(grid.rows, grid.columns).cpu().numpy()
+        # The colour covers at most five eighths, so that the frame stays visible.
         strength = Image.fromarray((table * 160).astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
         self.picture.paste(Image.new("RGB", size, TARGET), mask=strength)
 
@@ -101,6 +102,7 @@ class _MomentDrawing:
         """Draw the objects and their ways, the next window, and the window of this look."""
         moment = self.moment
         self._draw_ways()
+        # This look's window comes last, over the others.
         for box, confirmed in zip(moment.objects.boxes.tolist(), moment.confirmed.tolist(), strict=True):
             self.draw.rectangle(self._scaled(box), outline=FOUND if confirmed else TARGET, width=2)
         self.draw.rectangle(self._scaled(next_region), outline=GAZE, width=1)
@@ -111,8 +113,8 @@ class _MomentDrawing:
         objects = self.moment.objects
         if objects.track_ids is None:
             return
-        for way in self.moment.ways.values():
-            points = [self._scaled_point(point) for point in way]
+        for track in self.moment.ways.values():
+            points = [self._scaled_point(point) for point in track]
             self.draw.line(points, fill=GAZE, width=2)
         from PIL import ImageFont
 
@@ -152,9 +154,9 @@ class _MomentDrawing:
 
     def _scaled(self, box: Sequence[float], margin: int = 0) -> Box:
         """Convert a box to pixels of the drawing, with a margin."""
-        across, down = self.scale
-        left, right = sorted((box[0] * across, box[2] * across))
-        top, bottom = sorted((box[1] * down, box[3] * down))
+        x_scale, y_scale = self.scale
+        left, right = sorted((box[0] * x_scale, box[2] * x_scale))
+        top, bottom = sorted((box[1] * y_scale, box[3] * y_scale))
         return left - margin, top - margin, right + margin, bottom + margin
 
     def _scaled_point(self, point: Sequence[float]) -> tuple[float, float]:
@@ -164,20 +166,22 @@ class _MomentDrawing:
 
 def video_suffix() -> str:
     """Find the suffix of the videos that OpenCV can write here: `.mp4`, or `.avi` where it was built without FFmpeg."""
+    *suffixes, last = VIDEO_CODECS
+    return next(filter(_can_be_written, suffixes), last)
+
+
+def _can_be_written(suffix: str) -> bool:
+    """Tell whether OpenCV has the codec of a kind of video, which it says only of a file that it opens."""
     import tempfile
 
     import cv2
 
-    *others, last = VIDEO_CODECS
-    for suffix in others:
-        with tempfile.TemporaryDirectory() as folder:
-            code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[suffix])
-            writer = cv2.VideoWriter(f"{folder}/try{suffix}", code, 10, (64, 64))
-            opened = bool(writer.isOpened())
-            writer.release()
-        if opened:
-            return suffix
-    return last
+    with tempfile.TemporaryDirectory() as folder:
+        code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[suffix])
+        writer = cv2.VideoWriter(f"{folder}/try{suffix}", code, 10, (64, 64))
+        is_open = bool(writer.isOpened())
+        writer.release()
+    return is_open
 
 
 @contextmanager
@@ -195,29 +199,54 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
         DataError: OpenCV is not installed, or cannot write such a video.
     """
     with needing("OpenCV", path, "opencv-python-headless", DataError):
-        import cv2
-    codec = VIDEO_CODECS[path.suffix.lower()]
+        import cv2  # noqa: F401
     with replacing(path) as temporary:
         # OpenCV chooses the container by the suffix.
         named = temporary.with_name(temporary.name + path.suffix)
-        writer: Any = None
+        writer = _FrameWriter(named, path, rate)
         try:
-
-            def add(frame: _Frame) -> None:
-                nonlocal writer
-                if writer is None:
-                    code = cv2.VideoWriter.fourcc(*codec)
-                    writer = cv2.VideoWriter(str(named), code, rate, (frame.shape[1], frame.shape[0]))
-                    if not writer.isOpened():
-                        other = f"{path.stem}{video_suffix()}"
-                        raise DataError(f"cannot write {path}: OpenCV has no {codec} encoder; name it {other}")
-                writer.write(np.ascontiguousarray(frame[..., ::-1]))
-
-            yield add
-            if writer is not None:
-                writer.release()
+            yield writer.add
+            if writer.close():
                 named.replace(temporary)
         finally:
-            if writer is not None:
-                writer.release()
+            writer.close()
             named.unlink(missing_ok=True)
+
+
+class _FrameWriter:
+    """Writer of the frames of a video, which is opened with the first frame, whose size all have.
+
+    Args:
+        file: the file that is written.
+        path: what the video is called in the end, whose suffix says its codec.
+        rate: frames a second.
+    """
+
+    def __init__(self, file: Path, path: Path, rate: float) -> None:
+        self._file = file
+        self._path = path
+        self._rate = rate
+        self._writer: Any = None
+
+    def add(self, frame: _Frame) -> None:
+        """Add a frame `(h, w, 3)`, RGB."""
+        if self._writer is None:
+            self._open(frame.shape[1], frame.shape[0])
+        self._writer.write(np.ascontiguousarray(frame[..., ::-1]))  # OpenCV writes BGR
+
+    def _open(self, width: int, height: int) -> None:
+        """Open the file for frames of a size; raises `DataError` where OpenCV has no encoder."""
+        import cv2
+
+        codec = VIDEO_CODECS[self._path.suffix.lower()]
+        self._writer = cv2.VideoWriter(str(self._file), cv2.VideoWriter.fourcc(*codec), self._rate, (width, height))
+        if not self._writer.isOpened():
+            other = f"{self._path.stem}{video_suffix()}"
+            raise DataError(f"cannot write {self._path}: OpenCV has no {codec} encoder; name it {other}")
+
+    def close(self) -> bool:
+        """Close the file; returns whether there was a frame."""
+        if self._writer is None:
+            return False
+        self._writer.release()
+        return True

@@ -61,8 +61,9 @@ def _open_window(
     left, top, right, bottom = (round(edge * scale) for edge in window)
     part = picture.crop(window)
     magnification = min(1.0, *(side / length for side, length in zip(input_size, part.size, strict=True)))
-    seen = part.resize([max(1, round(side * magnification)) for side in part.size], Resampling.LANCZOS)
-    view.paste(seen.resize((right - left, bottom - top), Resampling.BICUBIC), (left, top))
+    # First to what the detector gets, then to the size in the view: what it does not see is blurred.
+    input_pixels = part.resize([max(1, round(side * magnification)) for side in part.size], Resampling.LANCZOS)
+    view.paste(input_pixels.resize((right - left, bottom - top), Resampling.BICUBIC), (left, top))
 
 
 def _frame(view: PillowImage, window: Sequence[float], boxes: Tensor, number: int, caption: str) -> PillowImage:

@@ -39,7 +39,7 @@ class LookPath:
         self._numbers: list[tuple[int, Text]] = []
         width = record.around
         if record.kind.path:
-            points = np.array([look.fixation for look in record]).reshape(-1, 2)
+            points = np.array([look.fixation for look in record]).reshape(-1, 2)  # also without a look
             self.gaze = GazePath(axes, points, record.size, found=record.found, around=width)
             self.number_boxes = self.gaze.number_boxes
         for look in record:
@@ -141,13 +141,15 @@ class GazePath:
         from matplotlib import colormaps
         from matplotlib.collections import LineCollection
 
-        self.path = fixations + 0.5
+        # Pixel centres are at integers, and in figures the corner of the picture is at 0.
+        self.path = fixations + 0.5  # (n, 2)
         self.frame = frame
         self.found = found
         count = len(self.path)
         self.colours = colormaps[TIME](np.linspace(0, 1, max(count, 2))[:count])
         pieces = _saccades(self.path, around)
         self.pieces = len(pieces)
+        # (pieces · (n - 1), 2, 2): start and end of each line, the pieces of one saccade after each other.
         self.segments = np.concatenate(pieces, 1).reshape(-1, 2, 2)
         # A light line below the coloured one shows it on any picture.
         light = LineCollection(list(self.segments), colors=(1, 1, 1, 0.7), linewidths=1.6)

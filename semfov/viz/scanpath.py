@@ -14,7 +14,7 @@ from semfov.errors import check
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
 from semfov.viz.belief import draw_belief
-from semfov.viz.drawing import check_foveal, choose_fixations, draw_image, draw_scale, photograph_of
+from semfov.viz.drawing import check_foveal, choose_fixations, draw_image, draw_scale, photograph_of, rows_and_columns
 from semfov.viz.look import draw_view
 from semfov.viz.objects import (
     LegendEntry,
@@ -149,8 +149,7 @@ def plot_foveated_strip(
     views = _views(scanpath, views)
     check(columns >= 1, "columns", "at least 1", columns)
     fixations = choose_fixations(scanpath, most)
-    columns = len(fixations) if axes is not None else min(columns, len(fixations))
-    rows = -(-len(fixations) // columns)  # rounded up
+    rows, columns = rows_and_columns(len(fixations), columns, axes)
     aspect = views[0].shape[-2] / views[0].shape[-1]
     height = rows * (2.6 * aspect + 0.3)
     figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", axes=axes)

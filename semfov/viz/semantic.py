@@ -17,8 +17,8 @@ from semfov.viz.drawing import (
     check_foveal,
     draw_cells,
     draw_cross,
+    draw_grey,
     draw_grid,
-    draw_image,
     draw_scale,
     text_size,
 )
@@ -36,7 +36,7 @@ _NAME_POINTS = 7
 
 def cell_entropy(scanpath: Scanpath) -> Tensor:
     """Compute the entropy in bits of the class of every cell after each look, `(n, X·Y)`."""
-    shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
+    shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)  # (n, X·Y, K+1)
     return torch.special.entr(shares).sum(-1).detach().cpu() / math.log(2)
 
 
@@ -86,8 +86,7 @@ def regions_after(scanpath: Scanpath, fixation: int) -> list[Region]:
 
 def _draw_entropy(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor | None) -> AxesImage:
     """Draw the entropy of every cell over a photograph, on a scale for all fixations."""
-    if image is not None:
-        draw_image(axes, image, scanpath.grid, grey=True)
+    draw_grey(axes, image, scanpath.grid)
     values = cell_entropy(scanpath)
     alpha = None if image is None else 0.65
     lowest = float(values.min())
@@ -100,8 +99,7 @@ def _draw_entropy(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor |
 
 def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor | None) -> AxesImage:
     """Draw the probability of the most probable object of every cell, from 0 to 1, over a photograph."""
-    if image is not None:
-        draw_image(axes, image, scanpath.grid, grey=True)
+    draw_grey(axes, image, scanpath.grid)
     drawn = draw_cells(axes, scanpath.grid, scanpath.probabilities[fixation, :, 1:].amax(-1))
     draw_grid(axes, scanpath.grid)
     draw_cross(axes, scanpath.fixations[fixation])
@@ -160,9 +158,12 @@ def _borders(grid: Grid, region: Sequence[int]) -> list[_Line]:
     for cell in region:
         column = cell % grid.columns
         x1, y1, x2, y2 = edges[cell]
+        is_first = column == 0
+        is_last = column == grid.columns - 1
+        # Beyond the ends of a row are cells of other rows; above and below the grid are numbers that no cell has.
         neighbours: list[tuple[int | None, _Line]] = [
-            (cell - 1 if column else None, [(x1, y1), (x1, y2)]),
-            (cell + 1 if column + 1 < grid.columns else None, [(x2, y1), (x2, y2)]),
+            (None if is_first else cell - 1, [(x1, y1), (x1, y2)]),
+            (None if is_last else cell + 1, [(x2, y1), (x2, y2)]),
             (cell - grid.columns, [(x1, y1), (x2, y1)]),
             (cell + grid.columns, [(x1, y2), (x2, y2)]),
         ]
