@@ -275,13 +275,13 @@ def reading(path: str | os.PathLike[str], name: str | None = None) -> Iterator[N
         DataError: it is not there, is no regular one, or cannot be read.
     """
     check_regular(path, name)
-    where = name or path
+    label = name or path
     try:
         yield
     except FileNotFoundError:
-        raise DataError(f"{where}: no such file; check the path") from None
+        raise DataError(f"{label}: no such file; check the path") from None
     except OSError as error:
-        raise DataError(f"{where}: cannot be read ({error.strerror or error})") from None
+        raise DataError(f"{label}: cannot be read ({error.strerror or error})") from None
 
 
 def read_bytes(path: str | os.PathLike[str], *, most: int | None = None, name: str | None = None) -> bytes:

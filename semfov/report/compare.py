@@ -32,11 +32,11 @@ def comparison_page(about: str, sentences: Sequence[str], table: Sequence[Sequen
     Returns:
         The HTML of the page.
     """
-    result, *others = sentences
+    result, *remarks = sentences
     sections = (
         f'<p class="outcome">{escape(result)}</p><p>{escape(about)}</p>'
         f'<div class="curves">{figure_html(_FIGURE, figure)}</div>'
-        f"{''.join(f'<p>{escape(sentence)}</p>' for sentence in others)}"
+        f"{''.join(f'<p>{escape(sentence)}</p>' for sentence in remarks)}"
         f"{table_html(table, _COLUMNS)}"
     )
     return page_html("semfov beside slices", [], sections=sections)

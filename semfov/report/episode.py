@@ -36,6 +36,7 @@ def pillow(image: Tensor) -> PillowImage:
     """Convert a picture `(3, H, W)`, of bytes or in [0, 1], for Pillow."""
     from PIL import Image
 
+    # Pillow has the channels last.
     pixels = image if image.dtype == torch.uint8 else (image.detach().clamp(0, 1) * 255).round().byte()
     return Image.fromarray(pixels.cpu().permute(1, 2, 0).numpy())
 
@@ -226,10 +227,10 @@ def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
     Returns:
         Data of each: its box, its best classes with their scores, and the place of its label.
     """
-    found = confident_detections(scanpath.fixated[fixation].detections, _DETECTIONS)[0]
+    found = confident_detections(scanpath.fixated[fixation].detections, _DETECTIONS)[0]  # a batch of one
     detections = []
     for box, scores in zip(found.boxes, found.class_scores, strict=True):
-        best = scores.topk(min(_SCORES, len(scores)))
+        best = scores.topk(min(_SCORES, len(scores)))  # of (K,), without background
         classes = []
         for score, index in zip(best.values.tolist(), best.indices.tolist(), strict=True):
             classes.append([scanpath.classes[index + 1], rounded(score, 9)])
@@ -258,7 +259,7 @@ def tagged(
     Returns:
         The data of each, with `tag`, the rectangle of its text.
     """
-    unit = frame[0] / 640
+    unit = frame[0] / 640  # the view is drawn about 640 pixels of the screen wide
     sizes = [(unit * (11.5 * len(text) + 8), unit * 25) for text in texts]
     places = place_labels([tuple(detection["box"]) for detection in detections], sizes, frame, obstacles)
     with_tags = []
@@ -271,7 +272,8 @@ def tagged(
 def _map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
     """Quantise the maps `(n, X·Y)` of the target, of the classes most probable anywhere, and of background."""
     probabilities = scanpath.probabilities.detach().cpu()  # (n, X·Y, K+1)
-    labels = (1 + probabilities[..., 1:].amax((0, 1)).argsort(descending=True, stable=True)).tolist()
+    highest = probabilities[..., 1:].amax((0, 1))  # (K,), anywhere after any look; background comes last
+    labels = (1 + highest.argsort(descending=True, stable=True)).tolist()
     target = scanpath.target
     maps = []
     if target is not None:

@@ -37,6 +37,7 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
         `picture`, for the script: its result in words, shares of the fixations as bytes, borders and scanpaths;
         `facts`, HTML; `shares` of the areas in words, by name; and `caution`, None for none.
     """
+    # The slider begins before the first fixation, with the map of all, and has a step for each fixation that is seen.
     longest = max(map(len, scanpaths))
     steps = min(longest, _MOST_STEPS)
     densities = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
@@ -69,7 +70,7 @@ def _rounded_points(scanpath: Fixations) -> list[list[float]]:
 
 def _bytes_of_map(density: Tensor) -> str:
     """Encode the share of the fixations in the smallest area that reaches each cell as bytes, in base 64."""
-    shares = (shares_around(density).clamp(max=1) * 255).round().byte()
+    shares = (shares_around(density).clamp(max=1) * 255).round().byte()  # (rows, columns)
     return base64.b64encode(shares.numpy().tobytes()).decode()
 
 

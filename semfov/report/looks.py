@@ -85,6 +85,7 @@ def _overview(data: Data, place: str) -> str:
     width, height = data["size"]
     unit = max(width, height) / 640  # the drawing is about 640 pixels of the screen wide
     windows = [(number, look["box"]) for number, look in enumerate(data["looks"], 1) if not look["whole"]]
+    # Room for digits of 13 pixels of the screen.
     tag_sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
     window_boxes = [_corners(box) for _, box in windows]
     tags = place_labels(window_boxes, tag_sizes, (width, height))
@@ -218,7 +219,7 @@ def _detection_shapes(look: Data, target: str | None) -> str:
     Returns:
         SVG.
     """
-    unit = look["size"][0] / 640
+    unit = look["size"][0] / 640  # the view is drawn about 640 pixels of the screen wide
     boxes = []
     tags = []
     for order, detection in enumerate(look["detections"], 1):
@@ -234,7 +235,7 @@ def _detection_shapes(look: Data, target: str | None) -> str:
             f'textLength="{length:.1f}" lengthAdjust="spacingAndGlyphs">{order}</text>'
         )
         tags.append(f'<g class="{kind}">{rect(detection["tag"], "tag")}{text}</g>')
-    return "".join(boxes + tags)
+    return "".join(boxes + tags)  # what comes later lies over what was drawn before
 
 
 def _look_facts(look: Data, number: int) -> dict[str, str]:

@@ -55,10 +55,10 @@ def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
     Returns:
         HTML.
     """
-    first, *others = rows
+    first, *body_rows = rows
     kinds = ["", *[' class="number"'] * (len(first) - 1)]
     head = "".join(f'<th scope="col"{kind}>{escape(cell)}</th>' for kind, cell in zip(kinds, first, strict=True))
-    body = "".join(f"<tr>{_row(name, numbers)}</tr>" for name, *numbers in others)
+    body = "".join(f"<tr>{_row(name, numbers)}</tr>" for name, *numbers in body_rows)
     label = escape(caption)
     return (
         f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'

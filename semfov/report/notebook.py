@@ -119,6 +119,7 @@ def scanpath_html(scanpath: Scanpath) -> str:
     classes = min(len(scanpath.classes) - 1, int((_MAPS - 8 * cells) / bytes_of_map - 2))
     if classes >= 1:
         views = None if scanpath.stimulus is None else scanpath.views()
+        # The notebook's file keeps the page of each record.
         for width, quality in _FINENESS:
             frame = _frame(scanpath, views, classes, width, quality)
             if len(frame.encode()) <= _MOST_CHARACTERS:

@@ -48,6 +48,7 @@ def zoom_data(
     """
     source = _opened(path, picture)
     check(path.passes > 0, "path", "at least one look", path.passes)
+    # Only the pixels that the page shows are read: the picture may be larger than the memory.
     image = read_region(source, (0, 0, *path.size), path.size, min(width, path.size[0]))
     looks = [_look(path, look, view, quality) for look, view in zip(path, path.look_views(source), strict=True)]
     return {
@@ -90,16 +91,17 @@ def _outcome_in_words(path: Record) -> str:
 def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Data:
     """Tell of a look its window, the value for which it was chosen, its detections and what it shows most sharply."""
     x1, _, x2, _ = look.region
+    # Looks of a head have none of their own: then it is the pixels of the view for one of the picture.
     magnification = look.more.get("magnification", view.size[0] / max(x2 - x1, 1))
     detections = _detections(path, look, view)
     closer = _closer_look(path, look)
-    turned = _pose_in_words(look) if path.kind.turns else None
+    pose = _pose_in_words(look) if path.kind.turns else None
     return {
         "view": jpeg_uri(view.pixels, max(1, round((x2 - x1) * magnification)), quality),
         "box": [round(side) for side in look.region],
         "size": list(view.size),
         "whole": path.is_whole(look.region),
-        "turned": turned,
+        "turned": pose,
         "warm": look.index == 0 and _warmed_up(path),
         "magnification": magnification,
         "value": look.value,
@@ -108,13 +110,13 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
         "detections": detections[:_MOST_DETECTIONS],
         "count": len(detections),
         "brought": _brought_in_words(path, look),
-        "status": _status(path, look, magnification, turned),
+        "status": _status(path, look, magnification, pose),
     }
 
 
-def _status(path: Record, look: RecordedLook, magnification: float, turned: str | None) -> str:
+def _status(path: Record, look: RecordedLook, magnification: float, pose: str | None) -> str:
     """Tell of a look where it was, its value, and what came of it."""
-    sentences = [f"{_number_in_words(path, look)}{_where_in_words(path, look, magnification, turned)}."]
+    sentences = [f"{_number_in_words(path, look)}{_where_in_words(path, look, magnification, pose)}."]
     if look.value is not None:
         sentences.append(f"Its value was {look.value:.2g}.")
     closer = _closer_look(path, look)
@@ -155,12 +157,12 @@ def _pose_in_words(look: RecordedLook) -> str:
     return f"pan {more['pan']:z.0f}°, tilt {more['tilt']:z.0f}°, field of view {more['field']:.0f}°"
 
 
-def _where_in_words(path: Record, look: RecordedLook, magnification: float, turned: str | None) -> str:
+def _where_in_words(path: Record, look: RecordedLook, magnification: float, pose: str | None) -> str:
     """Tell where a look was: at the whole picture, at a point, or in the pose of a head."""
     if path.is_whole(look.region):
         return ", at the whole picture"
-    if turned is not None:
-        return f": {turned}"
+    if pose is not None:
+        return f": {pose}"
     x, y = look.fixation
     return f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}"
 
@@ -213,7 +215,7 @@ def _detections(path: Record, look: RecordedLook, view: LookView) -> list[Data]:
             "score": score,
         }
         rows.append((label == path.target, score, entry))
-    rows.sort(key=lambda row: row[:2], reverse=True)
+    rows.sort(key=lambda row: row[:2], reverse=True)  # those of the target first, then by score
     entries = [entry for _, _, entry in rows]
     drawn = entries[:_MOST_DETECTIONS]
     # Names would cover small objects. The table has them.

@@ -82,6 +82,7 @@ class WholeBar:
             self._bar.refresh()
 
     def _move(self, to: float) -> None:
+        # Not back: the tasks of a stage may have done more than it was expected to.
         self._position = max(self._position, to)
         self._bar.update(min(self.done, 1.0) - self._bar.n)
 

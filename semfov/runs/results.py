@@ -106,6 +106,7 @@ class SceneResults:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with closing(sqlite3.connect(self.path, timeout=_WAIT)) as database, database:
             database.execute(_TABLE)
+            # A damaged row counts as missing: its scene is run again, and takes its place.
             database.executemany("INSERT OR REPLACE INTO scenes VALUES (?, ?, ?, ?)", self._waiting)
 
     def _rows(self, query: str, *given: int) -> Iterator[tuple[Any, ...]]:
@@ -143,5 +144,6 @@ class SceneResults:
         return {"records": outcomes, "seconds": times}
 
     def _sha256(self, index: int, seconds: str, records: str) -> str:
+        # With what the outcomes depend on: a row of another scene or run is none of this one.
         head = json.dumps([self.key, index, self.digest(index), seconds])
         return hashlib.sha256(f"{head}\n{records}".encode()).hexdigest()

@@ -35,5 +35,6 @@ def noise_for(protocol: ProtocolConfig, cells: int, *episode: object) -> Tensor:
     purpose = ("exploration" if part is None else part for part in episode)
     shape = protocol.shifts + 1, cells
     if protocol.ties == "first":
+        # Of cells of the same value the one with the largest number is taken: here the first one.
         return torch.linspace(1, 0, cells).expand(shape)
     return torch.rand(shape, generator=generator_for("ties", protocol.seed, *purpose))

@@ -85,6 +85,7 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
         return fitted, held_out
     ids = [*make_scenes(data, classes).ids]
     check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
+    # One in so many, and not the last ones: files are often in the order in which they were taken.
     fitted_ids = [name for number, name in enumerate(ids) if number % every]
     return make_scenes(data, classes, fitted_ids), make_scenes(data, classes, ids[::every])
 

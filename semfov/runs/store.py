@@ -79,6 +79,7 @@ class DetectionStore(SceneStore):
 
     def save(self, digest: str, looks: Mapping[Any, Any]) -> None:
         rows = {action: tuple(map(float, self.encode(action))) for action in looks}
+        # In a fixed order, so that the same looks give the same bytes.
         actions = sorted(looks, key=rows.__getitem__)
         numbers = torch.tensor([rows[action] for action in actions], dtype=torch.float64)
         packed = self.pack([looks[action] for action in actions])
@@ -95,10 +96,10 @@ class DetectionStore(SceneStore):
     def pack(self, looks: Sequence[Any]) -> dict[str, Tensor]:
         """Join the detections of looks without padding, which makes up most of a padded batch."""
         return {
-            "count": torch.cat([look.mask.sum(-1) for look in looks]),
-            "boxes": torch.cat([look.boxes[look.mask] for look in looks]),
-            "scores": torch.cat([look.scores[look.mask] for look in looks]),
-            "confidence": torch.cat([look.confidence[look.mask] for look in looks]),
+            "count": torch.cat([look.mask.sum(-1) for look in looks]),  # (N,), one for each look; they sum to M
+            "boxes": torch.cat([look.boxes[look.mask] for look in looks]),  # (M, 4)
+            "scores": torch.cat([look.scores[look.mask] for look in looks]),  # (M, C)
+            "confidence": torch.cat([look.confidence[look.mask] for look in looks]),  # (M,)
         }
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Any]) -> list[Any]:
@@ -169,6 +170,7 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
         """Store new looks, and free the opened scene and the stored looks; a later look reads them again."""
         self._look = None
         self.save()
+        # Without a store they could not be read again, and are kept.
         if self._store is not None:
             self._looks = None
 

@@ -13,8 +13,8 @@ def table(rows: list[list[str]]) -> list[str]:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
         lines.append(f"| {' | '.join(cells)} |")
     rules = ["-" * (width + 2) for width in widths]
-    headings, *others = lines
-    return [headings, f"|{'|'.join(rules)}|", *others]
+    headings, *body = lines
+    return [headings, f"|{'|'.join(rules)}|", *body]
 
 
 def plus_minus(value: float, error: float, digits: int = 1, *, sign: str = "") -> str:

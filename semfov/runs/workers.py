@@ -138,7 +138,7 @@ def run_tasks(
         return
     processes = available_cores() if where is None else where
     with closing(task_bar(sum(map(count, tasks)), title, unit, hidden=hidden)) as bar:
-
+        # After the result is taken: what the caller does with it counts as work, too.
         def tell(task: _Task) -> None:
             bar.update(count(task))
 
@@ -226,6 +226,7 @@ def _results(
     running: dict[Future[_Result], _Task] = {}
     waiting = iter(tasks)
 
+    # The next task is given when one is done, so that `_OUTSTANDING` are with the executor at any time.
     def submit(number: int) -> None:
         for task in islice(waiting, number):
             future = executor.submit(function, task)
@@ -303,6 +304,7 @@ def _on_cluster(
         try:
             with _open_cluster(address, again=attempt > 0) as (executor, places):
                 waiting = list(unfinished)
+                # Large batches save exchanges, and small ones let the workers end together.
                 size = min(_BATCH, max(1, len(waiting) // (_TURNS * places)))
                 batches = [tuple(waiting[start : start + size]) for start in range(0, len(waiting), size)]
                 for batch, results in _results(executor, partial(_in_turn, job), batches, lambda batch: None):
