@@ -66,6 +66,7 @@ def detector_options(options: DetectorOptions) -> dict[str, Any]:
     names = options.classes
     if names is not None and len(names) == 1 and Path(names[0]).is_file():
         names = given_names(names[0])
+    # A flag that is not given leaves the choice to the detector's own settings.
     values = {
         "weights": options.weights,
         "device": options.device,

@@ -340,8 +340,8 @@ def _make_page(agent: ActivePerception) -> "gradio.Blocks":
     import gradio
 
     calls = _Calls(agent)
-    kept = (_SECONDS_SWEPT, _SECONDS_KEPT)
-    with gradio.Blocks(title="semfov", analytics_enabled=False, delete_cache=kept, fill_width=True) as page:
+    sweeping = (_SECONDS_SWEPT, _SECONDS_KEPT)
+    with gradio.Blocks(title="semfov", analytics_enabled=False, delete_cache=sweeping, fill_width=True) as page:
         gradio.Markdown("# semfov\nSee where it looks in a picture, and what it finds there.", elem_classes="title")
         with gradio.Row():
             with gradio.Column(scale=1, min_width=300, elem_id="panel"):

@@ -137,6 +137,7 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
         f"{_precision(slices)} in {slices.seconds:.2f} s ({_passes(slices)})."
     ]
     # The passes, counted back from the last one, after which semfov is at least as good.
+    # Not where all slices find nothing, with which all would be level.
     level = [*takewhile(lambda point: (point.ap50 or 0) >= (slices.ap50 or 0) > 0, reversed(ours))]
     if level:
         sentences.append(f"It is level with them from {_passes(level[-1])} and {level[-1].seconds:.2f} s on.")
@@ -146,10 +147,10 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
 def _agreement(last: Point, slices: Point) -> list[str]:
     """Say what semfov lists after its last pass of what all slices list, which stand for the truth."""
     found = f"{last.right} of the {last.reference} objects that all slices list"
-    others = number_of(last.listed - last.right, "other")
+    false_alarms = number_of(last.listed - last.right, "other")
     share = last.seconds / slices.seconds
     return [
-        f"After {_passes(last)} semfov lists {found} and {others}, in {share:.2f} of their time.",
+        f"After {_passes(last)} semfov lists {found} and {false_alarms}, in {share:.2f} of their time.",
         "All slices miss and invent objects, too: AP50 says how well semfov agrees with them. To judge both by "
         "your own boxes, give --annotations FILE.",
     ]

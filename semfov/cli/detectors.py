@@ -62,9 +62,9 @@ def _classes_of(name: str, options: DetectorsOptions) -> Sequence[str]:
 
 def _in_columns(names: Sequence[str]) -> list[str]:
     """Write names in columns, in order down each of them, in lines of at most `_WIDTH` characters."""
-    width = max(map(len, names)) + 2
+    width = max(map(len, names)) + 2  # with two blanks between columns
     columns = max(1, _WIDTH // width)
-    rows = -(-len(names) // columns)
+    rows = -(-len(names) // columns)  # rounded up
     return ["".join(name.ljust(width) for name in names[row::rows]).rstrip() for row in range(rows)]
 
 

@@ -67,6 +67,7 @@ class PictureJob(ABC, Generic[_Options_co]):
         self.weights: dict[str, float] | None = None
         self.sources = picture_sources(options)
         self.several = len(self.sources) > 1
+        # The cheap checks come first: a mistake is told before files are read and the detector is loaded.
         self._check_names()
         self.truth = None if options.annotations is None else Truth(options.annotations)
         self._check_before_loading()
@@ -76,7 +77,7 @@ class PictureJob(ABC, Generic[_Options_co]):
             self.aim(detector_classes(options))
             agent = make_agent(options)
         self.agent = agent
-        classes = self.agent.classes[1:]
+        classes = self.agent.classes[1:]  # without background
         self.aim(classes)
         if self.truth is not None:
             self.truth.categories(self.targets or classes)
@@ -162,6 +163,7 @@ class PictureJob(ABC, Generic[_Options_co]):
             with torch.inference_mode():
                 picture = source.opened(self.options.how)
                 if self.truth is not None:
+                    # Its size is checked before it is looked at: boxes in another frame could not be judged.
                     self.truth.image_id(source.name, picture_size(source.picture()))
                 settings = {setting.name: getattr(self.options, setting.name) for setting in fields(self.task)}
                 if isinstance(picture, World):  # a scene is looked at by a head, whatever it was opened as
@@ -246,7 +248,8 @@ class SearchJob(PictureJob[SearchOptions]):
             return None
         height, width = scene.image.shape[-2:]
         grid = Grid(self.agent.columns, self.agent.rows, (width, height))
-        free_cells = (~grid.footprint(scene.boxes).any(0)).nonzero()[:, 0]
+        covered = grid.footprint(scene.boxes).any(0)  # (X·Y,), by any box
+        free_cells = (~covered).nonzero()[:, 0]
         if not len(free_cells):
             return None
         generator = torch.Generator().manual_seed(self.options.seed)

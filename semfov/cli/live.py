@@ -122,7 +122,7 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
                 print(f"  {_moment_line(moment)}  {rate}", flush=True)
                 if add_frame is not None:
                     add_frame(draw_moment(picture.image, moment, f"{moment.describe()}   {rate}"))
-        except KeyboardInterrupt:
+        except KeyboardInterrupt:  # ends a stream in good order: what was written until then is whole
             print("  stopped")
     if tracks is not None:
         write_text(tracks, "".join(mot_lines))
@@ -180,6 +180,7 @@ class _Speed:
         self.frames += 1
         if self.frames < _WARM_UP:
             return
+        # The end of the last frame of the warm-up is the beginning of those that count.
         now = perf_counter()
         if not self._ends:
             self._began = now

@@ -34,6 +34,7 @@ def _run(name: str, options: "Settings") -> int | None:
     """Run a subcommand, without its texts if it is to be quiet, or with them beside results in standard output."""
     command = SUBCOMMANDS[name]
     stream = sys.stdout
+    # With `--out -` programs read the results in standard output, where no text may be among them.
     texts = sys.stderr if str(getattr(options, "out", None)) == "-" else stream
     with ExitStack() as stack:
         nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
@@ -279,8 +280,10 @@ _COMMANDS = {
 
 def _in_command_words(message: str, options: Iterable[str]) -> str:
     """Say a message of the library in the words of the command: arguments become options."""
+    # Whole calls first, whose parts are options, too.
     for python, command in _COMMANDS.items():
         message = message.replace(python, command)
+    # Messages have the last part of a dotted name.
     by_name = {name.rpartition(".")[2]: name for name in options}
     names = "|".join(map(re.escape, by_name))
 

@@ -69,13 +69,13 @@ class OwnLooks(NamedTuple):
         )
         if self.agent is None:
             return f"{last} The agent would look next at the ring."
-        own, agent = _outcome(record), _outcome(self.agent)
-        return f"**You: {own}. The agent: {agent}**, from the same first look.\n\n{last}"
+        outcomes = f"You: {_outcome(record)}. The agent: {_outcome(self.agent)}"
+        return f"**{outcomes}**, from the same first look.\n\n{last}"
 
     def marks(self) -> str:
         """Collect what is drawn over the picture, as JSON; points and boxes in pixels of the picture."""
         record = self.record
-        grid, belief = record.belief_map(len(record) - 1)
+        grid, belief = record.belief_map(len(record) - 1)  # (X·Y,)
         detections = confident_detections(record.looks[-1].detections)[0]
         boxes = detections.boxes[detections.labels == record.target]
         return json.dumps(

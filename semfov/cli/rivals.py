@@ -106,10 +106,12 @@ def by_semfov(agent: ActivePerception, labels: Sequence[int], passes: int) -> Wa
                 stops.append((time.perf_counter() - began, record))
 
         last = agent.find_all(picture, [*labels] or None, how="windows", passes=passes, on_look=stop_the_clock)
+        # The last record counts also where it ends between two of the numbers.
         if not stops or stops[-1][1].passes < last.passes:
             stops.append((time.perf_counter() - began, last))
         findings = []
         for seconds, record in stops:
+            # Objects are merged after the search, and the time for that is added to each point.
             merging = time.perf_counter()
             objects = record.candidates.of(labels)
             seconds += time.perf_counter() - merging

@@ -49,8 +49,8 @@ class Trial:
         overview = torch.tensor([Window.overview(view.lattice).fixation])
         canvas, frames = eye.glimpse(view, overview)
         proposals = detector.propose(canvas).precise()
-        confidence = proposals.confidence[0]
-        labels = proposals.classes[0].argmax(-1)
+        confidence = proposals.confidence[0]  # (N,), of all boxes
+        labels = proposals.classes[0].argmax(-1)  # (N,), from 0 without background
 
         confident = (confidence >= SCORE_THRESHOLD).nonzero()[:, 0]
         boxes = proposals.boxes[0, confident]
@@ -107,7 +107,7 @@ def _rows(bare: Trial, objects: Objects, classes: tuple[str, ...]) -> list[list[
     Returns:
         The cells of each row; `-` where one of them does not have the object.
     """
-    is_same_class = bare.labels[:, None] == objects.labels
+    is_same_class = bare.labels[:, None] == objects.labels  # (M, objects)
     overlap = box_iou(bare.boxes, objects.boxes.to(bare.boxes)) * is_same_class
     rows: list[list[str]] = []
     unmatched = set(range(len(objects)))

@@ -42,8 +42,8 @@ class Truth:
             empty += sum(min(entry["bbox"][2:]) == 0 for entry in entries)
             if size is not None:
                 boxes += [entry["bbox"] for entry in entries]
-                limits += [size * 2] * len(entries)
-        corners = torch.tensor(boxes).view(-1, 4).double()
+                limits += [size * 2] * len(entries)  # width, height, width, height
+        corners = torch.tensor(boxes).view(-1, 4).double()  # (M, 4), as other programs write them
         warn_of_form(corners, torch.tensor(limits).view(-1, 4).double(), self.path)
         if empty:
             warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
@@ -121,6 +121,7 @@ class Truth:
         names = {canonical_name(name) for name in classes}
         categories = self.annotations.categories
         ids = [(canonical_name(category["name"]), id_) for id_, category in categories.items()]
+        # Reversed, so that of two categories of one name the first one counts.
         found = {name: id_ for name, id_ in reversed(ids) if name in names}
         examples = ", ".join(category["name"] for category in [*categories.values()][:5])
         check(bool(found), "annotations", f"some of the classes {', '.join([*classes][:5])} as categories", examples)
