@@ -1,8 +1,7 @@
 """Subcommand check: says what is suspicious in files of fixations."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,13 +12,16 @@ from semfov.cli.options import CheckOptions
 from semfov.data.fixations import Fixations
 from semfov.data.large import picture_size
 from semfov.data.sources import PHOTOGRAPHS, picture_files
-from semfov.errors import DataError, SemfovError, check, printable
+from semfov.errors import DataError, InputError, SemfovError, check, printable
 from semfov.human.density_check import suspicions_by_content
 from semfov.human.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
 from semfov.human.fixations.suspicions import other_frame_of, suspicions
 from semfov.human.fixations.table import FrameError, PictureError, read_table
 
+_Reader = Callable[..., list[Fixations]]
+
 _FRAMES_NAMED = 3  # largest number of sizes of frames that are named
+_WITHOUT_FRAMES = ("OSIE", "COCO-Search18")  # data sets whose files need not have the size of their frames
 
 
 class _PictureSizes(Mapping[str, tuple[int, int]]):
@@ -37,10 +39,10 @@ class _PictureSizes(Mapping[str, tuple[int, int]]):
         parts = name.lower().replace("\\", "/").split("/")
         # A table may have other folders before the name than there are here, or no ending.
         candidates = [*("/".join(parts[first:]) for first in range(len(parts))), Path(parts[-1]).stem]
-        path = next((self._files[candidate] for candidate in candidates if candidate in self._files), None)
-        if path is None:
-            raise KeyError(name)
-        return path
+        for candidate in candidates:
+            if candidate in self._files:
+                return self._files[candidate]
+        raise KeyError(name)
 
     def __getitem__(self, name: str) -> tuple[int, int]:
         path = self.path(name)
@@ -65,12 +67,11 @@ def check_fixations(options: CheckOptions) -> int:
         The exit code, 1 if anything is suspicious or a file cannot be read.
     """
     check(len(options.files) > 0, "file", "a file of fixations, such as people.csv", "none")
-    arguments = _reading_arguments(options)
-    sizes = _sizes(options)
+    reading = _Reading.of(options)
     wrong = False
     for name in options.files:
         try:
-            report = _report(Path(name), options, arguments, sizes)
+            report = reading.report(Path(name))
         except SemfovError as error:
             if len(options.files) == 1:
                 raise
@@ -148,68 +149,77 @@ def fixation_report(path: Path, options: CheckOptions, keep: Callable[[Path], bo
     Raises:
         SemfovError: the file cannot be read.
     """
-    return _report(path, options, _reading_arguments(options), _sizes(options, keep))
+    return _Reading.of(options, keep).report(path)
 
 
-def _sizes(options: CheckOptions, keep: Callable[[Path], bool] | None = None) -> _PictureSizes | None:
-    """Find the sizes of the pictures that the options name; None where they name none."""
-    place = None if options.picture is None else Path(options.picture)
-    return _PictureSizes(place, keep) if place is not None and _shows_pictures(place) else None
+class _Reading(NamedTuple):
+    """What files of fixations do not tell themselves.
 
-
-def _report(
-    path: Path, options: CheckOptions, arguments: dict[str, Any], sizes: _PictureSizes | None
-) -> FixationReport:
-    """Read one file of fixations, and say what is suspicious.
-
-    Args:
-        path: the file.
-        options: what the file does not tell itself.
-        arguments: the same, as arguments of a reader.
-        sizes: sizes of the pictures; None where there are none.
-
-    Returns:
-        The report.
+    Attributes:
+        options: as a command gives them.
+        arguments: the same, as arguments of a reader of fixations.
+        sizes: sizes of the pictures that the options name; None where they name none.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what the lines below say
-        warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say
-        reader = reader_of(path, arguments.get("columns"))
-        records = _records(reader, path, arguments, sizes)
-    if sizes is not None and "picture" in arguments:  # a single one is compared with what was looked at in it
-        records = [record for record in records if record.picture in sizes] or records
-    suspicious = suspicions(records, sizes)
-    if sizes is not None and records and not options.rules_alone:
+
+    options: CheckOptions
+    arguments: dict[str, Any]
+    sizes: _PictureSizes | None
+
+    @classmethod
+    def of(cls, options: CheckOptions, keep: Callable[[Path], bool] | None = None) -> "_Reading":
+        """Find the pictures that options name; `keep` tells which of a folder may be opened, None for all."""
+        sizes = None
+        if options.picture is not None and _shows_pictures(Path(options.picture)):
+            sizes = _PictureSizes(Path(options.picture), keep)
+        return cls(options, _reading_arguments(options), sizes)
+
+    def report(self, path: Path) -> FixationReport:
+        """Read one file of fixations, and say what is suspicious."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what the lines below say
+            warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say
+            reader = reader_of(path, self.arguments.get("columns"))
+            records = self._records(reader, path)
+        lines = [*suspicions(records, self.sizes), *self._suspicions_by_content(records)]
+        usual_frames = ""
+        data_set = DATA_SETS.get(reader)
+        if data_set in _WITHOUT_FRAMES and "size" not in self.arguments:
+            usual_frames = f" (those of {data_set}, or give --size)"
+        return FixationReport(_content(records, usual_frames), lines, was_compared=self.sizes is not None)
+
+    def _suspicions_by_content(self, records: Sequence[Fixations]) -> list[str]:
+        """Compare fixations with where people look in their pictures, if there are pictures."""
+        if self.sizes is None or self.options.rules_alone or not records:
+            return []
         # Where points look like those of another frame or unit, that is said by the rules alone, in one way.
-        is_own_frame = other_frame_of(records) is None
-        if is_own_frame:
-            suspicious += suspicions_by_content(records, sizes.path, sizes, quiet=options.quiet)
-    data_set = DATA_SETS.get(reader)
-    usual_frames = ""
-    if data_set in ("OSIE", "COCO-Search18") and "size" not in arguments:
-        usual_frames = f" (those of {data_set}, or give --size)"
-    return FixationReport(_content(records, usual_frames), suspicious, was_compared=sizes is not None)
+        if other_frame_of(records) is not None:
+            return []
+        return suspicions_by_content(records, self.sizes.path, self.sizes, quiet=self.options.quiet)
 
+    def _records(self, reader: _Reader, path: Path) -> list[Fixations]:
+        """Read the records of a file; of one picture of several, those that were made in it."""
+        picture = self.arguments.get("picture")
+        takes_picture = reader is not read_table and "picture" in signature(reader).parameters
+        if picture is None or (takes_picture and self.sizes is None):
+            return self._in_frames(reader, path, self.arguments)
+        unnamed = {name: value for name, value in self.arguments.items() if name != "picture"}
+        try:
+            records = self._in_frames(reader, path, unnamed)
+        except PictureError:
+            # The file names no picture, so this is the one.
+            return self._in_frames(reader, path, self.arguments)
+        if self.sizes is None:
+            raise InputError(f"picture: expected a picture or folder that exists, got {picture}")
+        return [record for record in records if record.picture in self.sizes] or records
 
-def _records(
-    reader: Callable[..., list[Fixations]], path: Path, arguments: dict[str, Any], sizes: _PictureSizes | None
-) -> list[Fixations]:
-    """Read the records of a file; where it has no frames, they are the pictures."""
-    unnamed = {name: value for name, value in arguments.items() if name != "picture"}
-    names_pictures = reader is read_table or "picture" not in signature(reader).parameters
-    if "picture" in arguments and (names_pictures or sizes is not None):
-        # A photograph may be one of those that the file names; any other name is for a file that names none.
-        with suppress(PictureError):
-            records = _records(reader, path, unnamed, sizes)
-            is_used = sizes is not None or not names_pictures
-            check(is_used, "picture", "a picture or folder that exists", arguments["picture"])
-            return records
-    try:
-        return read_by(reader, path, arguments)
-    except FrameError as error:
-        if sizes is None:
-            raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
-        return read_by(reader, path, {**arguments, "size": sizes})
+    def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> list[Fixations]:
+        """Read the records of a file; where it has no frames, they are the pictures."""
+        try:
+            return read_by(reader, path, arguments)
+        except FrameError as error:
+            if self.sizes is None:
+                raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
+            return read_by(reader, path, {**arguments, "size": self.sizes})
 
 
 def _content(records: list[Fixations], usual: str) -> str:
@@ -225,11 +235,14 @@ def _content(records: list[Fixations], usual: str) -> str:
         _counted(len(pictures), "picture", "pictures"),
     ]
     sizes = sorted({record.size for record in records})
-    frames = ", ".join(f"{width} × {height}" for width, height in sizes[:_FRAMES_NAMED])
-    more = ", …" if len(sizes) > _FRAMES_NAMED else ""
+    frames = [f"{width} × {height}" for width, height in sizes[:_FRAMES_NAMED]]
+    if len(sizes) > _FRAMES_NAMED:
+        frames.append("…")
+    durations = "without durations"
     times = [record.durations for record in records if record.durations is not None]
-    lasting = f"they take {np.median(np.concatenate(times)):g} ms in the median" if times else "without durations"
-    return f"{', '.join(words)}, frames of {frames}{more}{usual}; {lasting}"
+    if times:
+        durations = f"they take {np.median(np.concatenate(times)):g} ms in the median"
+    return f"{', '.join(words)}, frames of {', '.join(frames)}{usual}; {durations}"
 
 
 def _counted(number: int, one: str, several: str) -> str:

@@ -108,6 +108,25 @@ class Table(NamedTuple):
     repeated: frozenset[str] = frozenset()
     encoding: str = "utf-8"
 
+    @classmethod
+    def of(
+        cls, name: str, columns: list[str], lines: Iterable[tuple[str, Sequence[str]]], encoding: str = "utf-8"
+    ) -> "Table":
+        """Make a table of its lines.
+
+        Args:
+            name: for messages.
+            columns: their names.
+            lines: the place of each in words, such as `line 3`, and a text for each column.
+            encoding: of the file.
+
+        Returns:
+            The table.
+        """
+        rows = [Row(name, place, dict(zip(columns, texts, strict=True))) for place, texts in lines]
+        repeated = frozenset(column for column, count in Counter(columns).items() if count > 1)
+        return cls(name, columns, rows, repeated, encoding)
+
     def check_different(self, columns: Iterable[str | None]) -> None:
         """Raise `DataError` for columns to be read whose names others have, too."""
         repeated = sorted(self.repeated.intersection(columns))
@@ -138,13 +157,11 @@ def table_of(source: str | PathLike[str] | DataFrame) -> Table:
 
 
 def _table_of_frame(frame: DataFrame) -> Table:
-    name = "the table"
-    columns = [str(column) for column in frame.columns]
-    rows = []
+    """Make a table of a data frame, which has no name of its own."""
+    lines = []
     for number, values in enumerate(frame.itertuples(index=False, name=None)):
-        texts = [_text_of(value) for value in values]
-        rows.append(Row(name, f"row {number}", dict(zip(columns, texts, strict=True))))
-    return Table(name, columns, rows, _repeated(columns))
+        lines.append((f"row {number}", [*map(_text_of, values)]))
+    return Table.of("the table", [*map(str, frame.columns)], lines)
 
 
 def _text_of(value: object) -> str:
@@ -169,44 +186,49 @@ def _table_of_file(path: Path, name: str) -> Table:
     _check_text_file(path)
     text, encoding = read_recording(path)
     if has_events(text):
-        return _table_of_events(Events.of(text, name), name, encoding)
+        events = Events.of(text, name)
+        fixations = [(place, _texts(line, events.separator)) for place, line in events.fixations]
+        return Table.of(name, events.columns, fixations, encoding)
     preamble = _PREAMBLE.match(text)
     if preamble is not None:
         text = text[preamble.end() :]
     # The separator is what the names of the columns have most of.
     first_line = text.partition("\n")[0]
     separator = max(",;\t|", key=first_line.count)
+    columns, lines = _columns_and_lines(path, text, separator)
+    return Table.of(name, columns, lines, encoding)
+
+
+def _columns_and_lines(path: Path, text: str, separator: str) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Split a text at its separator.
+
+    Args:
+        path: the file, for messages.
+        text: its content, from the names of the columns on.
+        separator: of the fields in a line.
+
+    Returns:
+        The names of the columns, and of each line that is not empty its place in words and a text for each column.
+    """
     try:
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
         columns = [column.strip() for column in next(reader, [])]
         lines = [(f"line {reader.line_num}", line) for line in reader if any(line)]
     except csv.Error as error:
         raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
-    rows = []
     for place, line in lines:
         if len(line) > len(columns):
             raise DataError(f"{path}: {place}: expected {len(columns)} fields, got more; quote them with {separator!r}")
-        texts = [_field(field, separator) for field in line]
-        texts += [""] * (len(columns) - len(line))  # a line may end early
-        rows.append(Row(name, place, dict(zip(columns, texts, strict=True))))
-    return Table(name, columns, rows, _repeated(columns), encoding)
+        line += [""] * (len(columns) - len(line))  # a line may end early
+    return columns, [(place, _texts(line, separator)) for place, line in lines]
 
 
-def _table_of_events(events: Events, name: str, encoding: str) -> Table:
-    """Make a table of the fixations among the events of an eye tracker of SMI."""
-    rows = []
-    for place, line in events.fixations:
-        texts = [_field(field, events.separator) for field in line]
-        rows.append(Row(name, place, dict(zip(events.columns, texts, strict=True))))
-    return Table(name, events.columns, rows, _repeated(events.columns), encoding)
-
-
-def _field(text: str, separator: str) -> str:
-    """Strip a field, and make a decimal comma a point where commas do not separate fields."""
-    plain = text.strip()
-    if separator != "," and _DECIMAL.fullmatch(plain):
-        return plain.replace(",", ".")
-    return plain
+def _texts(fields: Iterable[str], separator: str) -> list[str]:
+    """Strip the fields of a line, and make decimal commas points where commas do not separate fields."""
+    texts = [field.strip() for field in fields]
+    if separator == ",":
+        return texts
+    return [text.replace(",", ".") if _DECIMAL.fullmatch(text) else text for text in texts]
 
 
 def _check_text_file(path: Path) -> None:
@@ -215,11 +237,6 @@ def _check_text_file(path: Path) -> None:
     with reading(path), path.open("rb") as file:
         is_picture = kind in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
     check_data(kind not in _REMEDIES, path, "a table of text, such as .csv", f"{kind}; {_REMEDIES.get(kind)}")
-    got = "a video" if kind in VIDEOS else "a picture"
-    is_table = not is_picture and kind not in VIDEOS
-    check_data(is_table, path, "a table of fixations (.csv, .tsv, .json, .asc, …)", got)
-
-
-def _repeated(columns: Sequence[str]) -> frozenset[str]:
-    """Find the names that several columns have."""
-    return frozenset(column for column, count in Counter(columns).items() if count > 1)
+    expected = "a table of fixations (.csv, .tsv, .json, .asc, …)"
+    check_data(kind not in VIDEOS, path, expected, "a video")
+    check_data(not is_picture, path, expected, "a picture")

@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -102,20 +103,20 @@ def read_export(
     if program is None:
         raise DataError(f"{table.name}: {_of_no_program(stored)}")
     layout = _Layout.of(program, table_columns, user_columns, table.name)
-    if layout.unread:
-        warnings.warn(f"{table.name}: {layout.unread}", stacklevel=2)
+    if layout.names["duration"] is None:
+        _warn_of_durations(program, table_columns, table.name)
     table.check_different([*layout.names.values(), layout.filter])
 
     rows = layout.fixations_of(table)
-    _name_people(rows, subject, table)
+    _name_people(rows, subject, table.name)
     if picture is not None:
         name_pictures(rows, picture, table.name)
     check_data(bool(rows), table.name, f"fixations of {program.name}", "none that has a place on the picture")
     rows = _of_one_eye(_viewings(rows), eye)
     check_data(bool(rows), table.name, f"fixations of the {eye} eye", "those of the other one")
     rows = _with_picture(rows, layout, table.name)
-    have_frames = all(row.fields["width"] and row.fields["height"] for row in rows)
-    if size is None and not have_frames:
+    sides = [row.fields[side] for row in rows for side in ("width", "height")]
+    if size is None and "" in sides:
         expected = f"the size of the frame, which {program.name} does not give"
         raise FrameError(f"{table.name}: expected {expected}; give size=")
     coordinates = Coordinates(units or layout.units, origin or program.origin)
@@ -133,7 +134,6 @@ class _Layout:
         filter: the column that tells fixations from other lines; None without one.
         units: of the points.
         milliseconds: of the unit of durations.
-        unread: a sentence on columns that may be durations, but are not read; empty where there are none.
     """
 
     program: Program
@@ -141,7 +141,6 @@ class _Layout:
     filter: str | None
     units: Units
     milliseconds: float
-    unread: str
 
     @classmethod
     def of(cls, program: Program, columns: Sequence[Column], named: Mapping[str, str], table: str) -> "_Layout":
@@ -160,47 +159,43 @@ class _Layout:
         missing = ", ".join(repr(name) for name in named.values() if name not in known)
         check_data(not missing, table, "the columns of columns=", f"none named {missing}")
         x, y = _point_columns(program, columns, table)
-        duration = _duration_column(program, columns, named.get("duration"))
         names = {
             "picture": _column_name(program.picture, columns),
             "subject": _column_name(program.subject, columns),
             "trial": _column_name(program.trial, columns),
             "number": _column_name(program.number, columns),
             "eye": _column_name(_EYE_KEYS, columns),
+            "width": _column_name(program.width, columns),
+            "height": _column_name(program.height, columns),
             "x": x.name,
             "y": y.name,
+            **named,
+            "duration": None,
         }
-        if program.size is not None:
-            width, height = program.size
-            names["width"] = _column_name((width,), columns)
-            names["height"] = _column_name((height,), columns)
-        names |= named
-        names["duration"] = None if duration is None else duration.name
+        milliseconds = 1.0
+        duration = _duration_column(program, columns, named.get("duration"))
+        if duration is not None:
+            names["duration"] = duration.name
+            milliseconds = TIMES[duration.unit or program.time]
         return cls(
             program=program,
             names=names,
-            filter=None if program.keep is None else _column_name((program.keep[0],), columns),
+            filter=_column_name(program.filter, columns),
             units=LENGTHS.get(x.unit, program.units),
-            milliseconds=1.0 if duration is None else TIMES[duration.unit or program.time],
-            unread="" if duration is not None else _unread(program, columns),
+            milliseconds=milliseconds,
         )
 
     def fixations_of(self, table: Table) -> list[Row]:
         """Take the rows that are fixations with a place, with their fields by our names."""
-        fixations = []
-        for row in table.rows:
-            if self._is_fixation(row.fields):
-                fields = self._fields_of(row.fields)
-                if fields["x"] and fields["y"]:
-                    fixations.append(row._replace(fields=fields))
-        return fixations
+        stored = [row for row in table.rows if self._is_fixation(row.fields)]
+        fixations = [row._replace(fields=self._fields_of(row.fields)) for row in stored]
+        return [row for row in fixations if "" not in (row.fields["x"], row.fields["y"])]
 
     def _is_fixation(self, stored: Mapping[str, str]) -> bool:
         """Tell whether a row is that of a fixation on the picture."""
-        if self.filter is None or self.program.keep is None:
+        if self.filter is None:
             return True
-        _, beginnings = self.program.keep
-        return stored[self.filter].lower().startswith(beginnings)
+        return stored[self.filter].lower().startswith(self.program.beginnings)
 
     def _fields_of(self, stored: Mapping[str, str]) -> dict[str, str]:
         """Take the fields of a row by our names; those that hold nothing are empty."""
@@ -216,19 +211,17 @@ class _Layout:
 
 def _column_name(keys: Sequence[str], columns: Sequence[Column]) -> str | None:
     """Find the name of the first column with one of some keys, of which the first counts most."""
-    for key in keys:
-        for column in columns:
-            if column.key == key:
-                return column.name
-    return None
+    # Reversed, so that the first of several columns with a key counts.
+    by_key = {column.key: column.name for column in reversed(columns)}
+    return next((by_key[key] for key in keys if key in by_key), None)
 
 
 def _duration_column(program: Program, columns: Sequence[Column], name: str | None) -> Column | None:
     """Find the column of durations in a unit that is read: that of a user's `name`, or of the program."""
-    candidates = [] if name is None else [Column.of(name)]
     if name is None:
-        for key in program.duration:
-            candidates += [column for column in columns if column.key == key]
+        candidates = [column for key, column in product(program.duration, columns) if column.key == key]
+    else:
+        candidates = [Column.of(name)]
     return next((column for column in candidates if (column.unit or program.time) in TIMES), None)
 
 
@@ -244,32 +237,34 @@ def _point_columns(program: Program, columns: Sequence[Column], table: str) -> t
         The first pair in one frame and unit.
     """
     x_columns, y_columns = (program.of_point(key, columns) for key in program.point)
-    pairs = []
-    for x in x_columns:
-        is_read = not x.unit or x.unit in LENGTHS
-        if is_read:
-            pairs += [(x, y) for y in y_columns if (x.frame, x.unit) == (y.frame, y.unit)]
+    in_units = [x for x in x_columns if x.length is not None]
+    pairs = [(x, y) for x, y in product(in_units, y_columns) if (x.frame, x.unit) == (y.frame, y.unit)]
     names = ", ".join(repr(column.name) for column in (*x_columns, *y_columns))
     expected = f"points of {program.name} in px or norm"
     check_data(bool(pairs), table, expected, f"the columns {names}; export them in px")
-    in_fractions = [(x, y) for x, y in pairs if LENGTHS.get(x.unit) == "fractions"]
-    return in_fractions[0] if in_fractions else pairs[0]
+    # Of several in fractions, or in pixels, this is the first.
+    return max(pairs, key=lambda pair: pair[0].length == "fractions")
 
 
-def _unread(program: Program, columns: Sequence[Column]) -> str:
-    """Say which columns may be durations of fixations, but are not read; empty where there is none."""
+def _warn_of_durations(program: Program, columns: Sequence[Column], table: str) -> None:
+    """Warn of columns that may be durations of fixations, but are not read."""
     lasting = [column for column in columns if column.key in program.duration or _LASTING.search(column.key)]
-    names = ", ".join(repr(column.name) for column in lasting)
-    return names and f"no duration is read, although there is {names}; name it by columns={{'duration': …}}, in ms or s"
+    if lasting:
+        names = ", ".join(repr(column.name) for column in lasting)
+        warnings.warn(
+            f"{table}: no duration is read, although there is {names}; "
+            "name it by columns={'duration': …}, in ms or s",
+            stacklevel=3,
+        )
 
 
-def _name_people(rows: Sequence[Row], subject: str | None, table: Table) -> None:
+def _name_people(rows: Sequence[Row], subject: str | None, table: str) -> None:
     """Write the name of the person into rows: that of a user, else that of the table, else of the file."""
-    # Exports of one person often have the name in that of the file alone.
-    is_file = bool(table.columns) and "." in table.name
-    file = Path(table.name).stem if is_file else "1"
+    # Exports of one person often have the name in that of the file alone; a data frame has no file.
+    unnamed = Path(table).stem if "." in table else "1"
     for row in rows:
-        row.fields["subject"] = subject if subject is not None else row.fields["subject"] or file
+        stored = row.fields["subject"] or unnamed
+        row.fields["subject"] = stored if subject is None else subject
 
 
 def _viewings(rows: Sequence[Row]) -> list[Row]:

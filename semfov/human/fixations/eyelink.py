@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -65,6 +65,11 @@ class _Trial:
     start: float
     end: float = math.inf
     views: list[_View] = field(default_factory=list)
+
+    def show(self, picture: str, time: float, place: _Place | None) -> None:
+        """Begin the view of a picture, which ends that of the one before."""
+        self.hide(time)
+        self.views.append(_View(picture, time, place=place))
 
     def hide(self, time: float) -> None:
         """End the view of the picture that is on the screen."""
@@ -133,16 +138,14 @@ def read_eyelink(
     check_data(bool(viewed), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials, lines))
 
     screen = _screen(path, lines, size)
+    with_one_eye = [replace(view, fixations=_of_one_eye(view.fixations, eye)) for view in viewed]
+    of_eye = [view for view in with_one_eye if view.fixations]
+    check_data(bool(of_eye), path, f"fixations of the {eye} eye", "those of the other one")
     person = path.stem if subject is None else subject
-    records = []
-    for view in viewed:
-        record = _record(view, screen, person, eye)
-        if record is not None:
-            records.append(record)
-    check_data(bool(records), path, f"fixations of the {eye} eye", "those of the other one")
+    records = [_record(view, screen, person) for view in of_eye]
 
     remarks = [*_lost(lines), *_outside_views(trials, fixations)]
-    of_other_eye = len(viewed) - len(records)
+    of_other_eye = len(viewed) - len(of_eye)
     if of_other_eye:
         remarks.append(f"{of_other_eye} of {len(viewed)} pictures have no fixation of the {eye} eye")
     if remarks:
@@ -163,14 +166,11 @@ def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _
     return left, top, width, height
 
 
-def _record(view: _View, screen: _Place, person: str, eye: str | None) -> Fixations | None:
-    """Make the record of an eye in a view, from the corner of the picture, or of the screen; None without fixations."""
-    fixations = _of_one_eye(view.fixations, eye)
-    if not fixations:
-        return None
+def _record(view: _View, screen: _Place, person: str) -> Fixations:
+    """Make the record of a view, in pixels from the corner of the picture, or of the screen where it has no place."""
     left, top, width, height = view.place or screen
-    points = np.array([(fixation.x - left, fixation.y - top) for fixation in fixations])
-    durations = np.array([fixation.duration for fixation in fixations])
+    points = np.array([(fixation.x - left, fixation.y - top) for fixation in view.fixations])  # (n, 2)
+    durations = np.array([fixation.duration for fixation in view.fixations])  # (n,), ms
     return Fixations(view.picture, person, points, (round(width), round(height)), durations=durations)
 
 
@@ -179,7 +179,9 @@ def _events(path: Path, lines: Sequence[str]) -> tuple[list[_Trial], list[_Fixat
     trials: list[_Trial] = []
     fixations: list[_Fixation] = []
     messages = [message[3] for line in lines if (message := _MESSAGE.match(line))]
-    if any(map(_LOAD.match, messages)) and not any(map(_BEGIN.match, messages)):
+    shows_pictures = any(map(_LOAD.match, messages))
+    has_trials = any(map(_BEGIN.match, messages))
+    if shows_pictures and not has_trials:
         trials.append(_Trial("trial 1", -math.inf))
     for number, line in enumerate(lines, start=1):
         try:
@@ -193,19 +195,27 @@ def _events(path: Path, lines: Sequence[str]) -> tuple[list[_Trial], list[_Fixat
 
 def _read_event(line: str, trials: list[_Trial]) -> _Fixation | None:
     """Add what a line tells to the trials; returns the fixation that it tells, if it has a place in a trial."""
-    words = line.split()
-    kind = words[0] if words else ""
-    if kind == "MSG" and (message := _MESSAGE.match(line)):
+    if message := _MESSAGE.match(line):
         time, delay, text = message.groups()
         _read_message(text, float(time) - float(delay or 0), trials)
-    elif kind == "END" and trials:
+        return None
+    words = line.split()
+    if not trials or not words:
+        return None
+    if words[0] == "END":
         trials[-1].hide(float(words[1]))
-    elif kind == "EFIX" and trials:
-        _, eye, *numbers = words
-        if "." not in numbers[3:5]:  # a place that the tracker has lost
-            start, _, duration, x, y = map(float, numbers[:5])
-            return _Fixation(eye[:1], start, duration, x, y)
+    if words[0] == "EFIX":
+        return _fixation(words)
     return None
+
+
+def _fixation(words: Sequence[str]) -> _Fixation | None:
+    """Read the words of a line `EFIX`; None for a fixation whose place the tracker has lost, and writes as a point."""
+    _, eye, *numbers = words
+    if "." in numbers[3:5]:
+        return None
+    start, _, duration, x, y = map(float, numbers[:5])
+    return _Fixation(eye[:1], start, duration, x, y)
 
 
 def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
@@ -224,9 +234,8 @@ def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
     elif _CLEAR.match(text):
         trial.hide(time)
     elif load := _LOAD.match(text):
-        trial.hide(time)
         picture, place = _loaded(load[1].upper(), load[2])
-        trial.views.append(_View(picture, time, place=place))
+        trial.show(picture, time, place)
     elif variable := _VARIABLE.match(text):
         trial.name = _file_name(variable[1])
 
@@ -241,21 +250,25 @@ def _loaded(mode: str, rest: str) -> tuple[str, _Place | None]:
     Returns:
         The name, and the place.
     """
-    placed = None if mode == "FILL" else _PLACED.match(rest)
-    if placed is None:
+    placed = _PLACED.match(rest)
+    # A name may end in numbers, too, and a picture that fills the screen has no place in its message.
+    if placed is None or mode == "FILL":
         return _file_name(rest), None
     name, *numbers = placed.groups()
-    if numbers[2] is None:
-        return _file_name(name), None
-    x, y, width, height = map(float, numbers)
+    return _file_name(name), None if None in numbers else _place(mode, *map(float, numbers))
+
+
+def _place(mode: str, x: float, y: float, width: float, height: float) -> _Place | None:
+    """Find the place of a picture from the numbers of its message; None where it has no area."""
     if min(width, height) < 1:
-        return _file_name(name), None
+        return None
     if mode == "CENTER":  # x and y are those of the middle
-        return _file_name(name), (x - width / 2, y - height / 2, width, height)
-    return _file_name(name), (x, y, width, height)
+        return x - width / 2, y - height / 2, width, height
+    return x, y, width, height
 
 
 def _file_name(path: str) -> str:
+    """Take the name of a file from a path of Windows or Unix, perhaps in quotes."""
     return path.strip('"').replace("\\", "/").rpartition("/")[2]
 
 
@@ -301,9 +314,9 @@ def _outside_views(trials: Sequence[_Trial], fixations: Sequence[_Fixation]) -> 
     starts = np.sort([fixation.start for fixation in fixations])
     missed = []
     for trial in trials:
-        is_empty = bool(trial.views) and not any(view.fixations for view in trial.views)
         first, end = np.searchsorted(starts, (trial.start, trial.end))
-        if is_empty and end > first:
+        has_fixations = bool(end > first)
+        if has_fixations and trial.views and not any(view.fixations for view in trial.views):
             missed.append(trial)
     if not missed:
         return []

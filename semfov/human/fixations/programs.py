@@ -81,6 +81,11 @@ class Column(NamedTuple):
         return cls(name, key_of(name[: end.start()]), frame, unit)
 
     @property
+    def length(self) -> Units | None:
+        """Unit of a coordinate or side; None for a unit that is not read. Without a unit, pixels."""
+        return LENGTHS.get(self.unit) if self.unit else "pixels"
+
+    @property
     def milliseconds(self) -> float | None:
         """Milliseconds of the unit of a duration; None for a unit that is not read. Without a unit, 1."""
         return TIMES.get(self.unit) if self.unit else 1.0
@@ -110,8 +115,10 @@ class Program(NamedTuple):
         subject: keys of the person's name.
         trial: keys of a trial.
         number: keys of a fixation's number.
-        size: keys of the width and the height of the frame.
-        keep: a column, and how its fields begin in the lines that count.
+        width: keys of the width of the frame.
+        height: keys of its height.
+        filter: keys of the column that tells fixations from other lines.
+        beginnings: how its fields begin in the lines of fixations, in lower case.
         needs: further keys that tell the table from others.
         lacks: keys that it does not have.
     """
@@ -127,8 +134,10 @@ class Program(NamedTuple):
     subject: tuple[str, ...] = ()
     trial: tuple[str, ...] = ()
     number: tuple[str, ...] = ()
-    size: tuple[str, str] | None = None
-    keep: tuple[str, tuple[str, ...]] | None = None
+    width: tuple[str, ...] = ()
+    height: tuple[str, ...] = ()
+    filter: tuple[str, ...] = ()
+    beginnings: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     lacks: tuple[str, ...] = ()
 
@@ -170,7 +179,8 @@ _PRO_LAB = _TOBII._replace(
     name="Tobii Pro Lab",
     picture=("presentedstimulusname", "presentedmedianame", "recordingmedianame"),
     number=("eyemovementtypeindex",),
-    keep=("eyemovementtype", ("fixation",)),
+    filter=("eyemovementtype",),
+    beginnings=("fixation",),
 )
 _CLOUD = Program(
     "Pupil Cloud",
@@ -188,7 +198,8 @@ _BEGAZE = Program(
     picture=("stimulus", "stimulusname"),
     subject=("participant", "participantname", "subject"),
     trial=("trial", "trialname"),
-    keep=("category", ("fixation", "visual intake")),
+    filter=("category",),
+    beginnings=("fixation", "visual intake"),
 )
 
 # From the particular to the general: a table of pictures or surfaces has the columns of a plain one, too.
@@ -198,31 +209,36 @@ PROGRAMS = (
         point=("mappedx", "mappedy"),
         picture=("snapshot",),
         number=("mappedindex",),
-        keep=("mappedtype", ("fixation",)),
+        filter=("mappedtype",),
+        beginnings=("fixation",),
     ),
     _PRO_LAB._replace(
         frames=("mcs",),
-        size=("presentedmediawidth", "presentedmediaheight"),
+        width=("presentedmediawidth",),
+        height=("presentedmediaheight",),
         needs=("presentedmediawidth", "presentedmediaheight"),
     ),
-    _PRO_LAB._replace(frames=("dacs", ""), size=("recordingresolutionwidth", "recordingresolutionheight")),
+    _PRO_LAB._replace(frames=("dacs", ""), width=("recordingresolutionwidth",), height=("recordingresolutionheight",)),
     _TOBII._replace(
         name="Tobii Studio",
         frames=("mcs", ""),
         picture=("medianame",),
         number=("fixationindex",),
-        size=("mediawidth", "mediaheight"),
-        keep=("gazeeventtype", ("fixation",)),
+        width=("mediawidth",),
+        height=("mediaheight",),
+        filter=("gazeeventtype",),
+        beginnings=("fixation",),
         needs=("gazeeventtype",),
     ),
     _PRO_LAB._replace(frames=("mcs",)),
     _CLOUD._replace(
-        keep=("fixationdetectedinreferenceimage", _TRUE),
+        filter=("fixationdetectedinreferenceimage",),
+        beginnings=_TRUE,
         needs=("fixationdetectedinreferenceimage",),
     ),
-    _CLOUD._replace(keep=("fixationdetectedonsurface", _TRUE), needs=("fixationdetectedonsurface",)),
+    _CLOUD._replace(filter=("fixationdetectedonsurface",), beginnings=_TRUE, needs=("fixationdetectedonsurface",)),
     _CLOUD,
-    _PLAYER._replace(number=("fixationid",), keep=("onsurf", _TRUE), needs=("onsurf", "fixationid")),
+    _PLAYER._replace(number=("fixationid",), filter=("onsurf",), beginnings=_TRUE, needs=("onsurf", "fixationid")),
     _PLAYER._replace(number=("id",), needs=("dispersion",), lacks=("onsurf",)),
     Program(
         "PsychoPy",
@@ -241,7 +257,8 @@ PROGRAMS = (
         picture=("medianame", "mediaid"),
         subject=("user", "username"),
         number=("fpogid",),
-        keep=("fpogv", _TRUE),
+        filter=("fpogv",),
+        beginnings=_TRUE,
     ),
     _BEGAZE,
     _BEGAZE._replace(point=("visualintakepositionx", "visualintakepositiony")),  # of glasses
@@ -253,14 +270,16 @@ PROGRAMS = (
         picture=("stimulus",),
         subject=("participant",),
         trial=("trial",),
-        size=("calibrationareawidth", "calibrationareaheight"),
+        width=("calibrationareawidth",),
+        height=("calibrationareaheight",),
         needs=("eventtype",),
     ),
     Program(
         "REMoDNaV",
         ("startx", "starty"),
         time="s",
-        keep=("label", ("fixa",)),
+        filter=("label",),
+        beginnings=("fixa",),
         needs=("onset", "label", "amp"),
     ),
     Program(
@@ -278,7 +297,8 @@ PROGRAMS = (
         picture=("stimulus", "image", "imageid", "textid"),
         subject=("subjectid", "participantid", "subject"),
         trial=("trialid", "trial"),
-        keep=("name", ("fixation",)),
+        filter=("name",),
+        beginnings=("fixation",),
         needs=("onset", "offset"),
     ),
     Program(
@@ -311,7 +331,4 @@ def program_of(columns: Sequence[Column]) -> Program | None:
     Returns:
         The program; None where no program has such columns.
     """
-    for program in PROGRAMS:
-        if program.fits(columns):
-            return program
-    return None
+    return next((program for program in PROGRAMS if program.fits(columns)), None)

@@ -102,35 +102,51 @@ def other_frame_of(fixations: Sequence[Fixations], *, units: bool = True) -> str
     points, sides = _joined(fixations)
     if len(points) < 3:
         return None
-    if units and _are_fractions(points) and sides.min() > 8:
-        return "fractions of the sides (units='fractions')"
-    if _are_from_centre(points, sides):
-        are_degrees = bool((np.abs(points) < _DEGREES * sides.min()).all())
-        degrees = "degrees from the centre (multiply them by the pixels of a degree)"
-        pixels = "pixels from the centre (origin='centre', or 'centre, y up')"
-        return degrees if are_degrees else pixels
+    rules = [_other_origin, _other_order, _smaller_frame]
+    if units:
+        rules.insert(0, _other_unit)
+    # The first rule that applies explains what the later ones would find.
+    frames = (rule(points, sides) for rule in rules)
+    return next((frame for frame in frames if frame is not None), None)
+
+
+def _other_unit(points: _Array, sides: _Array) -> str | None:
+    """Recognise fractions: all points `(n, 2)` in [0, 1], not all at its ends, in frames of more than some pixels."""
+    in_unit_square = ((points >= 0) & (points <= 1)).all()
+    are_whole = (points % 1 == 0).all()
+    if not in_unit_square or are_whole or sides.min() <= 8:
+        return None
+    return "fractions of the sides (units='fractions')"
+
+
+def _other_origin(points: _Array, sides: _Array) -> str | None:
+    """Recognise points on all sides of the origin, no farther from it than a frame around it reaches."""
+    negative = (points < -0.5).mean(0)  # (2,), shares of x and of y
+    in_middle = (np.abs(points) <= sides / 2).all(1).mean()
+    if negative.min() < 0.2 or in_middle <= 0.95:
+        return None
+    if (np.abs(points) < _DEGREES * sides.min()).all():
+        return "degrees from the centre (multiply them by the pixels of a degree)"
+    return "pixels from the centre (origin='centre', or 'centre, y up')"
+
+
+def _other_order(points: _Array, sides: _Array) -> str | None:
+    """Recognise y before x: points that lie inside their frames only with x and y exchanged."""
     inside = 1 - _outside(points, sides).mean()
     inside_if_swapped = 1 - _outside(points[:, ::-1], sides).mean()
     if inside < 0.9 and inside_if_swapped > max(0.98, inside + 0.1):
         return "y before x (swap the two columns)"
-    farthest = points.max(0)
-    in_first_quarter = bool((farthest < 0.5 * sides.min(0)).all())
-    if len(points) >= _MANY and in_first_quarter:
-        corner = " × ".join(f"{side:g}" for side in np.ceil(farthest + 1))
-        return f"fixations of a frame of {corner} or little more (give its size)"
     return None
 
 
-def _are_from_centre(points: _Array, sides: _Array) -> bool:
-    """Tell whether points lie on all sides of the origin, and not farther from it than a frame around it reaches."""
-    negative = (points < -0.5).mean(0)
-    in_middle = (np.abs(points) <= sides / 2).all(1).mean()
-    return bool(negative.min() >= 0.2 and in_middle > 0.95)
-
-
-def _are_fractions(points: _Array) -> bool:
-    """Tell whether all points lie in [0, 1], and not all at its ends."""
-    return bool(((points >= 0) & (points <= 1)).all()) and bool((points % 1 != 0).any())
+def _smaller_frame(points: _Array, sides: _Array) -> str | None:
+    """Recognise many points that all lie in the first quarter of their frames."""
+    farthest = points.max(0)  # (2,)
+    in_first_quarter = bool((farthest < 0.5 * sides.min(0)).all())
+    if len(points) < _MANY or not in_first_quarter:
+        return None
+    corner = " × ".join(f"{side:g}" for side in np.ceil(farthest + 1))
+    return f"fixations of a frame of {corner} or little more (give its size)"
 
 
 def _joined(fixations: Sequence[Fixations]) -> tuple[_Array, _Array]:
@@ -145,9 +161,14 @@ def _outside(points: _Array, sides: _Array) -> NDArray[np.bool_]:
     return np.asarray(~((points >= -0.5) & (points < sides - 0.5)).all(1))
 
 
+def _show_borders(points: _Array, sides: _Array) -> bool:
+    """Tell whether points are many enough, and in one frame, so that their borders tell where the pictures were."""
+    return len(points) >= _ENOUGH and bool((sides == sides[0]).all())
+
+
 def _letterbox(points: _Array, sides: _Array) -> list[str]:
     """Find bars without fixations at two opposite sides of one frame, while the other sides have none."""
-    if len(points) < _ENOUGH or (sides != sides[0]).any():
+    if not _show_borders(points, sides):
         return []
     share = (points + 0.5) / sides
     # Empty shares at the left and the top, and at the right and the bottom; single points may lie in a bar.
@@ -166,12 +187,14 @@ def _letterbox(points: _Array, sides: _Array) -> list[str]:
 
 def _middle(records: Sequence[Fixations], points: _Array, sides: _Array) -> list[str]:
     """Find bars without fixations at all sides of one frame, whatever the picture."""
-    pictures = len({record.picture for record in records})
-    if len(points) < _ENOUGH or pictures < _ENOUGH_PICTURES or (sides != sides[0]).any():
+    pictures = {record.picture for record in records}
+    if len(pictures) < _ENOUGH_PICTURES or not _show_borders(points, sides):
         return []
-    start, end = np.quantile((points + 0.5) / sides, [0.01, 0.99], axis=0)
+    start, end = np.quantile((points + 0.5) / sides, [0.01, 0.99], axis=0)  # (2,) both, shares of the sides
     filled = end - start
-    if (filled > _MOST_FILLED).any() or (np.abs(start + end - 1) > 2 * _LEVEL).any():
+    is_centred = np.abs(start + end - 1) <= 2 * _LEVEL
+    is_part = filled <= _MOST_FILLED
+    if not (is_part & is_centred).all():
         return []
     width, height = (f"{100 * part:.0f} %" for part in filled)
     return [
@@ -184,12 +207,10 @@ def _own_size(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]
     """Find fixations that keep to their pictures' own size in frames that would hold them much larger."""
     enlarging = [record for record in records if _would_enlarge(record, sizes)]
     count = sum(map(len, enlarging))
-    if count < _ENOUGH or count < 0.5 * sum(map(len, records)):
+    if count < max(_ENOUGH, 0.5 * sum(map(len, records))):
         return []
-    within = 0
-    for record in enlarging:
-        at_own_size = record.in_picture(sizes[record.picture], scale=1)
-        within += int(at_own_size.inside.sum())
+    at_own_size = [record.in_picture(sizes[record.picture], scale=1) for record in enlarging]
+    within = sum(int(record.inside.sum()) for record in at_own_size)
     if within < 0.99 * count:
         return []
     first = enlarging[0]
@@ -258,19 +279,21 @@ def _alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 def _of_repeats(records: Sequence[Fixations], points: _Array) -> list[str]:
     """Say what repeats: points, records, one place, and scanpaths of a single fixation."""
-    lines = []
+    return [
+        *_repeated_points(records),
+        *_repeated_records(records),
+        *_at_one_place(records, points),
+        *_single_fixations(records),
+    ]
+
+
+def _repeated_points(records: Sequence[Fixations]) -> list[str]:
+    """Find many fixations at the point of the one before."""
     repeats = np.concatenate([_repeats_point(record.points) for record in records])
-    share = repeats.mean() if len(repeats) >= _MANY else 0.0
-    if share > _MOST_REPEATED:
-        lines.append(
-            f"{100 * share:.0f} % of the fixations repeat the point before (are these samples of the tracker?)"
-        )
-    lines += _twice(records)
-    lines += _at_one_place(records, points)
-    single = sum(len(record) == 1 for record in records)
-    if len(records) >= _MANY and single > 0.5 * len(records):
-        lines.append(f"{single} of {len(records)} scanpaths have one fixation (is a column a trial that is none?)")
-    return lines
+    if len(repeats) < _MANY or repeats.mean() <= _MOST_REPEATED:
+        return []
+    percent = f"{100 * repeats.mean():.0f} %"
+    return [f"{percent} of the fixations repeat the point before (are these samples of the tracker?)"]
 
 
 def _repeats_point(points: _Array) -> NDArray[np.bool_]:
@@ -278,7 +301,15 @@ def _repeats_point(points: _Array) -> NDArray[np.bool_]:
     return np.asarray((points[1:] == points[:-1]).all(1))
 
 
-def _twice(records: Sequence[Fixations]) -> list[str]:
+def _single_fixations(records: Sequence[Fixations]) -> list[str]:
+    """Find many scanpaths of a single fixation."""
+    single = sum(len(record) == 1 for record in records)
+    if len(records) < _MANY or single <= 0.5 * len(records):
+        return []
+    return [f"{single} of {len(records)} scanpaths have one fixation (is a column a trial that is none?)"]
+
+
+def _repeated_records(records: Sequence[Fixations]) -> list[str]:
     """Find records of more than one fixation that occur more than once."""
     counts = Counter((record.picture, record.subject, record.target, record.points.tobytes()) for record in records)
     one_point = np.zeros((1, 2)).nbytes
@@ -307,37 +338,44 @@ def _of_durations(records: Sequence[Fixations]) -> list[str]:
     if not durations:
         return []
     values = np.concatenate(durations)
-    other_unit = _other_unit_of(values)
-    if other_unit is not None:
-        return [other_unit]
-    lines = []
-    median = float(np.median(values))
-    least = values.min()
-    most = values.max()
-    share_short = (values < _SHORT).mean()
-    if len(values) >= _MANY and least == most:
-        lines.append(f"all durations are {least:g} ms (are these samples of the tracker?)")
-    elif median < _SHORT:
-        lines.append(f"durations of {median:g} ms in the median are those of samples, not of fixations")
-    elif share_short > _MOST_SHORT:
-        lines.append(f"{100 * share_short:.0f} % of the fixations take less than {_SHORT:g} ms")
-    count_long = int((values > _LONG).sum())
-    if count_long:
-        lines.append(f"{count_long} of {len(values)} fixations take more than {_LONG / 1000:g} s, up to {most:g} ms")
-    return lines
+    # In another unit, all of them would also be too short, or too long.
+    return _other_time_unit(values) or [*_short_durations(values), *_long_durations(values)]
 
 
-def _other_unit_of(durations: _Array) -> str | None:
-    """Say which unit durations look like that are no milliseconds; None where they look like these."""
+def _other_time_unit(durations: _Array) -> list[str]:
+    """Recognise durations `(n,)` that are no milliseconds."""
     median = float(np.median(durations))
     least = durations.min()
     most = durations.max()
-    have_fractions = bool((durations % 1 != 0).any())
-    if median < 2 and most < 20 and have_fractions:
-        return f"durations from {least:g} to {most:g} look like seconds (multiply them by 1000)"
+    are_whole = (durations % 1 == 0).all()
+    if median < 2 and most < 20 and not are_whole:
+        return [f"durations from {least:g} to {most:g} look like seconds (multiply them by 1000)"]
     if median > 20_000:
-        return f"durations of {median:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"
-    return None
+        return [f"durations of {median:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"]
+    return []
+
+
+def _short_durations(durations: _Array) -> list[str]:
+    """Say of durations `(n,)` in ms that they are those of samples, or that many are short."""
+    least = durations.min()
+    median = float(np.median(durations))
+    share_short = (durations < _SHORT).mean()
+    if len(durations) >= _MANY and least == durations.max():
+        return [f"all durations are {least:g} ms (are these samples of the tracker?)"]
+    if median < _SHORT:
+        return [f"durations of {median:g} ms in the median are those of samples, not of fixations"]
+    if share_short > _MOST_SHORT:
+        return [f"{100 * share_short:.0f} % of the fixations take less than {_SHORT:g} ms"]
+    return []
+
+
+def _long_durations(durations: _Array) -> list[str]:
+    """Say how many durations `(n,)` in ms are longer than fixations last."""
+    count = int((durations > _LONG).sum())
+    if count == 0:
+        return []
+    longest = durations.max()
+    return [f"{count} of {len(durations)} fixations take more than {_LONG / 1000:g} s, up to {longest:g} ms"]
 
 
 def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], picture: str | None = None) -> None:

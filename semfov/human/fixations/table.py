@@ -5,6 +5,7 @@ import io
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import repeat
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple, get_args
@@ -16,18 +17,23 @@ from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, InputError, check, check_data, lookup
 from semfov.human.fixations.columns import LOST, DataFrame, Row, Table, table_of
 from semfov.human.fixations.encodings import warn_of_letters
-from semfov.human.fixations.programs import LENGTHS, Column, Origin, Units
+from semfov.human.fixations.programs import Column, Origin, Units
 from semfov.human.fixations.suspicions import warn_of_frames
 from semfov.io.files import write_text
 
 _COLUMNS = ("picture", "subject", "x", "y")
 _SIZE = ("width", "height")
 _EDGES = ("x1", "y1", "x2", "y2")
-_MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found", "trial")
+_MORE = ("target", "duration", *_EDGES, "found", "trial")
 """Further columns that a table may have; their fields may be empty."""
 
+_FIELDS = (*_COLUMNS, *_SIZE, *_MORE)
+_SCANPATH = ("picture", "subject", "target", "trial")  # fields that tell scanpaths apart
+
 _FOUND = {"true": True, "false": False, "1": True, "0": False, "": None}
-_UPWARDS = ("bottom left", "centre, y up")  # origins from which y points up
+
+_ARGUMENTS = {"picture": "picture=", "subject": "subject=", **dict.fromkeys(_SIZE, "size=")}
+"""Arguments that stand for a column: of a table of one picture, of one person, or of frames of one size."""
 
 Size = tuple[int, int] | Mapping[str, tuple[int, int]]
 """`(width, height)` of all frames, or of each by the name of its picture."""
@@ -39,6 +45,10 @@ class FrameError(DataError):
 
 class PictureError(DataError):
     """A table does not name the picture, which `picture` may give."""
+
+
+_ERRORS: dict[str, type[DataError]] = {"picture": PictureError, **dict.fromkeys(_SIZE, FrameError)}
+"""Errors for columns that are missing, by which a caller knows what to give; the first counts."""
 
 
 def read_table(
@@ -97,14 +107,12 @@ def read_table(
     if units is not None:
         lookup(units, get_args(Units), "unit")
     lookup(origin, get_args(Origin), "origin")
-    user_columns = named_columns(columns, (*_COLUMNS, *_SIZE, *_MORE))
+    user_columns = named_columns(columns, _FIELDS)
     table = table_of(source)
     names = _column_names(table, user_columns)
-    given = {name for name, value in (("picture", picture), ("subject", subject)) if value is not None}
-    needed = [name for name in _COLUMNS if name not in given]
-    if size is None:
-        needed += _SIZE
-    _check_columns(table, [names[field] for field in needed], needed)
+    arguments = {"picture": picture, "subject": subject, "width": size, "height": size}
+    needed = [field for field in (*_COLUMNS, *_SIZE) if arguments.get(field) is None]
+    _check_columns(table, names, needed)
     table.check_different(names.values())
     if size is None:
         _check_sides(table.name, names)
@@ -112,14 +120,7 @@ def read_table(
         units = _stated_units(table.name, names)
     milliseconds = _stated_milliseconds(table.name, names["duration"])
     _warn_of_durations(table, names["duration"])
-    rows = []
-    for row in table.rows:
-        fields = {field: row.fields.get(names[field], "") for field in (*_COLUMNS, *_SIZE, *_MORE)}
-        for field in ("duration", *_EDGES):
-            if fields[field].lower() in LOST:
-                fields[field] = ""
-        fields["duration"] = scaled(fields["duration"], milliseconds)
-        rows.append(row._replace(fields=fields))
+    rows = [row._replace(fields=_fields_of(row, names, milliseconds)) for row in table.rows]
     rows = _with_place(table.name, rows)
     if picture is not None:
         name_pictures(rows, picture, table.name)
@@ -130,22 +131,38 @@ def read_table(
     return warn_of_letters(table.name, table.encoding, records)
 
 
+def _fields_of(row: Row, names: Mapping[str, str], milliseconds: float) -> dict[str, str]:
+    """Take the fields of a row by our names.
+
+    Args:
+        row: of the table.
+        names: of its columns, by ours.
+        milliseconds: of the unit of its durations.
+
+    Returns:
+        All fields of `read_table`; those that the table does not have are empty, and durations are in ms.
+    """
+    fields = {field: row.fields.get(column, "") for field, column in names.items()}
+    for field in ("duration", *_EDGES):
+        if fields[field].lower() in LOST:
+            fields[field] = ""
+    fields["duration"] = scaled(fields["duration"], milliseconds)
+    return fields
+
+
 def _column_names(table: Table, named: Mapping[str, str]) -> dict[str, str]:
     """Find the names of a table's columns by ours: those that a user gives, else ours, in any case and with a unit."""
     # Reversed, so that the first of several such columns counts.
     by_key = {column.key: column for column in map(Column.of, reversed(table.columns))}
-    names = {}
-    for name in (*_COLUMNS, *_SIZE, *_MORE):
-        names[name] = name
+    names = dict(zip(_FIELDS, _FIELDS, strict=True))
+    for name in _FIELDS:
         similar = by_key.get(name)
-        if name in named:
-            names[name] = named[name]
-        elif similar is not None and name not in table.columns:
-            # A width in other units than pixels is not the one that is meant.
-            is_meant = name not in _SIZE or _may_be_pixels(similar)
-            if is_meant:
-                names[name] = similar.name
-    return names
+        if similar is None or name in table.columns:
+            continue
+        # A width in other units than pixels is not the one that is meant.
+        if name not in _SIZE or similar.length == "pixels":
+            names[name] = similar.name
+    return {**names, **named}
 
 
 def _warn_of_durations(table: Table, name: str) -> None:
@@ -159,15 +176,10 @@ def _warn_of_durations(table: Table, name: str) -> None:
         )
 
 
-def _may_be_pixels(column: Column) -> bool:
-    """Tell whether the name of a column has the unit of pixels, or none."""
-    return not column.unit or LENGTHS.get(column.unit) == "pixels"
-
-
 def _check_sides(table: str, names: Mapping[str, str]) -> None:
     """Raise `FrameError` for sides of frames whose columns have another unit than pixels in their names."""
     width, height = (Column.of(names[name]) for name in _SIZE)
-    if not (_may_be_pixels(width) and _may_be_pixels(height)):
+    if {width.length, height.length} != {"pixels"}:
         raise FrameError(
             f"{table}: expected width and height in px, got the columns {width.name!r} and {height.name!r}; give size="
         )
@@ -185,14 +197,13 @@ def _stated_units(table: str, names: Mapping[str, str]) -> Units:
     """
     x = Column.of(names["x"])
     y = Column.of(names["y"])
-    is_read = not x.unit or x.unit in LENGTHS
-    check_data(x.unit == y.unit and is_read, table, "x and y in px or norm", f"the columns {x.name!r} and {y.name!r}")
-    units = LENGTHS.get(x.unit, "pixels")
-    for name in _EDGES:
-        edge = Column.of(names[name])
-        is_same = not edge.unit or LENGTHS.get(edge.unit) == units
-        check_data(is_same, table, f"a box in {units}, as {x.name!r}", f"the column {edge.name!r}")
-    return units
+    if x.length is None or x.unit != y.unit:
+        raise DataError(f"{table}: expected x and y in px or norm, got the columns {x.name!r} and {y.name!r}")
+    for edge in (Column.of(names[name]) for name in _EDGES):
+        # A box without a unit is in that of the points.
+        is_in_units = edge.unit == "" or edge.length == x.length
+        check_data(is_in_units, table, f"a box in {x.length}, as {x.name!r}", f"the column {edge.name!r}")
+    return x.length
 
 
 def _stated_milliseconds(table: str, name: str) -> float:
@@ -222,27 +233,23 @@ def _with_place(table: str, rows: Sequence[Row]) -> list[Row]:
     return with_place or [*rows]
 
 
-def _check_columns(table: Table, columns: Sequence[str], needed: Sequence[str]) -> None:
-    """Raise `DataError` for a table that lacks some of the needed columns; `columns` has its names for them."""
-    missing = [name for name, column in zip(needed, columns, strict=True) if column not in table.columns]
+def _check_columns(table: Table, names: Mapping[str, str], needed: Sequence[str]) -> None:
+    """Raise `DataError` for a table that lacks some of the needed columns; `names` has its names by ours."""
+    missing = [field for field in needed if names[field] not in table.columns]
     if not missing:
         return
     among = ", ".join(map(repr, table.columns))[:300]
-    text = (
+    remedies = ["name them by columns={…}"]
+    # A side that is missing and another one have the same remedy.
+    arguments = dict.fromkeys(_ARGUMENTS[field] for field in missing if field in _ARGUMENTS)
+    if arguments:
+        remedies.append(f"give {', '.join(arguments)}")
+    errors = [kind for field, kind in _ERRORS.items() if field in missing]
+    error = errors[0] if errors else DataError
+    raise error(
         f"{table.name}: expected the columns {', '.join(needed)}, got none named "
-        f"{', '.join(column for column in columns if column not in table.columns)} among {among}; "
-        "name them by columns={…}"
+        f"{', '.join(names[field] for field in missing)} among {among}; {' or '.join(remedies)}"
     )
-    has_frames = not {*missing} & {*_SIZE}
-    # A table of one picture, of one person, or of frames of one size need not have these columns.
-    given = [f"{name}=" for name in ("picture", "subject") if name in missing]
-    if not has_frames:
-        given.append("size=")
-    if given:
-        text += f" or give {', '.join(given)}"
-    if "picture" in missing:
-        raise PictureError(text)
-    raise DataError(text) if has_frames else FrameError(text)
 
 
 def name_pictures(rows: Sequence[Row], picture: str, table: str) -> None:
@@ -255,6 +262,21 @@ def name_pictures(rows: Sequence[Row], picture: str, table: str) -> None:
         row.fields["picture"] = picture if row.fields["picture"] or not names else ""
 
 
+class _Axes(NamedTuple):
+    """An origin, `(x, y)` in shares of the sides from the top left corner, and whether y points down (1) or up (-1)."""
+
+    corner: tuple[float, float]
+    y_sign: int
+
+
+_AXES: dict[Origin, _Axes] = {
+    "top left": _Axes((0.0, 0.0), 1),
+    "bottom left": _Axes((0.0, 1.0), -1),
+    "centre": _Axes((0.5, 0.5), 1),
+    "centre, y up": _Axes((0.5, 0.5), -1),
+}
+
+
 class Coordinates(NamedTuple):
     """In which unit, and from where, a table gives points and boxes."""
 
@@ -265,16 +287,17 @@ class Coordinates(NamedTuple):
         """Convert points `(n, 2)` to pixels of a frame `(width, height)`, whose centres are at integers."""
         if self == ("pixels", "top left"):
             return points
-        # Pixels that are counted from a corner have their centres at integers.
-        is_centred = self == ("pixels", "bottom left")
-        return self._from_corner(points + 0.5 if is_centred else points, frame) - 0.5
+        if self == ("pixels", "bottom left"):
+            # Pixels that are counted from a corner have their centres at integers, half a pixel from their edges.
+            points = points + 0.5
+        return self._from_corner(points, frame) - 0.5
 
     def box(self, edges: Sequence[float], frame: tuple[int, int]) -> tuple[float, float, float, float]:
         """Convert the edges of a box, x1, y1, x2 and y2, to those of pixels of a frame `(width, height)`."""
         corners = np.array(edges, dtype=np.float64).reshape(2, 2)
         if self != ("pixels", "top left"):
             corners = self._from_corner(corners, frame)
-        if self.origin in _UPWARDS:
+        if _AXES[self.origin].y_sign < 0:
             corners[:, 1] = corners[::-1, 1]  # y1 is the upper edge
         x1, y1, x2, y2 = corners.flatten().tolist()
         return x1, y1, x2, y2
@@ -282,14 +305,9 @@ class Coordinates(NamedTuple):
     def _from_corner(self, places: NDArray[np.float64], frame: tuple[int, int]) -> NDArray[np.float64]:
         """Convert places `(n, 2)` to pixels from the top left corner of a frame, where 0 is its edge."""
         sides = np.array(frame, dtype=np.float64)
-        places = places * (sides if self.units == "fractions" else 1.0)
-        if self.origin in _UPWARDS:
-            places[:, 1] *= -1
-        if self.origin == "bottom left":
-            places[:, 1] += sides[1]
-        elif self.origin != "top left":
-            places += sides / 2
-        return places
+        axes = _AXES[self.origin]
+        unit = sides if self.units == "fractions" else np.ones(2)
+        return sides * axes.corner + unit * (1, axes.y_sign) * places
 
 
 def records_of(table: str, rows: Sequence[Row], size: Size | None, coordinates: Coordinates) -> list[Fixations]:
@@ -311,9 +329,10 @@ def records_of(table: str, rows: Sequence[Row], size: Size | None, coordinates: 
     previous = None
     for row in rows:
         fields = row.fields
-        scanpath = tuple(fields[name] for name in ("picture", "subject", "target", "trial"))
+        scanpath = tuple(fields[name] for name in _SCANPATH)
+        begins_again = scanpath in groups and scanpath != previous
         # Without a trial, two viewings of a picture by one person would be taken for one.
-        if scanpath in groups and scanpath != previous and not fields["trial"]:
+        if begins_again and not fields["trial"]:
             raise DataError(
                 f"{row}: expected the lines of a scanpath to follow each other, got those of "
                 f"{fields['subject']!r} in {fields['picture']!r} again; sort them, or add a column `trial` that tells "
@@ -338,10 +357,11 @@ def named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> di
     Raises:
         InputError: it is no such mapping, or one of our names is not known.
     """
+    if columns is None:
+        return {}
     are_names = isinstance(columns, Mapping) and all(isinstance(name, str) for name in columns.values())
-    expected = "names of the source by ours, such as {'x': 'FPOGX'}"
-    check(columns is None or are_names, "columns", expected, columns)
-    return {lookup(ours, known, "column"): theirs for ours, theirs in (columns or {}).items()}
+    check(are_names, "columns", "names of the source by ours, such as {'x': 'FPOGX'}", columns)
+    return {lookup(ours, known, "column"): theirs for ours, theirs in columns.items()}
 
 
 def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> None:
@@ -360,7 +380,7 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
     """
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow([*_COLUMNS, *_SIZE, *_MORE])
+    rows.writerow(_FIELDS)
     viewings: Counter[tuple[str, str, str | None]] = Counter()
     for record in fixations:
         # A person may see a picture more than once: the number of the viewing tells the scanpaths apart.
@@ -372,12 +392,14 @@ def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> No
 
 def _rows_of(record: Fixations, viewing: int) -> Iterator[list[object]]:
     """Yield the cells of each fixation of a record, the first, second or later viewing; what is not known is empty."""
-    durations = [""] * len(record) if record.durations is None else record.durations.tolist()
-    box = [""] * 4 if record.box is None else record.box
-    found = "" if record.found is None else str(record.found).lower()
+    # The writer of CSV makes an empty cell of None.
+    durations: Iterable[float | None] = repeat(None, len(record))
+    if record.durations is not None:
+        durations = record.durations.tolist()
+    box = record.box or (None,) * len(_EDGES)
+    found = {True: "true", False: "false", None: None}[record.found]
     for (x, y), duration in zip(record.points.tolist(), durations, strict=True):
-        person = [record.picture, record.subject]
-        yield [*person, x, y, *record.size, record.target or "", duration, *box, found, viewing]
+        yield [record.picture, record.subject, x, y, *record.size, record.target, duration, *box, found, viewing]
 
 
 def _record(rows: Sequence[Row], size: Size | None, coordinates: Coordinates) -> Fixations:
@@ -385,8 +407,9 @@ def _record(rows: Sequence[Row], size: Size | None, coordinates: Coordinates) ->
     first = rows[0]
     fields = first.fields
     check_data(fields["picture"] != "", f"{first}, picture", "the name of a picture", "nothing")
-    for name in (*(() if size is not None else _SIZE), *_EDGES, "found"):
-        _check_same(rows, name)
+    if size is None:
+        _check_same(rows, _SIZE)
+    _check_same(rows, (*_EDGES, "found"))
     frame = _frame(first, size)
     points = np.array([[row.number("x"), row.number("y")] for row in rows])
     durations = _durations(rows)
@@ -408,13 +431,15 @@ def _record(rows: Sequence[Row], size: Size | None, coordinates: Coordinates) ->
         raise DataError(f"{first}, {error}") from None
 
 
-def _check_same(rows: Sequence[Row], name: str) -> None:
-    """Raise `DataError` unless a field is the same in all rows of a scanpath."""
+def _check_same(rows: Sequence[Row], names: Iterable[str]) -> None:
+    """Raise `DataError` unless these fields are the same in all rows of a scanpath."""
     first = rows[0]
-    for row in rows:
-        if row.fields[name] != first.fields[name]:
-            expected = f"{first.fields[name]!r}, as in {first.place}"
-            raise DataError(f"{row}, {name}: expected {expected}, got {row.fields[name]!r}")
+    for name in names:
+        text = first.fields[name]
+        for row in rows:
+            if row.fields[name] != text:
+                expected = f"{text!r}, as in {first.place}"
+                raise DataError(f"{row}, {name}: expected {expected}, got {row.fields[name]!r}")
 
 
 def _durations(rows: Sequence[Row]) -> NDArray[np.float64] | None:
@@ -448,6 +473,7 @@ def _frame(row: Row, size: Size | None) -> tuple[int, int]:
     else:
         check(isinstance(size, tuple | list | np.ndarray), "size", "(width, height) in pixels", size)
         sides = [*size]
-    are_pixels = len(sides) == 2 and all(side > 0 and float(side).is_integer() for side in sides)
+    are_pixels = len(sides) == 2 and min(sides) > 0 and all(float(side).is_integer() for side in sides)
     check_data(are_pixels, f"{row}, size", "a width and a height in whole pixels", sides)
-    return int(sides[0]), int(sides[1])
+    width, height = map(int, sides)
+    return width, height
