@@ -47,9 +47,11 @@ class Annotations:
 
     def size(self, image: Id) -> tuple[int, int] | None:
         """Tell `(width, height)` of an image; None if the file does not say."""
-        width = self.images[image].get("width")
-        height = self.images[image].get("height")
-        return None if width is None or height is None else (int(width), int(height))
+        sides = [self.images[image].get(side) for side in ("width", "height")]
+        if None in sides:
+            return None
+        width, height = map(int, sides)
+        return width, height
 
 
 def read_annotations(path: str | PathLike[str]) -> Annotations:
@@ -195,19 +197,23 @@ def warn_of_form(boxes: torch.Tensor, limits: torch.Tensor, path: object, *, sta
         path: the file, for the message.
         stacklevel: as for `warnings.warn`.
     """
-    if not len(boxes):
-        return
-    first = boxes[:, :2]
-    last = boxes[:, 2:]
-    size = limits[:, 2:]
-    are_ordered = (last > first) & (last <= size + 1)
-    leaves_picture = (first + last > size + 1).any(-1)
+    form = _other_form(boxes, limits) if len(boxes) else None
+    if form is not None:
+        text = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {form}"
+        warnings.warn(text, stacklevel=stacklevel)
+
+
+def _other_form(boxes: torch.Tensor, limits: torch.Tensor) -> str | None:
+    """Say what boxes look like that are no `[x, y, width, height]` in pixels; arguments as for `warn_of_form`."""
     # A picture of one or two pixels may have such boxes in pixels.
     if float(boxes.max()) <= 1 and float(limits.min()) > 2:
-        form = "fractions of the picture"
-    elif bool(are_ordered.all()) and float(leaves_picture.double().mean()) >= _BEYOND:
-        form = "corners [x1, y1, x2, y2]"
-    else:
-        return
-    text = f"{path}: bbox is [x, y, width, height] in pixels, and these look like {form}"
-    warnings.warn(text, stacklevel=stacklevel)
+        return "fractions of the picture"
+    first = boxes[:, :2]  # x and y
+    last = boxes[:, 2:]  # width and height, or the lower right corner
+    size = limits[:, 2:]
+    are_corners = bool(((last > first) & (last <= size + 1)).all())
+    leaves_picture = (first + last > size + 1).any(-1)  # (N,)
+    # A few boxes leave their pictures in good files, too.
+    if are_corners and float(leaves_picture.double().mean()) >= _BEYOND:
+        return "corners [x1, y1, x2, y2]"
+    return None

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches
+from itertools import chain
 from numbers import Integral
 
 from torch import Tensor
@@ -107,6 +108,9 @@ _DARKNET = {new.replace(" ", ""): old for old, new in _ALIASES.items()}
 _MOST_NAMED = 12  # largest number of classes that a message names
 
 _UNCHANGED = ("sheep", "skis", "scissors", "broccoli")
+_PLURALS = (("(s|x|z|ch|sh)", r"\1es"), ("([^aeiou])y", r"\1ies"), ("ife", "ives"))
+"""Ends of words, and how their plurals end; of two, the first counts."""
+
 _IRREGULAR = {"person": "people", "mouse": "mice", "skis": "ski", "scissors": "scissor"}
 
 
@@ -151,11 +155,10 @@ def plural(name: str) -> str:
         return name
     if word in ("person", "mouse"):
         return name.removesuffix(word) + _IRREGULAR[word]
-    if re.search("(s|x|z|ch|sh)$", word):
-        return f"{name}es"
-    if re.search("[^aeiou]y$", word):
-        return f"{name[:-1]}ies"
-    return f"{name[:-2]}ves" if word.endswith("ife") else f"{name}s"
+    for ending, replacement in _PLURALS:
+        if re.search(f"{ending}$", word):
+            return re.sub(f"{ending}$", replacement, name)
+    return f"{name}s"
 
 
 def class_indices(classes: Sequence[str]) -> dict[str, int]:
@@ -189,18 +192,24 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         return _checked_index(name, len(classes), argument)
     if name in classes:
         return list(classes).index(name) + 1
-    wanted = _plain_key(name)
-    keys = [_plain_key(known) for known in classes]
-    matches = [place for place, key in enumerate(keys) if wanted == key]
-    # A name in another number is looked for only where none has this spelling: `glass` is no plural of `glas`.
-    if not matches:
-        matches = [place for place, key in enumerate(keys) if wanted in _inflections(key)]
+    matches = _matches(name, classes)
     if len(matches) == 1:
         return matches[0] + 1
-    if not matches:
-        matches = [keys.index(key) for key in _similar_keys(wanted, keys)]
-    suggestions = [classes[place] for place in matches]
+    suggestions = [classes[place] for place in matches] or _similar_classes(name, classes)
     raise InputError(_unknown(argument, name, suggestions, classes))
+
+
+def _matches(name: str, classes: Sequence[str]) -> list[int]:
+    """Find the places of the classes that a name spells, from 0: in the same number, else in the other one.
+
+    >>> _matches("wine_glasses", ("cup", "wine glass"))
+    [1]
+    """
+    wanted = _plain_key(name)
+    keys = [_plain_key(class_name) for class_name in classes]
+    # A name in another number is looked for only where none has this spelling: `glass` is no plural of `glas`.
+    spelled = [place for place, key in enumerate(keys) if wanted == key]
+    return spelled or [place for place, key in enumerate(keys) if wanted in _inflections(key)]
 
 
 def _checked_index(value: object, count: int, argument: str) -> int:
@@ -219,18 +228,18 @@ def _inflections(key: str) -> set[str]:
     return forms
 
 
-def _similar_keys(wanted: str, keys: Sequence[str]) -> list[str]:
+def _similar_classes(name: str, classes: Sequence[str]) -> list[str]:
     """Find the classes that an unknown name may mean: those with it as a synonym, and those of a similar spelling."""
+    wanted = _plain_key(name)
+    by_key: dict[str, str] = {}
+    for class_name in classes:
+        by_key.setdefault(_plain_key(class_name), class_name)  # the first of two in one spelling
     singular = [word for word in _SYNONYMS if wanted in _other_numbers(word)]
-    meant = []
-    for word in (wanted, *singular):
-        for name in _SYNONYMS.get(word, ()):
-            key = _plain_key(name)
-            if key in keys:
-                meant.append(key)
+    names = chain.from_iterable(_SYNONYMS.get(word, ()) for word in (wanted, *singular))
+    meant = [key for key in map(_plain_key, names) if key in by_key]
     # A synonym says more than a similar spelling, which then has to be closer.
-    similar = get_close_matches(wanted, keys, n=3, cutoff=0.8 if meant else 0.6)
-    return [*meant, *similar]
+    similar = get_close_matches(wanted, by_key, n=3, cutoff=0.8 if meant else 0.6)
+    return [by_key[key] for key in (*meant, *similar)]
 
 
 def class_numbers(

@@ -70,10 +70,13 @@ class Description:
         if self.colours is not None:
             return [*self.colours]
         without_alpha = self.count - (self.alpha is not None)
-        numbers = [1, 2, 3] if without_alpha >= 3 else [1]
+        numbers = [1]
+        words = "1 is shown as grey"
+        if without_alpha >= 3:
+            numbers = [1, 2, 3]
+            words = "1, 2 and 3 are shown as red, green and blue"
         # One band is grey and three are colours; of other numbers nobody knows.
         if without_alpha not in (1, 3):
-            words = "1 is shown as grey" if len(numbers) == 1 else "1, 2 and 3 are shown as red, green and blue"
             text = f"image {self.path}: of {self.count} bands without names {words}; choose by bands="
             warnings.warn(text, stacklevel=2)
         return numbers
@@ -95,17 +98,17 @@ class Description:
         self, white: White | None, read: Callable[[Box], Values], nodata: float | None
     ) -> tuple[float, float] | None:
         """Choose the values that are black and white; None for those of 8 or 16 bits."""
-        if white is None:
-            if self.bits is None or self.bits == 8:
-                return None
-            largest = 2**self.bits - 1
-            if self.bits > 8:
-                self._warn_of_range(read, largest)
-            return None if self.bits == 16 else (0.0, float(largest))
         if isinstance(white, str):
             values = np.concatenate([read(box).ravel() for box in self._sample_boxes()])
             return black_and_white(white, values, nodata)
-        return stated_limits(white)
+        if white is not None:
+            return stated_limits(white)
+        if self.bits in (None, 8):
+            return None
+        largest = 2**self.bits - 1
+        if self.bits > 8:
+            self._warn_of_range(read, largest)
+        return None if self.bits == 16 else (0.0, float(largest))
 
     def _warn_of_range(self, read: Callable[[Box], Values], largest: int) -> None:
         """Warn of values that take little of the range up to the `largest`."""

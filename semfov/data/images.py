@@ -81,7 +81,8 @@ def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: 
         sixteen_bits = deep or image.mode in SIXTEEN_BITS
         largest = _largest_grey(image)
         if not deep:
-            pixels = colours = _pixels(image, name, upright=oriented, white=white)
+            pixels = _pixels(image, name, upright=oriented, white=white)
+            colours = pixels
     if deep:
         pixels, colours = _deep_pixels(path, upright=oriented, white=white)
     # The warning is given outside the silence of the decoders.
@@ -316,9 +317,8 @@ def check_tile(size: int, stored: int, name: str) -> None:
     is_larger = stored > 2 * size + 2**16
     # A small tile may be blank, which takes next to nothing.
     is_smaller = 0 < stored * _MOST_A_BYTE < size and size > 3 * _SMALL
-    in_proportion = not is_larger and not is_smaller
     got = f"one that is stored in {stored:,}, out of proportion; replace it"
-    check_data(in_proportion, name, f"tiles of {size:,} bytes", got)
+    check_data(not (is_larger or is_smaller), name, f"tiles of {size:,} bytes", got)
 
 
 def check_area(size: tuple[int, int], name: str) -> None:
@@ -360,40 +360,48 @@ def _loaded(image: "Image", *, upright: bool) -> "Image":
     stored = _orientation(image)
     image.load()
     remaining = _orientation(image)  # Pillow turns some pictures when it decodes them
+    orientation = _UPRIGHT
     if upright:
         orientation = remaining
     elif remaining != stored:
         orientation = _INVERSE.get(stored, stored)
-    else:
-        orientation = _UPRIGHT
     return image if orientation == _UPRIGHT else image.transpose(Transpose[_MOVES[orientation]])
 
 
 def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) -> NDArray[np.float32]:
     """Decode an image to pixels `(H, W, 3)` in [0, 1], upright or as stored."""
-    sixteen_bits = image.mode in SIXTEEN_BITS
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
-    is_inverted = sixteen_bits and TiffTags.of_image(image).photometric == WHITE_IS_ZERO
+    is_inverted = image.mode in SIXTEEN_BITS and TiffTags.of_image(image).photometric == WHITE_IS_ZERO
     largest = _largest_grey(image)
     image = _loaded(image, upright=upright)
-    is_grey = image.mode in SIXTEEN_BITS or image.mode == "F"
-    if not is_grey:
-        image = _over_white(image).convert("RGB")
-    values = np.asarray(image)
-    if white is not None:
-        pixels = between(values, black_and_white(white, values))
-    elif is_grey:
-        pixels = _grey_pixels(values, 1 if image.mode == "F" else largest, name)
+    if image.mode == "F":
+        pixels = _grey_pixels(image, 1, name, white)
+    elif image.mode in SIXTEEN_BITS:
+        pixels = _grey_pixels(image, largest, name, white)
     else:
-        pixels = values.astype(np.float32) / np.float32(255)
-    if is_grey:
-        pixels = np.repeat(pixels[..., None], 3, axis=-1)
-    if is_grey and "transparency" in image.info:
-        pixels = _without(pixels, values[..., None] == image.info["transparency"])
+        pixels = _colour_pixels(image, white)
     return 1 - pixels if is_inverted else pixels
 
 
-def _grey_pixels(values: Values, most: int, name: str) -> NDArray[np.float32]:
+def _colour_pixels(image: "Image", white: White | None) -> NDArray[np.float32]:
+    """Convert an image of up to 8 bits a channel to pixels `(H, W, 3)` in [0, 1], over white."""
+    values = np.asarray(_over_white(image).convert("RGB"))
+    if white is None:
+        return values.astype(np.float32) / np.float32(255)
+    return between(values, black_and_white(white, values))
+
+
+def _grey_pixels(image: "Image", most: int, name: str, white: White | None) -> NDArray[np.float32]:
+    """Convert a grey image of 16 bits or of floats, whose largest value is `most`, to pixels `(H, W, 3)` in [0, 1]."""
+    values = np.asarray(image)  # (H, W)
+    shades = _shades(values, most, name) if white is None else between(values, black_and_white(white, values))
+    pixels = np.repeat(shades[..., None], 3, axis=-1)
+    if "transparency" in image.info:
+        pixels = _without(pixels, values[..., None] == image.info["transparency"])
+    return pixels
+
+
+def _shades(values: Values, most: int, name: str) -> NDArray[np.float32]:
     """Scale grey values to [0, 1] by the largest; raises `DataError` for values whose white is not known."""
     least = values.min()
     greatest = values.max()

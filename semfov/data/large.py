@@ -25,13 +25,10 @@ class ArrayPicture(LargePicture):
     """
 
     def __init__(self, array: NDArray[np.uint8]) -> None:
-        is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)
-        check(
-            array.dtype == np.uint8 and is_picture and array.size > 0,
-            "array",
-            "bytes of shape (H, W, 3) or (H, W)",
-            f"{array.dtype} {array.shape}",
-        )
+        is_picture = array.ndim >= 2 and array.shape[2:] in ((), (3,))
+        are_bytes = array.dtype == np.uint8 and array.size > 0
+        got = f"{array.dtype} {array.shape}"
+        check(is_picture and are_bytes, "array", "bytes of shape (H, W, 3) or (H, W)", got)
         self._array = array
         self.size = array.shape[1], array.shape[0]
 
@@ -65,12 +62,22 @@ def open_large(
     if isinstance(source, LargePicture):
         check(white is None and bands is None, "white", "None for a picture that is open; give it to open_large", white)
         return source
-    has_bands = isinstance(source, str | PathLike) and Path(source).suffix.lower() in BY_WINDOWS
-    expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
-    check(bands is None or has_bands, "bands", expected, bands)
     if isinstance(source, str | PathLike):
+        _check_no_bands(None if _has_windows(source) else bands)
         return _open_file(source, white, bands)
+    _check_no_bands(bands)
     return ArrayPicture(_bytes_of(source, color, white))
+
+
+def _has_windows(path: str | PathLike[str]) -> bool:
+    """Tell by its name whether a file is a TIFF or a raster, which are read by windows and have bands."""
+    return Path(path).suffix.lower() in BY_WINDOWS
+
+
+def _check_no_bands(bands: ChosenBands) -> None:
+    """Raise `InputError` for bands of a picture that is neither a TIFF nor a raster."""
+    expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
+    check(bands is None, "bands", expected, bands)
 
 
 def _check_bands(bands: ChosenBands) -> None:
@@ -86,15 +93,11 @@ def _check_bands(bands: ChosenBands) -> None:
 def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
     """Open a file by the readers of its kind, and note how its values are shown."""
     check_local(path, "picture")
-    picture: LargePicture
-    if Path(path).suffix.lower() in BY_WINDOWS:
-        picture = open_by_windows(path, white=white, bands=bands)
-    else:
-        picture = PhotographPicture(path, white)
+    picture = open_by_windows(path, white=white, bands=bands) if _has_windows(path) else PhotographPicture(path, white)
     if white is not None or bands is not None:
         # With which a record can open the file again; percentiles stay a word.
-        limits = white if white is None or isinstance(white, str) else stated_limits(white)
-        picture.shown = {"white": limits, "bands": bands}
+        is_stated = not isinstance(white, str | None)
+        picture.shown = {"white": stated_limits(white) if is_stated else white, "bands": bands}
     return picture
 
 
@@ -140,14 +143,18 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
     if isinstance(source, LargePicture):
         return source.size
     if isinstance(source, str | PathLike):
-        path = Path(source)
-        if path.suffix.lower() in BY_WINDOWS:
-            # A white, whichever, lets floats in. A file of another kind than its name says is Pillow's.
-            with suppress(DataError):
-                return open_large(path, white=1.0).size
-        with opening(path, "opened"), open_pillow(path) as image:
-            return upright_size(image)
+        return _size_of_file(Path(source))
     if isinstance(source, Pillow.Image):
         return upright_size(source)
     height, width = as_pixels(source, argument="picture").shape[-2:]
     return width, height
+
+
+def _size_of_file(path: Path) -> tuple[int, int]:
+    """Read `(width, height)` of a picture from its head, by the reader of its kind."""
+    if _has_windows(path):
+        # A white, whichever, lets floats in. A file of another kind than its name says is Pillow's.
+        with suppress(DataError):
+            return open_large(path, white=1.0).size
+    with opening(path, "opened"), open_pillow(path) as image:
+        return upright_size(image)

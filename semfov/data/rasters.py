@@ -3,6 +3,7 @@
 import warnings
 import weakref
 from contextlib import suppress
+from itertools import product
 from os import PathLike
 from pathlib import Path
 from threading import Lock
@@ -73,13 +74,12 @@ class RasterPicture(LargePicture):
             return True
         x1, y1, x2, y2 = box
         height, width = self._file.block_shapes[0]
+        rows = range(y1 // height, -(-y2 // height))
+        columns = range(x1 // width, -(-x2 // width))
+        # GDAL tells a size of blocks alone that are stored.
+        names = (f"BLOCK_SIZE_{column}_{row}" for row, column in product(rows, columns))
         with self._lock:
-            for row in range(y1 // height, -(-y2 // height)):
-                for column in range(x1 // width, -(-x2 // width)):
-                    # GDAL tells a size of blocks alone that are stored.
-                    if self._file.get_tag_item(f"BLOCK_SIZE_{column}_{row}", "TIFF", bidx=self._bands[0]):
-                        return True
-        return False
+            return any(self._file.get_tag_item(name, "TIFF", bidx=self._bands[0]) for name in names)
 
     def _reduced(self, box: Box, reduction: int) -> Tensor:
         """Read a window from the overviews of the file, or from a copy where it has none."""

@@ -3,12 +3,13 @@
 import math
 import time
 import warnings
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -140,18 +141,18 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
         The others, among them folders, mosaics and files without a suffix.
     """
     kinds = {"", ".vrt", *PHOTOGRAPHS}
-    others = {path for path in paths if path.suffix.lower() not in kinds and path.is_file()}
-    if not others:
+    foreign_files = {path for path in paths if path.suffix.lower() not in kinds and path.is_file()}
+    if not foreign_files:
         return list(paths)
-    name = printable(min(others).name)
-    if len(others) == 1:
+    name = printable(min(foreign_files).name)
+    text = f"{len(foreign_files)} files are no photographs and are left out, such as {name}"
+    if len(foreign_files) == 1:
         text = f"1 file is no photograph and is left out, {name}"
-    else:
-        text = f"{len(others)} files are no photographs and are left out, such as {name}"
-    if any(path.suffix.lower() in VIDEOS for path in others):
+    # `search`, `find` and `explore` take photographs alone.
+    if any(path.suffix.lower() in VIDEOS for path in foreign_files):
         text += "; `semfov live` takes videos"
     warnings.warn(f"{where}: {text}", stacklevel=3)
-    return [path for path in paths if path not in others]
+    return [path for path in paths if path not in foreign_files]
 
 
 class Stream(NamedTuple):
@@ -186,49 +187,49 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
         InputError: no stream has such an address.
     """
     check_white(white)
-    is_address = isinstance(source, str) and "://" in source
     if isinstance(source, int):
-        return _open_recorder(source, f"camera {source}", most, white)
-    if is_address:
-        return _open_recorder(source, _name(str(source)), most, white)
+        return _open_recorder(_Camera(source), most, white)
+    if isinstance(source, str) and "://" in source:
+        return _open_recorder(_Address(source), most, white)
     path = Path(source)
-    gaps: Counter[str] = Counter()
     if path.is_dir():
-        frames = _read_frames(picture_files(path, frames=True)[:most], gaps, white)
-        return Stream(path.name, None, frames, gaps)
+        return _open_folder(path, most, white)
     container = container_of(path)
     check_data(container != "playlist", path.name, "a video", "a playlist, which names other files; give these")
     if container == "animation":
-        shown = animation(path, white)
-        first = next(shown)
-        _, seconds = first
-        return Stream(path.name, 1 / seconds, _animate(chain([first], shown), path.name, most, gaps), gaps)
-    return _open_recorder(path, path.name, most, white, container)
+        return _open_animation(path, most, white)
+    return _open_recorder(_Film(path, container), most, white)
 
 
-def _open_recorder(
-    source: str | Path | int, name: str, most: int | None, white: White | None, container: Container = "other"
-) -> Stream:
+def _open_folder(folder: Path, most: int | None, white: White | None) -> Stream:
+    """Open a folder of frames, whose rate nothing tells."""
+    gaps: Counter[str] = Counter()
+    files = picture_files(folder, frames=True)
+    return Stream(folder.name, None, _read_frames(files[:most], gaps, white), gaps)
+
+
+def _open_animation(path: Path, most: int | None, white: White | None) -> Stream:
+    """Open an animation, whose rate is that of its first frame."""
+    gaps: Counter[str] = Counter()
+    shown = animation(path, white)
+    first = next(shown)
+    _, seconds = first
+    return Stream(path.name, 1 / seconds, _animate(chain([first], shown), path.name, most, gaps), gaps)
+
+
+def _open_recorder(source: "_Source", most: int | None, white: White | None) -> Stream:
     """Open a source that OpenCV reads."""
+    name = source.name
     with needing("OpenCV", name, "opencv-python-headless", DataError):
         import cv2
     recorder = _recorder(cv2, source)
     if not recorder.isOpened():
-        raise DataError(f"{name}: cannot be opened; check that {_cause(source)}")
+        raise DataError(f"{name}: cannot be opened; check that {source.remedy}")
     rate = float(recorder.get(cv2.CAP_PROP_FPS))
     gaps: Counter[str] = Counter()
-    frames = _Recording(cv2, recorder, source, name, gaps, white, container).frames(most)
+    frames = _Recording(cv2, recorder, source, gaps, white).frames(most)
     first = next(frames)
     return Stream(name, rate if 0 < rate < _FASTEST else None, chain([first], frames), gaps)
-
-
-def _cause(source: str | Path | int) -> str:
-    """Say what to check of a source that cannot be opened."""
-    if isinstance(source, int):
-        return "it is connected and not in use"
-    if isinstance(source, str):
-        return "address, user and password are right, and that this machine reaches the camera (ffplay shows it)"
-    return "OpenCV reads videos of this format"
 
 
 def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None) -> Iterator[Picture]:
@@ -336,17 +337,98 @@ class _Recorder(Protocol):
     def release(self) -> None: ...
 
 
-def _recorder(cv2: ModuleType, source: str | Path | int) -> _Recorder:
-    """Open OpenCV's reader of a source."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised by the caller
-    try:
-        if isinstance(source, Path):
-            return cv2.VideoCapture(str(source))
-        if isinstance(source, int):
-            return cv2.VideoCapture(source)
+class _Source(ABC):
+    """A source that OpenCV reads.
+
+    Attributes:
+        name: for messages.
+        remedy: what to check where it cannot be opened.
+        container: of a file.
+    """
+
+    name: str
+    remedy: ClassVar[str]
+    container: Container = "other"
+
+    @abstractmethod
+    def recorder(self, cv2: ModuleType) -> _Recorder:
+        """Make a reader of the source."""
+
+    @abstractmethod
+    def reopen(self, cv2: ModuleType, recorder: _Recorder) -> bool:
+        """Open a reader again; returns whether the source is there."""
+
+    def stamp(self, cv2: ModuleType, recorder: _Recorder) -> float:
+        """Tell the time of the frame that was read, in seconds; OpenCV has it in milliseconds."""
+        return float(recorder.get(cv2.CAP_PROP_POS_MSEC)) / 1000
+
+    def frames_stated(self, count: float) -> int:
+        """Tell how many frames there should be, by the count that OpenCV finds; 0 where it does not tell."""
+        return 0
+
+
+class _Film(_Source):
+    """A file of a video."""
+
+    remedy = "OpenCV reads videos of this format"
+
+    def __init__(self, path: Path, container: Container = "other") -> None:
+        self.path = path
+        self.name = path.name
+        self.container = container
+
+    def recorder(self, cv2: ModuleType) -> _Recorder:
+        return cv2.VideoCapture(str(self.path))
+
+    def reopen(self, cv2: ModuleType, recorder: _Recorder) -> bool:
+        return False  # a file that has ended does not go on
+
+    def frames_stated(self, count: float) -> int:
+        return frames_stated(self.path, self.container, count)
+
+
+class _Camera(_Source):
+    """A camera of this machine, by its number."""
+
+    remedy = "it is connected and not in use"
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.name = f"camera {number}"
+
+    def recorder(self, cv2: ModuleType) -> _Recorder:
+        return cv2.VideoCapture(self.number)
+
+    def reopen(self, cv2: ModuleType, recorder: _Recorder) -> bool:
+        return recorder.open(self.number)
+
+    def stamp(self, cv2: ModuleType, recorder: _Recorder) -> float:
+        return time.monotonic()  # a frame is of the moment at which it is read
+
+
+class _Address(_Source):
+    """A stream on a network."""
+
+    remedy = "address, user and password are right, and that this machine reaches the camera (ffplay shows it)"
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.name = _name(address)
+
+    def recorder(self, cv2: ModuleType) -> _Recorder:
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _WAIT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _WAIT]
-        return cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+        return cv2.VideoCapture(self.address, cv2.CAP_FFMPEG, limits)
+
+    def reopen(self, cv2: ModuleType, recorder: _Recorder) -> bool:
+        return recorder.open(self.address, cv2.CAP_FFMPEG)
+
+
+def _recorder(cv2: ModuleType, source: _Source) -> _Recorder:
+    """Open OpenCV's reader of a source, without its messages: errors are raised by the caller."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return source.recorder(cv2)
     finally:
         cv2.utils.logging.setLogLevel(level)
 
@@ -366,11 +448,9 @@ class _Recording:
     Args:
         cv2: OpenCV.
         recorder: its reader of the source, which is open.
-        source: file, number of a camera, or address.
-        name: of the source, for messages.
+        source: a file, a camera, or an address.
         gaps: to which frames are added that were `lost`, and `reconnected`.
         white: the values of 16 bits that are black and white.
-        container: of a file.
 
     Private attributes, all of the frames so far: `_read` counts those that were read, and `_gaps` those that were lost
     between them; `_missed` counts attempts since the last frame that gave none; `_waited` has the seconds for which a
@@ -384,23 +464,22 @@ class _Recording:
         self,
         cv2: ModuleType,
         recorder: _Recorder,
-        source: str | Path | int,
-        name: str,
+        source: _Source,
         gaps: Counter[str],
         white: White | None = None,
-        container: Container = "other",
     ) -> None:
         self._cv2 = cv2
         self._recorder = recorder
         self._source = source
-        self._name = name
         self._gaps = gaps
         self._white = white
-        self._container = container
         self._total = float(recorder.get(cv2.CAP_PROP_FRAME_COUNT))
         rate = float(recorder.get(cv2.CAP_PROP_FPS))
-        self._is_file = isinstance(source, Path) or 0 < self._total < _MOST_FRAMES
-        self._clock = _Clock(1 / rate if 0 < rate < _FASTEST else FRAME, rounded=container == "matroska")
+        # An address may be that of a film, too, which states how long it is.
+        self._is_file = isinstance(source, _Film) or 0 < self._total < _MOST_FRAMES
+        # The time stamps of Matroska are whole milliseconds.
+        is_rounded = source.container == "matroska"
+        self._clock = _Clock(1 / rate if 0 < rate < _FASTEST else FRAME, rounded=is_rounded)
         self._read = 0
         self._missed = 0
         self._waited = 0.0
@@ -416,7 +495,8 @@ class _Recording:
                 elif self._may_go_on():
                     self._missed += 1
                 elif not self._read:
-                    raise DataError(f"{self._name}: no frame could be read; check that the source is not damaged")
+                    name = self._source.name
+                    raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
                 elif not self._reconnect():
                     self._count_lost_end()
                     return
@@ -434,11 +514,9 @@ class _Recording:
     def _picture(self, pixels: Values) -> Picture:
         """Note a frame that was read, and date it by the clock of the stream."""
         self._gaps["lost"] += self._missed
-        is_camera = isinstance(self._source, int)
-        position = self._cv2.CAP_PROP_POS_MSEC
-        stamp = time.monotonic() if is_camera else float(self._recorder.get(position)) / 1000
+        stamp = self._source.stamp(self._cv2, self._recorder)
         passed = min(self._clock.passed(stamp, self._missed) + self._waited, _LONGEST)
-        name = f"{self._name}, frame {self._read + self._gaps['lost']}"
+        name = f"{self._source.name}, frame {self._read + self._gaps['lost']}"
         picture = Picture(name, _rgb(pixels, self._white), passed=passed)
         self._read += 1
         self._missed = 0
@@ -452,7 +530,7 @@ class _Recording:
 
     def _reconnect(self) -> bool:
         """Open a camera or a stream again; returns whether it is there."""
-        if self._is_file or isinstance(self._source, Path):
+        if self._is_file:
             return False
         began = time.monotonic()
         if not _reopened(self._cv2, self._recorder, self._source):
@@ -465,11 +543,9 @@ class _Recording:
 
     def _count_lost_end(self) -> None:
         """Count the frames that a file states, and that were not there at its end."""
-        if not isinstance(self._source, Path):
-            return
-        stated = frames_stated(self._source, self._container, self._total)
+        stated = self._source.frames_stated(self._total)
         counted = self._read + self._gaps["lost"]
-        if self._container == "avi":
+        if self._source.container == "avi":
             # AVI counts the frames that a film leaves out, too, over which its time stamps go.
             counted = max(counted, self._clock.frames)
         # The number of frames that a file states may be off by one.
@@ -477,7 +553,7 @@ class _Recording:
             self._gaps["lost"] += stated - counted
 
 
-def _reopened(cv2: ModuleType, recorder: _Recorder, source: str | int) -> bool:
+def _reopened(cv2: ModuleType, recorder: _Recorder, source: _Source) -> bool:
     """Open a camera or a stream again, after pauses that grow; returns whether it is there."""
     recorder.release()
     for pause in _PAUSES:
@@ -486,6 +562,6 @@ def _reopened(cv2: ModuleType, recorder: _Recorder, source: str | int) -> bool:
         if not probe.isOpened():
             continue
         probe.release()
-        if recorder.open(source) if isinstance(source, int) else recorder.open(source, cv2.CAP_FFMPEG):
+        if source.reopen(cv2, recorder):
             return True
     return False

@@ -12,7 +12,7 @@ import re
 import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from functools import cached_property
 from itertools import product
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 _NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorinterp">(\w{1,20})</Item>')
 """How GDAL writes the name of a band, counted from 0, into its tag."""
 
+_BITS = {np.dtype(np.uint8): 8, np.dtype(np.uint16): 16}  # of values without a sign that need no `white`
 _MOST_PAGES = 64  # that are looked through for the first that is no thumbnail
 _MOST_LAYERS = 64  # pages that are channels of one picture
 _ROWS = 64  # of a picture that is stored in one strip, which are read at once
@@ -137,10 +138,11 @@ class TiffPicture(LargePicture):
             warnings.warn(f"image {path}: the first of {pictures} pictures in it is shown; {remedy}", stacklevel=2)
 
         description = _describe(self.path, self.page, layers)
-        colours = [band - 1 for band in description.shown_bands(bands)]
-        alphas = [] if description.alpha is None else [description.alpha - 1]
-        self._channels = colours + alphas
-        self._colours = len(colours)
+        shown = description.shown_bands(bands)
+        self._colours = len(shown)
+        if description.alpha is not None:
+            shown.append(description.alpha)
+        self._channels = [band - 1 for band in shown]
         self._nodata = _nodata_of(self.page)
         self._check_decoder()
         # The tone of some values is chosen by the values in the file, which are read here.
@@ -186,8 +188,9 @@ class TiffPicture(LargePicture):
                     window[rows, columns, place] = values[..., 0]
             return window
         for rows, columns, values in self._tiles.parts(box):
-            all_in_order = self._channels == [*range(values.shape[-1])]
-            window[rows, columns] = values if all_in_order else values[..., self._channels]
+            # Choosing channels copies the tile, which is needless where they are all of them.
+            are_all = self._channels == [*range(values.shape[-1])]
+            window[rows, columns] = values if are_all else values[..., self._channels]
         return window
 
     def _colour_values(self, box: Box) -> Values:
@@ -248,15 +251,13 @@ class _Tiles:
         self._decoded: dict[tuple[int, int], Values] = {}
         width, height = self._size = _size_of(page)
         self._is_one_strip = not page.is_tiled and page.rowsperstrip >= height
-        # What is not packed has its rows at known places.
-        is_plain = page.compression == 1 and page.predictor == 1 and page.fillorder == 1
+        # What is not packed has its rows at known places in the file.
+        is_plain = (page.compression, page.predictor, page.fillorder) == (1, 1, 1)
         self._has_plain_rows = self._is_one_strip and is_plain and all(page.databytecounts)
-        if page.is_tiled:
-            self.width = page.tilewidth
-            self.height = page.tilelength
-        else:
-            self.width = width
-            self.height = min(_ROWS, height) if self._has_plain_rows else page.rowsperstrip
+        self.width = page.tilewidth if page.is_tiled else width
+        self.height = page.tilelength if page.is_tiled else page.rowsperstrip
+        if self._has_plain_rows:
+            self.height = min(_ROWS, height)
         self.columns = len(_tiles_along(0, width, self.width))
         self.rows = len(_tiles_along(0, height, self.height))
         has_planes = page.planarconfig == PLANES and page.samplesperpixel > 1
@@ -386,11 +387,10 @@ def _overlap(place: int, length: int, start: int, stop: int) -> tuple[slice, sli
 
 def _first_page(file: "TiffFile") -> _Page:
     """Find the first page that is no reduced copy, such as a thumbnail, of another one."""
+    # A page is read when it is asked for, and a file may have very many.
     pages = cast(Sequence[_Page], file.pages)
-    for number in range(min(len(pages), _MOST_PAGES)):
-        if not pages[number].is_reduced:
-            return pages[number]
-    return pages[0]
+    numbers = range(min(len(pages), _MOST_PAGES))
+    return next((pages[number] for number in numbers if not pages[number].is_reduced), pages[0])
 
 
 def _size_of(page: _Page) -> tuple[int, int]:
@@ -410,30 +410,24 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
     Returns:
         The pages, and the number of pictures in the stack.
     """
-    if not file.series:
+    if not file.series or file.series[0].keyframe.index != page.index:
         return [page], 1
     series = file.series[0]
     pages = cast(Sequence[_Layer | None], series.pages)
     # A page has rows (Y) and columns (X), and perhaps samples (S); the axes before these number the pages.
     axes = series.axes.removesuffix("S").removesuffix("YX")
     lengths = series.shape[: len(axes)]
-    is_of_stack = page.index == series.keyframe.index and math.prod(lengths) == len(pages)
-    if not is_of_stack:
+    if math.prod(lengths) != len(pages):
         return [page], 1
-    channels = lengths[axes.index("C")] if "C" in axes else 1
+    channels = dict(zip(axes, lengths, strict=True)).get("C", 1)
     pictures = len(pages) // channels
     # A page of several samples has its channels in itself.
-    are_channels = page.samplesperpixel == 1 and 2 <= channels <= _MOST_LAYERS
-    if not are_channels:
+    if page.samplesperpixel > 1 or not 2 <= channels <= _MOST_LAYERS:
         return [page], pictures
-
-    layers = []
-    for number in _first_picture(axes, lengths):
-        layer = pages[number]
-        if layer is None or layer.shape != page.shape:  # it is not in the file, or of another size
-            return [page], pictures
-        layers.append(layer)
-    return layers, pictures
+    layers = [pages[number] for number in _first_picture(axes, lengths)]
+    # Others are of another size, or not in the file.
+    layers_alike = [layer for layer in layers if layer is not None and layer.shape == page.shape]
+    return (layers_alike if len(layers_alike) == channels else [page]), pictures
 
 
 def _first_picture(axes: str, lengths: tuple[int, ...]) -> list[int]:
@@ -454,7 +448,7 @@ def _check_kind(page: _Page, path: Path, *, has_white: bool) -> None:
     import tifffile
 
     remedy = "give white='auto', or the values that are black and white" if _is_image(page) else "convert it"
-    has_tone = has_white or page.dtype in (np.uint8, np.uint16)
+    has_tone = has_white or page.dtype in _BITS
     check_data(_is_image(page) and has_tone, path, "8 or 16 bits", f"{page.dtype} {page.shape}; {remedy}")
     check_data(page.photometric != PALETTE, path, "grey, RGB or bands", "a palette; convert it")
     if page.compression not in tifffile.TIFF.DECOMPRESSORS or page.predictor not in tifffile.TIFF.UNPREDICTORS:
@@ -478,14 +472,12 @@ def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
     kinds = [int(kind) for kind in page.extrasamples]
     first_extra = count - len(kinds) + 1
     extra = dict(enumerate(kinds, first_extra))
-    numbers = _named_bands(page)
-    colours = named_colours(numbers)
-    if colours is None and first_extra == 4 and (page.photometric == RGB or has_layers):
+    names = _named_bands(page)
+    colours = named_colours(names)
+    has_three_colours = first_extra == 4 and (page.photometric == RGB or has_layers)
+    if colours is None and has_three_colours:
         colours = 1, 2, 3
-    alpha = next((band for band, kind in extra.items() if kind in (PREMULTIPLIED, UNASSOCIATED)), None)
-    is_named_otherwise = alpha in numbers.values() and "alpha" not in numbers
-    if is_named_otherwise:  # by GDAL
-        alpha = None
+    alpha = _alpha_of(extra, names)
     return Description(
         path=path,
         size=_size_of(page),
@@ -494,8 +486,24 @@ def _describe(path: Path, page: _Page, layers: Sequence[_Layer]) -> Description:
         alpha=alpha,
         premultiplied=alpha is not None and extra[alpha] == PREMULTIPLIED,
         white_is_zero=page.photometric == WHITE_IS_ZERO,
-        bits=8 * page.dtype.itemsize if page.dtype in (np.uint8, np.uint16) else None,
+        bits=_BITS.get(page.dtype),
     )
+
+
+def _alpha_of(extra: Mapping[int, int], names: Mapping[str, int]) -> int | None:
+    """Find the band that is an alpha.
+
+    Args:
+        extra: what TIFF calls the further bands, by their numbers from 1.
+        names: numbers of bands by the names that GDAL gives them.
+
+    Returns:
+        Its number; None without one, and where GDAL gives it another name.
+    """
+    alphas = [band for band, kind in extra.items() if kind in (PREMULTIPLIED, UNASSOCIATED)]
+    if not alphas or (alphas[0] in names.values() and "alpha" not in names):
+        return None
+    return alphas[0]
 
 
 def _named_bands(page: _Page) -> dict[str, int]:
@@ -509,11 +517,13 @@ def _named_bands(page: _Page) -> dict[str, int]:
 def _nodata_of(page: _Page) -> float | None:
     """Read the value of pixels without data; None where the file states none that its type has."""
     tag = page.tags.get(GDAL_NODATA)
+    if tag is None:
+        return None
     try:
-        value = float(str("" if tag is None else tag.value).strip("\0 "))
+        value = float(str(tag.value).strip("\0 "))
     except ValueError:  # some programs write words
         return None
-    if page.dtype.kind not in "ui":
+    if page.dtype.kind == "f":
         return value
     limits = np.iinfo(page.dtype)
     return value if limits.min <= value <= limits.max else None

@@ -21,17 +21,19 @@ _ROWS = 64  # of a picture that are converted at once: more leave the cache of t
 
 def check_white(white: White | None) -> None:
     """Raise `InputError` for what is no white."""
-    if white is None or (isinstance(white, str) and white == "auto"):
+    if isinstance(white, str | None) and white in (None, "auto"):
         return
     limits: Sequence[object] = white if isinstance(white, tuple | list) else (0.0, white)
-    numbers = [_plain(limit) for limit in limits]
-    are_finite = all(is_number(number) and np.isfinite(number) for number in numbers)
-    check(
-        len(numbers) == 2 and are_finite and numbers[0] < numbers[1],
-        "white",
-        "a value above 0, (black, white) with black < white, or 'auto'",
-        white,
-    )
+    expected = "a value above 0, (black, white) with black < white, or 'auto'"
+    check(_are_limits([_plain(limit) for limit in limits]), "white", expected, white)
+
+
+def _are_limits(numbers: Sequence[Any]) -> bool:
+    """Tell whether these are two finite numbers, of which the second is larger."""
+    if len(numbers) != 2 or not all(map(is_number, numbers)):
+        return False
+    black, white = numbers
+    return -np.inf < black < white < np.inf
 
 
 def _plain(number: Any) -> Any:

@@ -194,13 +194,13 @@ class Mosaic:
             source = band.sources[number]
             columns = _Side.of(source, 0, left, x_scale, width)
             rows = _Side.of(source, 1, top, y_scale, height)
+            # A source that is narrower than a pixel of the canvas may hold no middle of one.
             if not columns.covered or not rows.covered:
                 continue
             values, present = self._values(source, columns, rows, resampling)
-            values = _as_kind(values, band.kind)
-            # A view, so that what is assigned to it is written to the canvas.
+            # A view, so that what is copied to it is written to the canvas.
             part = canvas[rows.covered.start : rows.covered.stop, columns.covered.start : columns.covered.stop]
-            part[:] = values if present is None else np.where(present, values, part)
+            np.copyto(part, _as_kind(values, band.kind), where=True if present is None else present)
         return canvas
 
     def _values(
@@ -229,15 +229,16 @@ class Mosaic:
             "resampling": resampling,
         }
         file = self._open(source.path)
-        stored = file.read_masks(source.band, **options) if source.of_mask else file.read(source.band, **options)
+        read = file.read_masks if source.of_mask else file.read
+        stored = read(source.band, **options)  # (h, w), of the inner pixels alone
         present = _presence(source, file, stored, options)
         values = _converted(source, file, stored)
-        # What lies at the edge of the source shows what is beside it.
         borders = rows.border, columns.border
-        if borders == ((0, 0), (0, 0)):
-            return values, present
-        padded_present = None if present is None else np.pad(present, borders, "edge")
-        return np.pad(values, borders, "edge"), padded_present
+        if borders != ((0, 0), (0, 0)):
+            # What lies at the edge of the source shows what is beside it.
+            values = np.pad(values, borders, "edge")
+            present = None if present is None else np.pad(present, borders, "edge")
+        return values, present
 
 
 def _presence(source: Source, file: Dataset, stored: Values, options: WindowOptions) -> NDArray[np.bool_] | None:
@@ -246,9 +247,9 @@ def _presence(source: Source, file: Dataset, stored: Values, options: WindowOpti
         return np.asarray(file.read_masks(source.band, **options) > 0)
     if source.nodata is None:
         return None
-    if np.isnan(source.nodata):  # which equals no number, itself included
-        return ~np.isnan(stored)
-    return np.asarray(stored != source.nodata)
+    # NaN equals no number, itself included.
+    present = ~np.isnan(stored) if np.isnan(source.nodata) else stored != source.nodata
+    return np.asarray(present)
 
 
 def _converted(source: Source, file: Dataset, values: Values) -> Values:

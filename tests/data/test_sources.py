@@ -161,10 +161,11 @@ def test_a_damaged_video_goes_on_after_its_gaps(video, tmp_path):
 def test_frames_pass_by_their_time_stamps(monkeypatch):
     """Frames at 0, 40, 80 and 1080 ms; those of a camera come when they are read, at 5, 5.1, 5.6 and 5.7 s."""
     monkeypatch.setattr(sources.time, "monotonic", iter([5, 5.1, 5.6, 5.7]).__next__)
-    for source, expected in ((Path("a.mp4"), [0.04, 0.04, 0.04, 1]), (0, [0.04, 0.1, 0.5, 0.1])):
+    film = sources._Film(Path("a.mp4"))
+    for source, expected in ((film, [0.04, 0.04, 0.04, 1]), (sources._Camera(0), [0.04, 0.1, 0.5, 0.1])):
         recorder = Recorder([[0, 40, 80, 1080], []])
         monkeypatch.setattr(recorder, "get", lambda key, of=recorder: of.now if key == cv2.CAP_PROP_POS_MSEC else 25.0)
-        taken = sources._Recording(cv2, recorder, source, "a", Counter()).frames(4)
+        taken = sources._Recording(cv2, recorder, source, Counter()).frames(4)
         assert [picture.passed for picture in taken] == pytest.approx(expected)
 
 
@@ -296,7 +297,7 @@ def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):
     recorder, gaps = Recorder([[1, 2], [], [3, 4]]), Counter()
     monkeypatch.setattr(sources, "_PAUSES", (0.0, 0.0))
     monkeypatch.setattr(sources, "_recorder", lambda *_: recorder)
-    taken = list(sources._Recording(cv2, recorder, "rtsp://camera", "camera", gaps).frames(None))
+    taken = list(sources._Recording(cv2, recorder, sources._Address("rtsp://camera"), gaps).frames(None))
     assert [int(picture.image[0, 0, 0]) for picture in taken] == [1, 2, 3, 4]
     assert gaps == {"reconnected": 1, "lost": 0}
     assert [picture.passed for picture in taken[:2]] == [0.04, 0.04]
