@@ -47,11 +47,11 @@ class Annotations:
 
     def size(self, image: Id) -> tuple[int, int] | None:
         """Tell `(width, height)` of an image; None if the file does not say."""
-        sides = [self.images[image].get(side) for side in ("width", "height")]
-        if None in sides:
+        width = self.images[image].get("width")
+        height = self.images[image].get("height")
+        if width is None or height is None:
             return None
-        width, height = map(int, sides)
-        return width, height
+        return int(width), int(height)
 
 
 def read_annotations(path: str | PathLike[str]) -> Annotations:

@@ -96,8 +96,8 @@ def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBand
     picture = open_by_windows(path, white=white, bands=bands) if _has_windows(path) else PhotographPicture(path, white)
     if white is not None or bands is not None:
         # With which a record can open the file again; percentiles stay a word.
-        is_stated = not isinstance(white, str | None)
-        picture.shown = {"white": stated_limits(white) if is_stated else white, "bands": bands}
+        limits = white if isinstance(white, str | None) else stated_limits(white)
+        picture.shown = {"white": limits, "bands": bands}
     return picture
 
 

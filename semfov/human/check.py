@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from semfov.cli.options import CheckOptions
+from semfov.data.classes import amount
 from semfov.data.fixations import Fixations
 from semfov.data.large import picture_size
 from semfov.data.sources import PHOTOGRAPHS, picture_files
@@ -202,9 +203,9 @@ class _Reading(NamedTuple):
         takes_picture = reader is not read_table and "picture" in signature(reader).parameters
         if picture is None or (takes_picture and self.sizes is None):
             return self._in_frames(reader, path, self.arguments)
-        unnamed = {name: value for name, value in self.arguments.items() if name != "picture"}
+        other_arguments = {name: value for name, value in self.arguments.items() if name != "picture"}
         try:
-            records = self._in_frames(reader, path, unnamed)
+            records = self._in_frames(reader, path, other_arguments)
         except PictureError:
             # The file names no picture, so this is the one.
             return self._in_frames(reader, path, self.arguments)
@@ -229,10 +230,10 @@ def _content(records: list[Fixations], usual: str) -> str:
     people = {record.subject for record in records}
     pictures = {record.picture for record in records}
     words = [
-        _counted(sum(map(len, records)), "fixation", "fixations"),
-        _counted(len(records), "scanpath", "scanpaths"),
-        _counted(len(people), "person", "people"),
-        _counted(len(pictures), "picture", "pictures"),
+        amount(sum(map(len, records)), "fixation"),
+        amount(len(records), "scanpath"),
+        amount(len(people), "person"),
+        amount(len(pictures), "picture"),
     ]
     sizes = sorted({record.size for record in records})
     frames = [f"{width} × {height}" for width, height in sizes[:_FRAMES_NAMED]]
@@ -243,8 +244,3 @@ def _content(records: list[Fixations], usual: str) -> str:
     if times:
         durations = f"they take {np.median(np.concatenate(times)):g} ms in the median"
     return f"{', '.join(words)}, frames of {', '.join(frames)}{usual}; {durations}"
-
-
-def _counted(number: int, one: str, several: str) -> str:
-    """Write a number of things in words."""
-    return f"{number} {one if number == 1 else several}"

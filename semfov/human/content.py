@@ -220,7 +220,7 @@ def _particular_densities(names: Sequence[str], densities: Mapping[str, Tensor])
         bits = ratio.log2().clamp(min=_FAINTEST)
         on_grid = interpolate(bits[None, None], size=(_SIDE, _SIDE), mode="bilinear")
         logs.append(on_grid[0, 0])
-    stacked = torch.stack(logs)
+    stacked = torch.stack(logs)  # (N, _SIDE, _SIDE)
     mean_of_other_pictures = (stacked.sum(0) - stacked) / (len(logs) - 1)
     particular = stacked - mean_of_other_pictures
     return {name: density.numpy() for name, density in zip(names, particular, strict=True)}
@@ -276,6 +276,7 @@ class _Evidence:
     def best_shift(self, records: Sequence[Fixations]) -> _BestShift:
         """Find the shift with which some records fit best, all of them moved alike."""
         places = self._places(records, _PRESENT_READING)
+        # Every picture counts the same, however many fixations it has.
         total = sum(_fit_by_shift(self._particular[name], places[name]) for name in places)
         row, column = np.unravel_index(int(np.argmax(total)), np.shape(total))
         shift = (np.array([column, row]) - _REACH) / _SIDE
@@ -299,8 +300,8 @@ class _Evidence:
 
 def _densities_at(particular: _Array, places: _Array) -> _Array:
     """Take d at places `(n, 2)` in shares of the sides; 0 beyond the picture."""
-    cells = np.floor(places * _SIDE).astype(np.int64)
-    inside = np.all((cells >= 0) & (cells < _SIDE), axis=1)
+    cells = np.floor(places * _SIDE).astype(np.int64)  # (n, 2)
+    inside = np.all((cells >= 0) & (cells < _SIDE), axis=1)  # (n,)
     columns, rows = np.where(inside[:, None], cells, 0).T
     return np.where(inside, particular[rows, columns], 0.0)
 
@@ -322,8 +323,8 @@ def _fit_by_shift(particular: _Array, places: _Array) -> _Array:
     cells = cells.clip(_REACH, _SIDE + 3 * _REACH - 1)
     column, row = cells.T
     steps = np.arange(-_REACH, _REACH + 1)
-    rows = row[:, None, None] + steps[:, None]
-    columns = column[:, None, None] + steps
+    rows = row[:, None, None] + steps[:, None]  # (n, shifts, 1)
+    columns = column[:, None, None] + steps  # (n, 1, shifts)
     return np.asarray(padded[rows, columns].mean(0))
 
 

@@ -41,12 +41,12 @@ def suspicions_by_content(
         return []
     detector = load_detector(DetectorOptions.detector)
     densities: dict[str, Tensor] = {}
-    known: dict[str, tuple[int, int]] = {}
+    picture_sizes: dict[str, tuple[int, int]] = {}
     with task_bar(len(names), "where people look", "picture", hidden=quiet) as bar:
         for name in names:
             with suppress(KeyError, SemfovError):  # a picture that is missing or damaged is named by its size
                 image = OpenedPicture.of(path_of(name)).image(torch.zeros(1))[0]
                 densities[name] = GazePrediction.of(detector, image).cells
-                known[name] = sizes[name]
+                picture_sizes[name] = sizes[name]
             bar.update()
-    return content_suspicions(records, densities, known)
+    return content_suspicions(records, densities, picture_sizes)

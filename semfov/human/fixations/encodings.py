@@ -46,8 +46,11 @@ def warn_of_letters(
     Returns:
         The records.
     """
+    if encoding != WINDOWS:
+        return fixations
     names = [name for record in fixations for name in (record.picture, record.subject, record.target or "")]
-    uncertain = [name for name in names if not name.isascii()] if encoding == WINDOWS else []
+    # Letters of ASCII are the same in all encodings that are read.
+    uncertain = [name for name in names if not name.isascii()]
     if uncertain:
         warnings.warn(
             f"{source}: is not UTF-8, so names are read as Western European ones of Windows ({WINDOWS}), such as "

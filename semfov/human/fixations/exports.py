@@ -155,8 +155,8 @@ class _Layout:
         Returns:
             The layout.
         """
-        known = {column.name for column in columns}
-        missing = ", ".join(repr(name) for name in named.values() if name not in known)
+        names_in_table = {column.name for column in columns}
+        missing = ", ".join(repr(name) for name in named.values() if name not in names_in_table)
         check_data(not missing, table, "the columns of columns=", f"none named {missing}")
         x, y = _point_columns(program, columns, table)
         names = {
@@ -261,9 +261,9 @@ def _warn_of_durations(program: Program, columns: Sequence[Column], table: str) 
 def _name_people(rows: Sequence[Row], subject: str | None, table: str) -> None:
     """Write the name of the person into rows: that of a user, else that of the table, else of the file."""
     # Exports of one person often have the name in that of the file alone; a data frame has no file.
-    unnamed = Path(table).stem if "." in table else "1"
+    default_name = Path(table).stem if "." in table else "1"
     for row in rows:
-        stored = row.fields["subject"] or unnamed
+        stored = row.fields["subject"] or default_name
         row.fields["subject"] = stored if subject is None else subject
 
 

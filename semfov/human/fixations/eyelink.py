@@ -138,14 +138,14 @@ def read_eyelink(
     check_data(bool(viewed), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials, lines))
 
     screen = _screen(path, lines, size)
-    with_one_eye = [replace(view, fixations=_of_one_eye(view.fixations, eye)) for view in viewed]
-    of_eye = [view for view in with_one_eye if view.fixations]
-    check_data(bool(of_eye), path, f"fixations of the {eye} eye", "those of the other one")
+    views_of_one_eye = [replace(view, fixations=_of_one_eye(view.fixations, eye)) for view in viewed]
+    views_of_eye = [view for view in views_of_one_eye if view.fixations]
+    check_data(bool(views_of_eye), path, f"fixations of the {eye} eye", "those of the other one")
     person = path.stem if subject is None else subject
-    records = [_record(view, screen, person) for view in of_eye]
+    records = [_record(view, screen, person) for view in views_of_eye]
 
     remarks = [*_lost(lines), *_outside_views(trials, fixations)]
-    of_other_eye = len(viewed) - len(of_eye)
+    of_other_eye = len(viewed) - len(views_of_eye)
     if of_other_eye:
         remarks.append(f"{of_other_eye} of {len(viewed)} pictures have no fixation of the {eye} eye")
     if remarks:
@@ -161,9 +161,10 @@ def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _
             raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
         return 0.0, 0.0, *size
     left, top, right, bottom = map(float, frame.groups())
-    # The message has the first and the last pixel.
-    width, height = (round(right - left) + 1, round(bottom - top) + 1) if size is None else size
-    return left, top, width, height
+    if size is None:
+        # The message has the first and the last pixel.
+        size = round(right - left) + 1, round(bottom - top) + 1
+    return left, top, *size
 
 
 def _record(view: _View, screen: _Place, person: str) -> Fixations:

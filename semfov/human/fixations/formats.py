@@ -137,19 +137,18 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
     """
     trials = []
     for scanpath in fixations:
-        x1, y1, x2, y2 = scanpath.box or (0.0, 0.0, 0.0, 0.0)
         trial = {
             "name": scanpath.picture,
             "subject": scanpath.subject,
             "task": scanpath.target,
-            "bbox": None if scanpath.box is None else [x1, y1, x2 - x1, y2 - y1],
+            "bbox": _bbox_of(scanpath.box),
             "X": scanpath.points[:, 0].tolist(),
             "Y": scanpath.points[:, 1].tolist(),
             "length": len(scanpath),  # which programs for this data set read
-            "T": None if scanpath.durations is None else scanpath.durations.tolist(),
+            "T": _milliseconds(scanpath),
             "fixOnTarget": scanpath.found,
         }
-        trials.append({key: value for key, value in trial.items() if value is not None})
+        trials.append(_without_none(trial))
     write_text(path, json.dumps(trials) + "\n")
 
 
@@ -208,14 +207,16 @@ def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> Non
     3
     """
     check(len({scanpath.size for scanpath in fixations}) <= 1, "fixations", "pictures of one size", "several sizes")
-    pictures: dict[str, list[dict[str, list[float]]]] = {}
+    pictures: dict[str, list[dict[str, object]]] = {}
     for picture, people in by_picture(fixations).items():
         pictures[picture] = []
         for scanpath in people:
-            person = {"x": scanpath.points[:, 0].tolist(), "y": scanpath.points[:, 1].tolist()}
-            if scanpath.durations is not None:
-                person["duration_ms"] = scanpath.durations.tolist()
-            pictures[picture].append(person)
+            person = {
+                "x": scanpath.points[:, 0].tolist(),
+                "y": scanpath.points[:, 1].tolist(),
+                "duration_ms": _milliseconds(scanpath),
+            }
+            pictures[picture].append(_without_none(person))
     write_text(path, json.dumps(pictures) + "\n")
 
 
@@ -300,7 +301,6 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
         expected = "one scanpath for each picture"
         check(scanpath.picture not in trials, "fixations", expected, f"several for {scanpath.picture}")
         width, height = scanpath.size
-        x1, y1, x2, y2 = scanpath.box or (0.0, 0.0, 0.0, 0.0)
         trial = {
             "subject": scanpath.subject,
             "image_height": height,
@@ -309,12 +309,12 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
             "screen_width": width,
             "X": scanpath.points[:, 0].tolist(),
             "Y": scanpath.points[:, 1].tolist(),
-            "T": None if scanpath.durations is None else scanpath.durations.tolist(),
+            "T": _milliseconds(scanpath),
             "target_object": scanpath.target,
-            "target_bbox": None if scanpath.box is None else [y1, x1, y2, x2],
+            "target_bbox": _rows_of_box(scanpath.box),
             "target_found": scanpath.found,
         }
-        trials[scanpath.picture] = {key: value for key, value in trial.items() if value is not None}
+        trials[scanpath.picture] = _without_none(trial)
     write_text(path, json.dumps(trials) + "\n")
 
 
@@ -354,6 +354,16 @@ def _flag(name: str, value: object) -> bool | None:
     return None if value is None else bool(value)
 
 
+def _without_none(values: Mapping[str, object]) -> dict[str, object]:
+    """Take the values that are known, by their keys."""
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _milliseconds(scanpath: Fixations) -> list[float] | None:
+    """List the durations of the fixations; None where they are not known."""
+    return None if scanpath.durations is None else scanpath.durations.tolist()
+
+
 def _edges_of(box: Sequence[float] | None) -> _Edges | None:
     """Find the edges x1, y1, x2 and y2 of a box `[x, y, width, height]`."""
     if box is None:
@@ -362,12 +372,28 @@ def _edges_of(box: Sequence[float] | None) -> _Edges | None:
     return float(x), float(y), float(x + width), float(y + height)
 
 
+def _bbox_of(box: _Edges | None) -> list[float] | None:
+    """Write the edges of a box as `[x, y, width, height]`."""
+    if box is None:
+        return None
+    x1, y1, x2, y2 = box
+    return [x1, y1, x2 - x1, y2 - y1]
+
+
 def _box_of_rows(box: Sequence[float] | None, is_in_cells: bool) -> _Edges | None:
     """Find the edges x1, y1, x2 and y2 of a box `[first row, first column, last row, last column]`."""
     if box is None:
         return None
     top, left, bottom, right = box
     return float(left), float(top), float(right + is_in_cells), float(bottom + is_in_cells)
+
+
+def _rows_of_box(box: _Edges | None) -> list[float] | None:
+    """Write the edges of a box in pixels as `[first row, first column, last row, last column]`."""
+    if box is None:
+        return None
+    x1, y1, x2, y2 = box
+    return [y1, x1, y2, x2]
 
 
 def _in_pictures(scanpaths: list[Fixations], sizes: Mapping[str, tuple[int, int]] | None) -> list[Fixations]:

@@ -75,8 +75,8 @@ def read_by(reader: _Reader, source: str | PathLike[str] | DataFrame, options: M
     if "size" in options and reader in (read_cocosearch, read_ruarte):
         expected = f"none for {source}, a file of {DATA_SETS[reader]}, whose frame is that of each trial"
         check(reader is read_cocosearch, "size", expected, options["size"])
-        others = {name: value for name, value in options.items() if name != "size"}
-        options = {"screen": options["size"], **others}
+        options_without_size = {name: value for name, value in options.items() if name != "size"}
+        options = {"screen": options["size"], **options_without_size}
     name = source if isinstance(source, str | PathLike) else "it"
     check_options(options, [*signature(reader).parameters][1:], f"{reader.__name__}, which reads {name}")
     try:
@@ -103,10 +103,15 @@ def reader_of(source: str | PathLike[str] | DataFrame, columns: Mapping[str, str
     if not isinstance(source, str | PathLike):
         return table_reader(source, columns)
     kind = Path(source).suffix.lower()
-    if kind == ".asc":
-        return read_eyelink
-    if kind != ".json":
-        return read_eyelink if kind == ".txt" and _is_eyelink(source) else table_reader(source, columns)
+    if kind == ".json":
+        return _json_reader(source)
+    # edf2asc writes .asc; some people rename it.
+    is_eyelink = kind == ".asc" or (kind == ".txt" and _is_eyelink(source))
+    return read_eyelink if is_eyelink else table_reader(source, columns)
+
+
+def _json_reader(source: str | PathLike[str]) -> _Reader:
+    """Choose the reader of a file of JSON by its beginning; raises `DataError` for other text."""
     beginning = _BEGINNING.match(read_text(source))
     if beginning is None:
         raise DataError(f"{source}: expected JSON, a list or an object, got other text; correct or replace the file")

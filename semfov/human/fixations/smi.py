@@ -86,8 +86,8 @@ class Events(NamedTuple):
             if kind.startswith("userevent"):
                 views += _views(fields, separator, f"{name}: {place}")
             elif kind.startswith("fixation"):
-                fits = len(fields) == len(columns)
-                check_data(fits, f"{name}: {place}", f"{len(columns)} fields", str(len(fields)))
+                has_all_fields = len(fields) == len(columns)
+                check_data(has_all_fields, f"{name}: {place}", f"{len(columns)} fields", str(len(fields)))
                 fixations.append(_Fixation(_time(fields[3], f"{name}: {place}"), place, fields))
 
         # Some texts have one kind of events, or one eye, after the other.

@@ -1,6 +1,7 @@
 """Tables in which a fixation is not one row with a column for x and one for y."""
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from semfov.human.fixations.columns import LOST, Row, Table
@@ -34,10 +35,16 @@ def _with_pairs(table: Table) -> Table:
         return table
     rows = []
     for row in table.rows:
-        pair = re.split(r"[,\s]+", row.fields.get(names["location"], "").strip("[]() "))
-        texts = pair if len(pair) == 2 else ("", "")
-        rows.append(row._replace(fields={**row.fields, **dict(zip(_PAIR, texts, strict=True))}))
+        text = row.fields.get(names["location"], "").strip("[]() ")
+        pair = re.split(r"[,\s]+", text)
+        x, y = pair if len(pair) == 2 else ("", "")
+        rows.append(_with_fields(row, _PAIR, (x, y)))
     return table._replace(columns=[*table.columns, *_PAIR], rows=rows)
+
+
+def _with_fields(row: Row, names: Sequence[str], texts: Sequence[str]) -> Row:
+    """Add fields of these names to a row."""
+    return row._replace(fields={**row.fields, **dict(zip(names, texts, strict=True))})
 
 
 class _Snapshot(NamedTuple):
@@ -48,14 +55,17 @@ class _Snapshot(NamedTuple):
 
     def has_fixation(self, row: Row) -> bool:
         """Tell whether a row has the place of a fixation on the snapshot."""
-        texts = [row.fields.get(self.columns.get(key, ""), "") for key in ("fixationx", "fixationy")]
-        return not any(text.lower() in LOST for text in texts)
+        place = self._texts(row, ("fixationx", "fixationy"))
+        return not any(text.lower() in LOST for text in place)
 
     def row(self, row: Row) -> Row:
         """Write what a row has of the snapshot into the columns of all snapshots."""
-        keys = ("fixationx", "fixationy", "eyemovementtype", "eyemovementtypeindex")
-        texts = [self.name, *(row.fields.get(self.columns.get(key, ""), "") for key in keys)]
-        return row._replace(fields={**row.fields, **dict(zip(_SNAPSHOT, texts, strict=True))})
+        texts = self._texts(row, ("fixationx", "fixationy", "eyemovementtype", "eyemovementtypeindex"))
+        return _with_fields(row, _SNAPSHOT, [self.name, *texts])
+
+    def _texts(self, row: Row, keys: Sequence[str]) -> list[str]:
+        """Take the fields of a row by the keys of the snapshot's columns; those that the table lacks are empty."""
+        return [row.fields.get(self.columns.get(key, ""), "") for key in keys]
 
 
 def _with_snapshots(table: Table) -> Table:

@@ -94,19 +94,19 @@ def multimatch(
     diagonal = float(np.hypot(*size))
     _check_spread(np.concatenate([p, q]), diagonal)
 
-    u = np.diff(p, axis=0)
-    v = np.diff(q, axis=0)
+    u = np.diff(p, axis=0)  # saccades, (n - 1, 2)
+    v = np.diff(q, axis=0)  # (m - 1, 2)
     i, j = _aligned(_distances(u, v))
-    u = u[i]
+    u = u[i]  # aligned, (k, 2) like v
     v = v[j]
     duration = float("nan")
     if durations is not None:
         s, t = _checked_durations(durations, len(p), len(q))
         duration = _duration_similarity(s[i], t[j])
 
-    difference = np.linalg.norm(u - v, axis=1)
+    difference = np.linalg.norm(u - v, axis=1)  # (k,), as all that follow
     turn = np.abs(_directions(u) - _directions(v))
-    angle = np.minimum(turn, 2 * np.pi - turn)
+    angle = np.minimum(turn, 2 * np.pi - turn)  # the shorter way around
     stretch = np.abs(np.linalg.norm(u, axis=1) - np.linalg.norm(v, axis=1))
     distance = np.linalg.norm(p[i] - q[j], axis=1)
     return MultiMatch(
@@ -243,13 +243,14 @@ def scanmatch(
         check_whole(count, "cells", 1, 1000)
     path = as_path(ours, "ours", least=1)
     other_path = as_path(theirs, "theirs", least=1)
-    word = cell_labels(path, columns, rows, size)
-    other_word = cell_labels(other_path, columns, rows, size)
+    word = cell_labels(path, columns, rows, size)  # (n,), cells as letters
+    other_word = cell_labels(other_path, columns, rows, size)  # (m,)
     if durations is not None:
         milliseconds, other_milliseconds = _pair(durations, "durations", "those of both scanpaths")
         word = _repeated(word, milliseconds, bin_ms)
         other_word = _repeated(other_word, other_milliseconds, bin_ms)
-    gain = threshold - _distances(_cells_of(word, columns), _cells_of(other_word, columns))
+    # The substitution matrix of the paper falls with the distance of cells, and is 0 at the threshold.
+    gain = threshold - _distances(_cells_of(word, columns), _cells_of(other_word, columns))  # (n, m)
     longer = max(len(word), len(other_word))
     return float(_best_alignment(gain, gap) / (threshold * longer))
 

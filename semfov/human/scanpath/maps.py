@@ -71,8 +71,8 @@ def auc_shuffled(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, other_x: Array
     >>> auc_shuffled([[0.0, 0.1], [0.2, 0.9]], [1], [1], [0, 1], [1, 1])
     0.75
     """
-    hits = _looked_up(saliency, x, y)[1]
-    others = np.sort(_looked_up(saliency, other_x, other_y)[1])
+    hits = _looked_up(saliency, x, y)[1]  # (n,)
+    others = np.sort(_looked_up(saliency, other_x, other_y)[1])  # (m,), ascending as `_share_below` needs them
     check(hits.size > 0 and others.size > 0, "x, other_x", "fixations of this picture and of others", "none")
     return float(_share_below(others, hits).mean())
 
@@ -102,6 +102,7 @@ def auc_borji(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, *, draws: int = 1
     check(fixated.size > 0, "x, y", "at least one fixation", "none")
     check_whole(draws, "draws", 1, 1_000_000)
     check_whole(seed, "seed", 0, 2**63 - 1)
+    # With repeats, as the authors draw pixels.
     samples = np.random.default_rng(seed).choice(values.reshape(-1), (draws, fixated.size))
     areas = [_share_below(np.sort(sample), fixated.reshape(-1)).mean() for sample in samples]
     return float(np.mean(areas))
@@ -128,9 +129,9 @@ def correlation(first: ArrayLike, second: ArrayLike) -> _Array:
         missing = int((~np.isfinite(values)).sum())
         got = f"NaN or infinity in {missing} of {values.size} pixels; replace them (numpy.nan_to_num)"
         check(missing == 0, "maps", "finite numbers", got)
-    one = one - one.mean(-1, keepdims=True)
+    one = one - one.mean(-1, keepdims=True)  # (..., H·W)
     other = other - other.mean(-1, keepdims=True)
-    covariance = (one * other).sum(-1)
+    covariance = (one * other).sum(-1)  # times the number of pixels, as the spread is
     spread = np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
     has_spread = spread > 0
     ratio = covariance / np.where(has_spread, spread, 1)
@@ -227,8 +228,8 @@ def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     """
     values, fixated = _looked_up(maps, x, y)
     check(bool(np.isfinite(values).all()), "maps", "finite numbers", "infinity; give densities, not their logarithms")
-    flat = values.reshape(*values.shape[:-2], -1)
-    mean = flat.mean(-1)[..., None]
+    flat = values.reshape(*values.shape[:-2], -1)  # (..., H·W)
+    mean = flat.mean(-1)[..., None]  # (..., 1)
     # By rounding the mean of equal values may differ from them, and their deviation from 0.
     is_constant = (np.ptp(flat, axis=-1) == 0)[..., None]
     deviation = np.where(is_constant, 1, flat.std(-1)[..., None])
@@ -260,14 +261,15 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     array([0.875])
     """
     values, fixated = _looked_up(maps, x, y)
-    ascending = np.sort(values.reshape(-1, _pixel_count(values)), axis=-1)
-    by_map = fixated.reshape(len(ascending), -1)
+    ascending = np.sort(values.reshape(-1, _pixel_count(values)), axis=-1)  # (maps, H·W)
+    by_map = fixated.reshape(len(ascending), -1)  # (maps, n)
     areas = [_share_below(pixels, scores) for pixels, scores in zip(ascending, by_map, strict=True)]
     return np.reshape(areas, fixated.shape)
 
 
 def _share_below(ordered: _Array, values: _Array) -> _Array:
     """Compute the fraction of ascending numbers that are lower than each of `values` `(n,)`; ties count half."""
+    # The number of lower ones, and of lower or equal ones: their mean counts ties half.
     twice = np.searchsorted(ordered, values) + np.searchsorted(ordered, values, side="right")
     return np.asarray(twice / (2 * len(ordered)))
 
@@ -293,7 +295,7 @@ def log_density(maps: ArrayLike, floor: float = 0.0) -> _Array:
     """
     check_number(floor, "floor", 0, 1)
     values = _as_maps(maps)
-    total = values.sum((-1, -2), keepdims=True)
+    total = values.sum((-1, -2), keepdims=True)  # (..., 1, 1)
     is_positive = bool((values >= 0).all() and (total > 0).all())
     is_finite = bool(np.isfinite(total).all())
     got = f"values from {values.min():g} to {values.max():g}, with sums from {total.min():g} to {total.max():g}"
@@ -326,7 +328,7 @@ def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> _Array:
     """
     values, fixated = _looked_up(density, x, y)
     with np.errstate(over="ignore", invalid="ignore"):
-        totals = np.exp(values).sum((-1, -2))
+        totals = np.exp(values).sum((-1, -2))  # (...), 1 for a density
     error = np.abs(totals - 1)
     is_normal = bool((np.isfinite(values.max((-1, -2))) & (error <= _ROUNDING)).all())
     got = f"exponentials with sum {totals.flat[error.argmax()]:g}; log_density makes them of maps"
@@ -406,6 +408,6 @@ def _looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[_Array, _Ar
     got = f"{int(outside.sum())} of {outside.size} outside it; remove them, or scale them to pixels of the map"
     check(not bool(outside.any()), "x, y", f"points inside a map of {width} × {height} pixels", got)
 
-    flat = values.reshape(*leading, -1)
-    pixel = (row * width + column).astype(np.int64)
+    flat = values.reshape(*leading, -1)  # (..., H·W), row by row
+    pixel = (row * width + column).astype(np.int64)  # (..., n)
     return values, np.take_along_axis(flat, pixel, axis=-1)

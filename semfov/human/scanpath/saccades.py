@@ -54,7 +54,7 @@ def length_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     b = np.sort(_sample(theirs, "theirs"))
     if not (len(a) and len(b)):
         return float("nan")
-    lengths = np.sort(np.concatenate([a, b]))
+    lengths = np.sort(np.concatenate([a, b]))  # (n + m,), where a distribution rises
     gap = _distribution(a, lengths) - _distribution(b, lengths)
     return float((np.abs(gap[:-1]) * np.diff(lengths)).sum())
 
@@ -93,7 +93,7 @@ def direction_distance(ours: ArrayLike, theirs: ArrayLike) -> float:
     # F - G is constant between one direction and the next.
     directions = np.sort(np.concatenate([f_sample, g_sample]))
     angles = np.concatenate([[0.0], directions, [2 * np.pi]])
-    spans = np.diff(angles)
+    spans = np.diff(angles)  # (n + m + 1,), as all that follow
     starts = angles[:-1]
     gap = _distribution(f_sample, starts) - _distribution(g_sample, starts)
     # The best c is the median of the gap, weighted by the spans, which sum to 2π.
