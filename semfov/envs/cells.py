@@ -96,6 +96,7 @@ class _SceneLooks(Looks):
         evidence_rows = sum(entered.rows(self._observer) for entered in self._scenes.values())
         self._first_rows[scene] = _FirstRows(evidence_rows, len(self._scenes) * len(self.grid))
         self._scenes[scene] = looks
+        # The tables lack the new scene, and are made again when they are read.
         self._evidence = None
         self._detections = None
 
@@ -104,7 +105,8 @@ class _SceneLooks(Looks):
         watch = Stopwatch()
         evidence = self._evidence_table()[self._evidence_row[episodes] + cell]
         watch.lap("weigh")
-        rows = self._detections_row[episodes] + cell
+        rows = self._detections_row[episodes] + cell  # (n,)
+        # Most steps need no detections, so that they are read only when they are asked for.
         return EpisodeLook(evidence, lambda: self._detections_table()[rows], watch.seconds)
 
     def _evidence_table(self) -> Look:
@@ -214,14 +216,15 @@ class CellGazes(Gazes[CellEpisode]):
     @torch.inference_mode()
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """Planes of probabilities, of the fixated cells and of the cell of the gaze, `(n, C+2, Y, X)`."""
-        visited = self.memory.visited[rows]
+        visited = self.memory.visited[rows]  # (n, X·Y)
         belief = self._belief_of(rows)
         gaze = torch.zeros_like(visited).scatter(1, self.cell[rows, None], True)
-        if self.searching:  # if no fixated cell holds the target
-            maps = belief.chance(self.targets[rows]).masked_fill(visited, 0.0)[:, None]
+        if self.searching:
+            # A search ends at its target, so that no fixated cell holds it.
+            maps = belief.chance(self.targets[rows]).masked_fill(visited, 0.0)[:, None]  # (n, 1, X·Y)
         else:
-            maps = belief.class_probabilities().mT
-        cell_planes = torch.stack([visited, gaze], 1).float()
+            maps = belief.class_probabilities().mT  # (n, C, X·Y)
+        cell_planes = torch.stack([visited, gaze], 1).float()  # (n, 2, X·Y)
         planes = torch.cat([maps.float().clamp(0, 1), cell_planes], 1)
         return planes.numpy().reshape(len(rows), -1, *self.scenery.shape)
 
@@ -250,7 +253,7 @@ class CellGazes(Gazes[CellEpisode]):
         boxes = None
         if isinstance(episode, Trial):
             objects = scenery.annotation(episode.scene)
-            boxes = objects.boxes[objects.labels == episode.target]
+            boxes = objects.boxes[objects.labels == episode.target]  # (M, 4)
         path = self.scanpath()
         view = self._stimulus.views(path.fixations[-1:])[0]
         image = reduced_copy(scenery.image(episode.scene)).float() / 255
@@ -276,13 +279,15 @@ class CellGazes(Gazes[CellEpisode]):
     def _enter(self, rows: Tensor, episodes: Sequence[CellEpisode]) -> None:
         """Take the scenes, the targets and the goals of episodes."""
         scenes = [episode.scene for episode in episodes]
+        targets = None
         if self.searching:
             trials = [episode for episode in episodes if isinstance(episode, Trial)]
-            self.targets[rows] = torch.tensor([trial.cue for trial in trials])
+            targets = torch.tensor([trial.cue for trial in trials])  # (n,)
+            self.targets[rows] = targets
             self._right[rows] = _goals(trials, self._right.shape[1])
         else:
-            self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])
-        self.looks.enter(rows, scenes, self.targets[rows] if self.searching else None)
+            self._right[rows] = torch.stack([self.scenery.answers(scene) for scene in scenes])  # (n, X·Y, C)
+        self.looks.enter(rows, scenes, targets)
         self.size[rows] = torch.stack([self.scenery.grid(scene).extent for scene in scenes])
 
     def check_saved(self, saved: SavedGazes) -> None:
@@ -319,12 +324,13 @@ class CellGazes(Gazes[CellEpisode]):
 
     def _rate(self, rows: Tensor) -> None:
         """Compare the gaze of the rows `(n,)` with their goals, or their maps with the right classes."""
-        right = self._right[rows]
+        right = self._right[rows]  # (n, X·Y) in a search, (n, X·Y, C) in an exploration
         if self.searching:
             self.result[rows] = right[torch.arange(len(rows)), self.cell[rows]].float()
         else:
-            hits = right_cells(self._belief_of(rows).class_probabilities(), right).sum(-1)
-            self.result[rows] = hits / right.any(-1).sum(-1)
+            hits = right_cells(self._belief_of(rows).class_probabilities(), right).sum(-1)  # (n,)
+            cells_with_objects = right.any(-1).sum(-1)
+            self.result[rows] = hits / cells_with_objects
 
     def _new_trace(self) -> Trace:
         """Make the trace of the first episode, before its first look."""

@@ -194,9 +194,10 @@ class Gazes(ABC, Generic[_Episode]):
             The outcome of the step.
         """
         self.shift[rows] += 1
-        result_before = self.result[rows]
-        done = self._look(rows, actions)
+        result_before = self.result[rows]  # (n,), a copy: the look changes the results
+        done = self._look(rows, actions)  # (n,)
         gain = self.result[rows] - result_before
+        # An episode whose last look finds the target is done, and not cut short.
         truncated = ~done & (self.shift[rows] >= self.scenery.shifts)
         return Outcome(self.find * gain.double() - self.look_cost, done, truncated)
 
@@ -255,7 +256,7 @@ class Gazes(ABC, Generic[_Episode]):
             # Scenes have sizes of their own, so that each view is resized alone.
             glimpse = interpolate(self._view(row), (side, side), mode="bilinear", antialias=True)
             glimpses.append(glimpse)
-        pixels = torch.cat(glimpses).clamp(0, 1).mul(255).round().byte()
+        pixels = torch.cat(glimpses).clamp(0, 1).mul(255).round().byte()  # (n, 3, side, side)
         channels_last = pixels.permute(0, 2, 3, 1)
         return np.ascontiguousarray(channels_last.numpy())
 
@@ -269,7 +270,7 @@ class Gazes(ABC, Generic[_Episode]):
         Returns:
             The infos, each array `(n, ...)`.
         """
-        passes = self.shift[rows] + 1
+        passes = self.shift[rows] + 1  # with the first look, to which no gaze shift leads
         entries: Arrays = {
             "passes": passes.numpy(),
             "pixels": (passes * self.scenery.pixels).numpy(),

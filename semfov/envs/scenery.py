@@ -329,8 +329,9 @@ class ZoomScenery(_Surroundings[WindowEye]):
             sizes = {open_large(pictures.root / str(name)).size for name in pictures.ids}
         else:
             sizes = {pictures.annotation(index).size for index in range(len(pictures))}
+        # Most pictures of a folder have one of a few sizes, and a lattice depends on the size alone.
         lattices = [Lattice.over(size, self.eye.detector.input_size, finest=self.eye.finest) for size in sizes]
-        return max(len(lattice) for lattice in lattices)
+        return max(map(len, lattices))
 
     def targets(self, scene: int) -> list[int]:
         if self.annotated:
@@ -361,25 +362,25 @@ class ZoomScenery(_Surroundings[WindowEye]):
         """
         for _ in range(_DRAWS):
             picture = int(random.integers(len(self.pictures))) if scene is None else scene
-            if task == "search":
-                targets = self.episodes(picture)
-                if targets:
-                    return picture, targets[random.integers(len(targets))]
-                continue
-            # Nobody knows whether a picture without annotations shows objects.
-            may_have_objects = not self.annotated or len(self.pictures.annotation(picture).boxes) > 0
-            if may_have_objects:
+            if task == "exploration" and self._may_have_objects(picture):
                 return picture, 0
+            if task == "search" and self.episodes(picture):
+                targets = self.episodes(picture)
+                return picture, targets[random.integers(len(targets))]
         raise DataError(
             "scenes: expected pictures with objects to look for, found none; give other pictures or targets"
         )
+
+    def _may_have_objects(self, scene: int) -> bool:
+        """Tell whether a picture has objects; without annotations nobody knows, so that it may."""
+        return not self.annotated or len(self.pictures.annotation(scene).boxes) > 0
 
     def found(self, looks: Sequence[WindowLook], scene: int, target: int) -> bool:
         """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
         if not self.annotated:
             return any(float(look.show[target - 1]) >= SCORE_THRESHOLD for look in looks)
         annotation = self.pictures.annotation(scene)
-        is_target = annotation.labels == target
+        is_target = annotation.labels == target  # (M,)
         objects = Annotation(
             annotation.boxes[is_target], annotation.labels[is_target], annotation.crowd[is_target], annotation.size
         )

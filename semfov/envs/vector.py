@@ -148,6 +148,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         if mask is None:
             return self._rows
         flags = np.asarray(mask)
+        # Like Gymnasium, which refuses a mask that selects none.
         is_mask = flags.shape == (self.num_envs,) and flags.dtype == np.bool_
         expected = f"{self.num_envs} booleans, one for each environment, at least one of them true"
         check(is_mask and bool(flags.any()), "reset_mask", expected, repr(mask))
@@ -192,7 +193,8 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         if not self.gazes.episodes:
             raise InputError("step: expected episodes in progress, got none; call reset first")
         mode = self.metadata["autoreset_mode"]
-        over = self._terminated | self._truncated
+        over = self._terminated | self._truncated  # (num_envs,), before this step
+        # The action for an episode that is over means nothing.
         reward = self._move((~over).nonzero()[:, 0], cells)
         if mode == AutoresetMode.NEXT_STEP:
             self._start(over.nonzero()[:, 0], {})
@@ -264,7 +266,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
 
         Gymnasium keeps them among the infos where a reset follows in the same step.
         """
-        observations = self.gazes.observe(rows)
+        observations = self.gazes.observe(rows)  # (n, ...) each
         final_observations = np.full(self.num_envs, None, dtype=object)
         is_final = np.zeros(self.num_envs, dtype=bool)
         for number, row in enumerate(rows.tolist()):

@@ -109,8 +109,9 @@ class WindowGaze(Gazes[_WindowEpisode]):
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
         """Lay out the probability that closer looks find an object, and how closely each place was looked at."""
-        probability = 1 - torch.exp(-self._expected_objects())
-        closeness = adaptive_max_pool2d(self._closeness(), self.shape)
+        # Of a number of objects that is Poisson distributed, the probability that it is not 0.
+        probability = 1 - torch.exp(-self._expected_objects())  # (1, Y, X)
+        closeness = adaptive_max_pool2d(self._closeness(), self.shape)  # (1, Y, X)
         return torch.cat([probability, closeness]).clamp(0, 1).numpy()[None]
 
     def _expected_objects(self) -> Tensor:
@@ -120,8 +121,9 @@ class WindowGaze(Gazes[_WindowEpisode]):
         assert belief is not None
         expected = torch.zeros(lattice.rows, lattice.columns)
         if lattice.levels > 1:
+            # Level 0 is the whole picture, which was looked at first.
             by_level = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
-            expected = torch.stack(by_level).amax(0)
+            expected = torch.stack(by_level).amax(0)  # (rows, columns) of the lattice
         # Objects of each place: the mean of its cells times their number.
         rows, columns = self.shape
         mean = adaptive_avg_pool2d(expected[None], self.shape)
@@ -133,7 +135,7 @@ class WindowGaze(Gazes[_WindowEpisode]):
         closeness = torch.zeros(1, lattice.rows, lattice.columns)
         for window in self.done:
             x1, y1, x2, y2 = window.cells
-            cells = closeness[0, y1:y2, x1:x2]
+            cells = closeness[0, y1:y2, x1:x2]  # a view, so that clamping it in place changes the whole
             cells.clamp_(min=(window.level + 1) / lattice.levels)
         return closeness
 
@@ -223,6 +225,7 @@ def _numbers_of(action: object) -> NDArray[np.float64]:
 def _window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
     """Find the window of the lattice that is nearest to an action `(x, y, magnification)`."""
     x, y, magnification = action.tolist()
+    # Each level magnifies twice as much as the one before, and takes an equal step of the action.
     level = round(magnification * (lattice.levels - 1))
     column = _nearest_place(lattice, level, 0, x)
     row = _nearest_place(lattice, level, 1, y)

@@ -50,7 +50,8 @@ def read_areas(areas: AreasLike, size: tuple[int, int], names: Sequence[str] = (
     {'logo': (10.0, 20.0, 200.0, 80.0)}
     """
     boxes: Mapping[str, object] = boxes_of(areas)
-    if boxes and all(isinstance(value, Mapping) for value in boxes.values()):
+    are_by_picture = [isinstance(value, Mapping) for value in boxes.values()]
+    if boxes and all(are_by_picture):
         boxes = _boxes_in_picture(boxes, names)
     check(0 < len(boxes) <= _MOST, "areas", f"1 to {_MOST} areas by name", len(boxes))
     return {name: _checked(name, box, size) for name, box in boxes.items()}
@@ -149,8 +150,8 @@ def share_in(density: Tensor, area: Area) -> float:
     """
     left, top, right, bottom = area
     height, width = density.shape
-    rows = _covered(height, top, bottom)
-    columns = _covered(width, left, right)
+    rows = _covered(height, top, bottom)  # (H,)
+    columns = _covered(width, left, right)  # (W,)
     return float(rows @ density.double() @ columns)
 
 

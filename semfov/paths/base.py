@@ -163,7 +163,7 @@ class Record(Conversion):
             # Read no more pixels than the detector saw of it.
             width_seen = max(1, round(width * look.more.get("magnification", 1.0)))
             pixels = read_region(source, region, self.size, width_seen)
-            boxes = look.detections.boxes[0]
+            boxes = look.detections.boxes[0]  # (L, 4)
             boxes_in_view = boxes - boxes.new_tensor([left, top, left, top])
             x, y = look.fixation
             yield LookView(pixels, (width, bottom - top), boxes_in_view, (x - left, y - top))
@@ -178,6 +178,7 @@ class Record(Conversion):
         Returns:
             The fixations, with the target of a search and whether it was found.
         """
+        # (n, 2), also without a fixation.
         points = torch.tensor([look.fixation for look in self.fixated], dtype=torch.float64).view(-1, 2).numpy()
         found = None if self.target is None else self.found
         return Fixations(picture, subject, points, self.size, target=self.target_name, found=found)
@@ -395,8 +396,9 @@ class Moment(Record):
 
         image = as_image(frame, argument="frame", color=color)
         width, height = self.size
-        size = tuple(image.shape[:0:-1])
+        size = tuple(image.shape[:0:-1])  # of (3, H, W), width first
         check(size == self.size, "frame", f"{width} × {height} px", size)
         drawing_size = self.size if longest is None else reduced(self.size, longest)
+        # In RGB, from which OpenCV differs by the order of the channels alone.
         drawing = draw_moment(image, self, self.describe(), drawing_size)
         return np.ascontiguousarray(drawing[..., ::-1]) if color == "bgr" else drawing

@@ -37,11 +37,14 @@ class Cautions(NamedTuple):
             yield f"this picture has one colour, so the map only says {said}"
         elif self.unlike:
             yield "this picture is unlike the photographs that the model learned from, so the map may be wrong"
-        if self.is_shipped:
-            if max(width, height) < _SMALL:
-                yield f"{width} × {height} px show little, and the model learned from pictures of 640 px and more"
-            if not self.panorama:
-                yield from self._proportions()
+        # The pictures of a model that a user has fitted are not known.
+        if not self.is_shipped:
+            return
+        if max(width, height) < _SMALL:
+            yield f"{width} × {height} px show little, and the model learned from pictures of 640 px and more"
+        # A panorama is looked at in views, and not as a whole.
+        if not self.panorama:
+            yield from self._proportions()
 
     def _proportions(self) -> Iterator[str]:
         """Say how the shape of the picture differs from those of the shipped fits."""

@@ -6,6 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from os import PathLike, fspath
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
@@ -172,9 +173,11 @@ class Conversion(Outcome, OtherWords):
         if self.best_place is not None:
             x1, y1, x2, y2 = self.best_place[0].tolist()
             return _rounded_place((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2)
-        point = (None, None) if self.found_at is None else self.found_at
-        found_box = decision.box if decision.outcome == "found" else None
-        return _rounded_place(*point, *([None] * 4 if found_box is None else found_box.tolist()))
+        x, y = self.found_at or (None, None)
+        edges = [None] * 4
+        if decision.outcome == "found" and decision.box is not None:
+            edges = decision.box.tolist()
+        return _rounded_place(x, y, *edges)
 
     def object_rows(self) -> list[Values]:
         """Make a table of the objects, of plain values, most confident first.
@@ -261,9 +264,8 @@ class Conversion(Outcome, OtherWords):
         if table == "objects":
             return self.object_rows(), list(self._columns)
         rows = self.rows()
-        columns: dict[str, None] = {}  # in the order in which rows first have them
-        for row in rows:
-            columns |= dict.fromkeys(row)
+        # Looks of one record may have other columns, which stand in the order in which rows first have them.
+        columns = dict.fromkeys(chain.from_iterable(rows))
         return rows, list(columns)
 
     def to_supervision(self) -> supervision.Detections:

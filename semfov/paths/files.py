@@ -191,6 +191,7 @@ class Format:
         """
         tensors, record = read(path, self.kind)
         record.pop("kind")
+        # First of all, as the schema knows the present names alone.
         _rename_former(record)
         unknown = record.keys() - self.schema.record.keys()
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
@@ -232,6 +233,7 @@ def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
     """Collect the tensors that all records have: detections, the photograph, and boxes of decision and closer looks."""
     tensors = {}
     for name in (*_DETECTIONS, "confidence"):
+        # Batches of one become rows, one look after the other.
         tensors[name] = torch.cat([getattr(look, name)[0] for look in outcome.detections])
     if outcome.decision is not None and outcome.decision.box is not None:
         tensors["box"] = outcome.decision.box
@@ -249,6 +251,7 @@ def _separated(tensors: Mapping[str, Tensor], lengths: list[int]) -> tuple[Detec
         tensors: boxes `(M, 4)`, scores, mask, and from present versions confidence of all looks.
         lengths: number of detections of each look, with sum M.
     """
+    # Files of earlier versions have no confidence, which detections then take from their scores.
     columns = [tensors[name].split(lengths) for name in (*_DETECTIONS, "confidence") if name in tensors]
     looks = []
     for parts in zip(*columns, strict=True):
@@ -289,6 +292,7 @@ def _check_closer(closer: Sequence[Mapping[str, Any]], boxes: int, looks: int, c
     check(boxes == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", boxes)
     expected = f"a look below {looks} and the index of a class"
     for values in closer:
+        # Either number may be missing, and neither may be beyond the looks.
         look = max(values["fixation"] or 0, values["number"] or 0)
         check(look < looks and _is_class(values["target"], classes), "closer", expected, values)
 

@@ -1,6 +1,5 @@
 """The looks of a fovea: fixations of cells, and closer looks at places of the photograph itself."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -8,7 +7,7 @@ from torch import Tensor
 
 from semfov.belief import Grid
 from semfov.detection.detections import Detections
-from semfov.paths.look import Box, RecordedLook, cell_columns
+from semfov.paths.look import Box, RecordedLook, cell_columns, finite_or_none
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -110,7 +109,7 @@ class FoveaLooks:
             region=region,
             detections=detections,
             seconds=self._clock if stages else None,
-            value=value if value is not None and math.isfinite(value) else None,
+            value=finite_or_none(value),
             more={**cell_columns(self.grid, cell, self._probability), "presence": self._presence},
             cell=cell,
             stages=stages,

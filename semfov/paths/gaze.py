@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.data.classes import amount
 from semfov.data.fixations import Fixations
 from semfov.detection import Detector, FeatureMaps
 from semfov.errors import InputError, check, check_number, check_whole, checked_keywords, lookup
@@ -123,6 +124,7 @@ class GazePrediction(OtherWords):
         lookup(quality, get_args(Quality), "quality")
         is_wide = size[0] >= _ROUND * size[1]
         check(is_wide or not panorama, "panorama", "a picture that is at least 1.5 times as wide as high", size)
+        # A copy, as the shipped model is shared by all predictions.
         suits = image.dtype == fitted.read.dtype and image.device == fitted.read.device
         converted = fitted if suits else deepcopy(fitted).to(image)
         if seen is None:
@@ -184,11 +186,12 @@ class GazePrediction(OtherWords):
     @property
     def parts(self) -> dict[str, float]:
         """What each term adds: divergence in bits of the density from the one without the term, by its name."""
-        log_density = self.cells.log()
+        log_density = self.cells.log()  # (rows, columns)
         parts = {}
         for name in self.terms:
             others = (term[0] for other, term in self.terms.items() if other != name)
             without = sum(others, torch.zeros_like(log_density))
+            # The sum of the other terms is a log density up to a constant, which is subtracted.
             log_ratio = log_density - without + without.logsumexp((0, 1))
             parts[name] = float((self.cells * log_ratio).sum() / math.log(2))
         return parts
@@ -317,9 +320,9 @@ class GazePrediction(OtherWords):
 
     def _starts(self, people: int, generator: torch.Generator) -> Tensor:
         """Draw the first fixation of each viewer, `(people, 2)`, within two standard deviations and the picture."""
-        side = torch.tensor(self.size)
+        side = torch.tensor(self.size)  # (2,)
         drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
-        mean, spread = self.model.start.cpu().float()
+        mean, spread = self.model.start.cpu().float()  # (2,) both, shares of the sides
         start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
         return torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
 
@@ -338,12 +341,12 @@ class GazePrediction(OtherWords):
         """
         milliseconds = seconds * 1000
         count = min(_MOST_FIXATIONS, math.ceil(milliseconds / _SHORTEST) + 1)
-        distributions = self.model.duration.cpu().float()
+        distributions = self.model.duration.cpu().float()  # (fixations, 2), mean and spread of the logarithm
         later = distributions[-1:].expand(max(count - len(distributions), 0), -1)
-        mean, spread = torch.cat([distributions, later])[:count].unbind(1)
-        durations = (mean + spread * torch.randn(people, count, generator=generator)).exp()
+        mean, spread = torch.cat([distributions, later])[:count].unbind(1)  # (count,) both
+        durations = (mean + spread * torch.randn(people, count, generator=generator)).exp()  # (people, count)
         ends = (durations + self.model.pause.cpu().float()).cumsum(1)
-        ended_in_time = (ends < milliseconds).sum(1)
+        ended_in_time = (ends < milliseconds).sum(1)  # (people,)
         return durations, (ended_in_time + 1).clamp(max=count)  # the last one begins in the time and ends after it
 
     @property
@@ -366,15 +369,13 @@ class GazePrediction(OtherWords):
         Returns:
             `(rows, columns)`; the density of all fixations where no scanpath is long enough.
         """
-        points = [
-            torch.from_numpy(scanpath.resized(self.size).points[:number])
-            for scanpath in scanpaths
-            if len(scanpath) >= number
-        ]
-        if not points:
+        candidates = [scanpath.resized(self.size) for scanpath in scanpaths if len(scanpath) >= number]
+        if not candidates:
             return self.cells
+        points = [torch.from_numpy(scanpath.points[:number]) for scanpath in candidates]
         with torch.no_grad():
-            terms = self.model.given(self.terms, self.size[::-1], torch.stack(points).float())
+            terms = self.model.given(self.terms, self.size[::-1], torch.stack(points).float())  # points (n, number, 2)
+        # Terms are summands of a logarithm, (n, rows, columns) each.
         log_density = torch.stack([*terms.values()]).sum(0).flatten(1)
         return log_density.softmax(1).mean(0).view_as(self.cells)
 
@@ -530,7 +531,7 @@ class GazePrediction(OtherWords):
         first = ", then ".join(f"({place['x']:.0f}, {place['y']:.0f})" for place in self.first_fixations())
         limit = ""
         if self.seen is not None:
-            limit = f", after {self.seen} fixation{'s' if self.seen != 1 else ''} seen by the fovea"
+            limit = f", after {amount(self.seen, 'fixation')} seen by the fovea"
         return f"people look first at {first}{limit}"
 
     def __str__(self) -> str:
@@ -554,7 +555,7 @@ class GazePrediction(OtherWords):
             # Beyond an edge lie the cells of the other one.
             round_the_seam = torch.cat([log[:, -1:], log, log[:, :1]], 1)
             rows = F.interpolate(round_the_seam[None, None], (height, columns), mode="bilinear")[0, 0]
-            pixels = rows @ interpolation(width, 1, columns - 1, columns, log.dtype, log.device).mT
+            pixels = rows @ interpolation(width, 1, columns - 1, columns, log.dtype, log.device).mT  # (H, W)
         else:
             pixels = F.interpolate(log[None, None], (height, width), mode="bilinear", align_corners=False)[0, 0]
         return (pixels - pixels.logsumexp((0, 1))).exp()
@@ -566,7 +567,7 @@ class GazePrediction(OtherWords):
 
 def _is_blank(photograph: Tensor) -> bool:
     """Tell whether a picture `(3, h, w)` in bytes has one colour."""
-    lowest, highest = photograph.flatten(1).aminmax(dim=1)
+    lowest, highest = photograph.flatten(1).aminmax(dim=1)  # (3,) both
     return int((highest.int() - lowest.int()).max()) <= _BLANK
 
 

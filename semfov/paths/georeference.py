@@ -112,9 +112,10 @@ def box_on_earth(corners: NDArray[np.float64], place: PlaceOnEarth) -> Geometry:
     Returns:
         A polygon, or two where the box crosses the antimeridian.
     """
-    share = np.arange(_STEPS)[:, None] / _STEPS
-    to_next = np.roll(corners, -1, 0) - corners
-    sides = corners[:, None] + to_next[:, None] * share
+    # A side of the box in pixels is a curve on earth, which its corners alone would cut short.
+    share = np.arange(_STEPS)[:, None] / _STEPS  # (steps, 1)
+    to_next = np.roll(corners, -1, 0) - corners  # (4, 2)
+    sides = corners[:, None] + to_next[:, None] * share  # (4, steps, 2)
     return polygon_on_earth(place(sides.reshape(-1, 2)), _STEPS)
 
 
@@ -131,8 +132,9 @@ def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> Geometry:
     >>> polygon_on_earth(np.array([[200.0, 1], [201, 1], [201, 2], [200, 2]]))["coordinates"][0][0]
     [-160.0, 1.0]
     """
-    longitude = _unwrapped(ring[:, 0])
-    latitude = ring[:, 1]
+    longitude = _unwrapped(ring[:, 0])  # (N + 1,)
+    latitude = ring[:, 1]  # (N,)
+    # Back at the first corner, the longitude differs by a whole turn if a pole lies inside.
     if abs(longitude[-1] - longitude[0]) > 180:
         corners = _with_pole(longitude, latitude)
     else:

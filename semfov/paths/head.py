@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.data.classes import amount
 from semfov.data.windowed import LargePicture
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
@@ -23,7 +24,7 @@ from semfov.kinds import HEAD
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS, Values
 from semfov.paths.files import POSITIVE, Format, SharedFields, check_decided_cell
-from semfov.paths.look import LookView, RecordedLook, cell_columns, read_region, whole_pixels
+from semfov.paths.look import LookView, RecordedLook, cell_columns, finite_or_none, read_region, whole_pixels
 from semfov.paths.merging import distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
 from semfov.paths.words import Words
@@ -45,6 +46,7 @@ _WORLD = {
     "tilt": Array(Number(-90, 90), 2),
 }
 
+# Of n looks over the cells of a scene.
 _FORMAT = Format(
     "head path",
     {
@@ -78,8 +80,8 @@ class HeadWords(Words):
         if record.decision is not None and record.target_name is not None:
             verdict = self.verdict(record.target_name, ":")
             outcome = f"{verdict} (there with probability {record.decision.probability:.2f})"
-        looks = f"{len(record)} look{'s' if len(record) != 1 else ''}"
-        turns = f"{record.turns} turn{'s' if record.turns != 1 else ''} of the head"
+        looks = amount(len(record), "look")
+        turns = f"{amount(record.turns, 'turn')} of the head"
         seconds = record.seconds[-1] if record.looks else 0.0
         return f"{outcome} in {seconds:.1f} s of eye and head: {looks}, {turns}"
 
@@ -131,7 +133,8 @@ def head_look(
         value: expected gain per second for which it was chosen; infinite for the first.
     """
     world = views.world
-    pose = views.poses[action // views.cells]
+    # Actions count the cells of a view, pose by pose.
+    pose = views.poses[action // views.cells]  # (3,)
     pan, tilt, field = pose.tolist()
     x, y = world.pixels_of(views.gaze[[action]])[0].tolist()
     whole_view = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
@@ -144,7 +147,7 @@ def head_look(
         region=(x1, y1, x2, y2),
         detections=replace(in_view, boxes=boxes_in_picture),
         seconds=seconds,
-        value=value if math.isfinite(value) else None,
+        value=finite_or_none(value),
         more={"action": action, "pan": pan, "tilt": tilt, "field": field, **cells},
         action=action,
         in_view=in_view,
@@ -220,6 +223,7 @@ class HeadPath(Record):
     def turns(self) -> int:
         """Number of times that the head moved."""
         poses = [action // self.views.cells for action in self.actions]
+        # An eye that moves within a view leaves the head where it is.
         return sum(pose != pose_before for pose_before, pose in pairwise(poses))
 
     @cached_property
@@ -247,7 +251,7 @@ class HeadPath(Record):
 
     def _cut_by_border(self, look: HeadLook) -> Tensor:
         """Tell which boxes of a look end at the border of its view, `(L,)`, so that they may show a part alone."""
-        boxes = look.in_view.boxes[0]
+        boxes = look.in_view.boxes[0]  # (L, 4)
         width, height = self.views.world.size
         upper_left = boxes.new_tensor([_BORDER, _BORDER])
         lower_right = boxes.new_tensor([width - _BORDER, height - _BORDER])
@@ -274,7 +278,8 @@ class HeadPath(Record):
         """List the objects, with `pan` to the right and `tilt` up of the middle of each box, in degrees."""
         rows = super().object_rows()
         world = self.views.world
-        middles = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2)
+        # Without objects the tensor has no second dimension by itself.
+        middles = torch.tensor([[row["x"], row["y"]] for row in rows], dtype=torch.float64).view(-1, 2)  # (M, 2)
         points = middles - 0.5  # pixel centres at integers
         in_scene = panorama_directions(points, self.size) if isinstance(world, Sphere) else points
         for row, (pan, tilt) in zip(rows, world.angles_of(in_scene).tolist(), strict=True):
@@ -327,7 +332,7 @@ class HeadPath(Record):
             The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
         """
         detections = self.looks[self._place(look, "look")].in_view
-        confidence = detections.confidence[0]
+        confidence = detections.confidence[0]  # (L,), as labels and mask
         labels = detections.labels[0]
         chosen = detections.mask[0] & (confidence >= score)
         if self.target is not None:
@@ -343,6 +348,7 @@ class HeadPath(Record):
         if isinstance(places, Regions):
             x, y = (world.pixels_of(places.outlines()[0]) + 0.5).unbind(-1)
             return torch.stack([x if self.around is None else _unwrapped(x, self.around), y], -1)
+        # A flat scene is seen straight on, so that the view is a rectangle.
         x1, y1, x2, y2 = places.boxes[0].tolist()
         return torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
 
@@ -369,6 +375,7 @@ class HeadPath(Record):
     def _window_of(self, look: HeadLook, image: Tensor) -> Tensor:
         """Cut the view of a look out of a flat picture `(3, H, W)` in any size, at the size of a view."""
         height, width = image.shape[-2:]
+        # Regions are in pixels of the picture that was looked at.
         scale_x = width / self.size[0]
         scale_y = height / self.size[1]
         x1, y1, x2, y2 = look.region
@@ -399,6 +406,7 @@ class HeadPath(Record):
         views = _views_of_file(record)
         cells = len(views.world.scene)
         actions = tensors["actions"]
+        # Poses and cells follow from the settings of the scene, which the actions have to suit.
         highest = int(actions.max())
         check(highest < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", highest)
         maps = tensors["maps"]
@@ -411,7 +419,7 @@ class HeadPath(Record):
 
 def _unwrapped(x: Tensor, around: float) -> Tensor:
     """Join the columns `(P,)` of a closed line, each the shorter way round from the one before, across the seam."""
-    step = (x.diff() + around / 2) % around - around / 2
+    step = (x.diff() + around / 2) % around - around / 2  # (P - 1,), from -around / 2 to around / 2
     return torch.cat([x[:1], x[:1] + step.cumsum(0)])
 
 

@@ -1,5 +1,6 @@
 """One look of a record: where it was, what it detected, and what it showed."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -7,6 +8,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.data.classes import amount
 from semfov.data.windowed import LargePicture, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.objects import box_text
@@ -51,8 +53,13 @@ class RecordedLook:
         """Tell number, point, region and number of detections from score 0.1 on in one line."""
         x, y = self.fixation
         count = int(confident_detections(self.detections).count)
-        detections = f"{count} detection{'s' if count != 1 else ''} from score {CONFIDENT:g} on"
+        detections = f"{amount(count, 'detection')} from score {CONFIDENT:g} on"
         return f"{type(self).__name__} {self.number} at ({x:.0f}, {y:.0f}), box {box_text(self.region)}: {detections}"
+
+
+def finite_or_none(value: float | None) -> float | None:
+    """Take the value of a look for its record; None for the infinite one of a look that was not chosen by a value."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 class LookView(NamedTuple):

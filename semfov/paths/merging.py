@@ -50,9 +50,10 @@ def merge_fixations(
 
 def _columns_of_fixation(detections: Detections, distances: Tensor, cut: Tensor, number: int) -> list[Tensor]:
     """Make the columns that `merge_looks` takes of the detections of a fixation, the nearer the sharper."""
-    confidence = detections.confidence[0]
+    confidence = detections.confidence[0]  # (L,), as all columns but the boxes
     chosen = detections.mask[0] & (confidence >= FAINTEST)
     numbers = torch.full_like(chosen, number, dtype=torch.int64)
+    # The last one is the sharpness: a fovea shows most where it looks.
     columns = (detections.boxes[0], confidence, detections.labels[0], numbers, cut, -distances)
     return [column[chosen].detach().cpu() for column in columns]
 
@@ -79,6 +80,6 @@ def distances_to(boxes: Tensor, point: Tensor) -> Tensor:
     Returns:
         `(L,)`, 0 inside a box.
     """
-    point = (point + 0.5).to(boxes)
-    outside = torch.maximum(boxes[:, :2] - point, point - boxes[:, 2:]).clamp(min=0)
+    point = (point + 0.5).to(boxes)  # from the border of a pixel, as the edges of boxes
+    outside = torch.maximum(boxes[:, :2] - point, point - boxes[:, 2:]).clamp(min=0)  # (L, 2), along x and y
     return torch.linalg.vector_norm(outside, dim=-1)

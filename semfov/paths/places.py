@@ -26,9 +26,10 @@ def places_of(cells: Tensor, size: tuple[int, int], *, around: bool = False) -> 
     Returns:
         The places, by their shares.
     """
-    centres = _cell_centres(cells, size)
-    distance = _distances(centres, size[0] if around else None) / (REACH * max(size))
-    density = cells.flatten()
+    centres = _cell_centres(cells, size)  # (N, 2)
+    # In reaches of a place, so that 1 is its border.
+    distance = _distances(centres, size[0] if around else None) / (REACH * max(size))  # (N, N)
+    density = cells.flatten()  # (N,), as the shares and what is free
     share = (distance <= 1).to(cells) @ density
     weighted_share = (1 - distance).clamp(min=0).to(cells) @ density
     places: list[Place] = []

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief import Belief, Grid
+from semfov.data.classes import amount
 from semfov.data.inputs import as_image
 from semfov.data.windowed import LargePicture
 from semfov.decision import Decision
@@ -52,6 +53,7 @@ _SETTINGS = Object(
 )
 _PLACEMENT = {"size": Array(POSITIVE, 2), "scale": Array(POSITIVE, 2), "offset": Array(WHOLE, 2)}
 
+# Of f fixations with beliefs over a grid of cells, C classes with the background, and q closer looks.
 _FORMAT = Format(
     "scanpath",
     {
@@ -93,7 +95,8 @@ class _CellRecord(Record):
     @property
     def seconds(self) -> tuple[Mapping[str, float], ...]:
         """Seconds of each look by stage (`semfov.episode.STAGES`); empty if they are not known."""
-        return tuple(look.stages for look in self.looks) if all(look.stages for look in self.looks) else ()
+        stages = tuple(look.stages for look in self.looks)
+        return stages if all(stages) else ()
 
     @property
     def size(self) -> tuple[int, int]:
@@ -144,7 +147,7 @@ class ScanpathWords(Words):
     def describe(self) -> str:
         """Describe the outcome of the episode in one line."""
         record = self.record
-        shifts = f"{record.shifts} gaze shift{'s' if record.shifts != 1 else ''}"
+        shifts = amount(record.shifts, "gaze shift")
         if record.target is None:
             return f"explored with {shifts}: {self.objects}"
         name = f"“{record.target_name}”"
@@ -158,7 +161,7 @@ class ScanpathWords(Words):
     def _closer_looks(self) -> str:
         """The number of closer looks, to follow that of gaze shifts; empty without any."""
         count = len(self.record.closer)
-        return f" and {count} closer look{'s' if count != 1 else ''}" if count else ""
+        return f" and {amount(count, 'closer look')}" if count else ""
 
     def _certainty(self, decision: Decision) -> str:
         """Say how sure the decision is."""
@@ -176,6 +179,7 @@ class ScanpathWords(Words):
         for cell in self.record.cells.tolist():
             row, column = divmod(cell, grid.columns)
             cells.append(f"({column}, {row})")
+        # In a line of a terminal.
         path = " ".join(cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]])
         width, height = grid.extent.tolist()
         cells_of_grid = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
@@ -284,8 +288,10 @@ class Scanpath(_CellRecord):
         """Probability in each cell after a look: of the target by the belief of the search, or of any object."""
         fixation = self.fixation_after(number)
         if self.target is None:
+            # Class 0 is the background.
             return self.grid, self.probabilities[fixation, :, 1:].amax(-1)
-        posterior = self.probabilities[..., self.target] if self.posterior is None else self.posterior
+        # Files of earlier versions may have no belief of the search beside the map of all classes.
+        posterior = self.probabilities[..., self.target] if self.posterior is None else self.posterior  # (n, X·Y)
         return self.grid, posterior[fixation]
 
     def regions(self, number: int = -1) -> Sequence[Region]:
@@ -314,6 +320,7 @@ class Scanpath(_CellRecord):
         if self.stimulus is None:
             yield from parts
             return
+        # There is a view of each fixation, and none of closer looks.
         views = iter(self.views())
         for look, part in zip(self.looks, parts, strict=True):
             if look.is_closer:
@@ -350,6 +357,7 @@ class Scanpath(_CellRecord):
     def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:
         fields = super()._fields(tensors, record, shared)
         grid = fields["grid"]
+        # Each of these is allowed by itself, and has to suit the grid.
         columns = tensors["values"].shape[-1]
         check(columns == len(grid), "values", f"one for each of {len(grid)} cells", columns)
         highest = int(tensors["cells"].max())
@@ -370,6 +378,7 @@ def _looks_of_file(
     detections = shared["detections"]
     seconds = record["seconds"] or [{}] * len(detections)
     cells = tensors["cells"].tolist()
+    # Records without closer looks, and all of earlier versions, lack these tensors.
     regions = tensors.get("closer_regions", torch.zeros(0, 4)).tolist()
     chances = tensors.get("closer_values", torch.zeros(0)).tolist()
     expected = f"{len(cells)} fixations and {len(regions)} closer looks"
@@ -378,16 +387,15 @@ def _looks_of_file(
     check(have_regions, "closer_regions", f"{len(close_ups)} regions", len(regions))
     points = tensors["fixations"].tolist()
     fovea = FoveaLooks(grid)
-    fixation = 0  # number of fixations so far, and of closer looks
-    closer = 0
-    for number, (seen, stages) in enumerate(zip(detections, seconds, strict=True)):
+    closer_looks = zip(regions, chances, strict=True)
+    fixations = enumerate(zip(cells, points, strict=True))
+    for number, (look_detections, stages) in enumerate(zip(detections, seconds, strict=True)):
         if number in close_ups:
-            fovea.look_closely(close_ups[number].cell or 0, regions[closer], seen, stages, chances[closer])
-            closer += 1
+            region, chance = next(closer_looks)
+            fovea.look_closely(close_ups[number].cell or 0, region, look_detections, stages, chance)
         else:
-            belief = _belief_of_file(tensors, fixation)
-            fovea.fixate(cells[fixation], points[fixation], seen, stages, *belief)
-            fixation += 1
+            fixation, (cell, point) = next(fixations)
+            fovea.fixate(cell, point, look_detections, stages, *_belief_of_file(tensors, fixation))
     return tuple(fovea.looks)
 
 
@@ -437,7 +445,7 @@ class FoveaMomentWords(MomentWords):
     @property
     def lines(self) -> list[str]:
         """The frame and the fixated cell."""
-        row, column = divmod(self.record.cell, self.record.grid.columns)
+        row, column = divmod(self.record.cell, self.record.grid.columns)  # cells are counted row by row
         return [f"frame {self.record.number}, at (column, row): ({column}, {row})"]
 
 

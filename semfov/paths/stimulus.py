@@ -77,7 +77,7 @@ class Stimulus:
         check_shape(fixations, "fixations", None, 2)
         settings = self.settings["sensor"]
         sensor = sensor_of(settings) if self.sensor is None else self.sensor
-        placement = self.placement
+        placement = self.placement  # of the photograph on the canvas of the detector
         # The sensor's blur is set for photographs of a reference size; a larger one is seen at more pixels a degree.
         magnification = max(placement.size) / settings["reference"]
         left, top = placement.offset
@@ -85,7 +85,7 @@ class Stimulus:
         height = round(placement.size[1] * placement.scale[1])
         views = []
         with torch.no_grad():
-            canvas = (self.canvas[None].double() / 255).to(sensor.like)
+            canvas = (self.canvas[None].double() / 255).to(sensor.like)  # (1, 3, h, w)
             state = sensor.open(canvas, canvas.new_tensor(placement.scale) * magnification)
             # One at a time: all views of a large canvas at once would take gigabytes.
             for point in placement.points_to_canvas(fixations.to(canvas)):

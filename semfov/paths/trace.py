@@ -122,21 +122,20 @@ class Trace:
         Args:
             outcome: further attributes of the scanpath: decision, ending, photograph, …
         """
-        count = len(self._fixated)
-        no_cells = torch.zeros(0, len(self.grid))
+        cells = len(self.grid)
         fields: Values = {
             "grid": self.grid,
             "classes": self.classes,
             "target": self.target,
             "score_threshold": self.score_threshold,
             "looks": self.looks,
-            "probabilities": partial(self._probabilities, count),
-            "values": torch.stack([fixated.values[0] for fixated in self._fixated]) if count else no_cells,
+            "probabilities": partial(self._probabilities, len(self._fixated)),
+            "values": _stacked([fixated.values[0] for fixated in self._fixated], cells),
             "found": False,
         }
         if self.target is not None:
-            fields["posterior"] = torch.stack(self._posterior) if count else no_cells
-            fields["presence"] = torch.stack(self._presence) if count else torch.zeros(0)
+            fields["posterior"] = _stacked(self._posterior, cells)
+            fields["presence"] = _stacked(self._presence)
         return Scanpath(**{**fields, **outcome})
 
     def _probabilities(self, count: int) -> Tensor:
@@ -145,9 +144,7 @@ class Trace:
         with torch.inference_mode(is_inference), torch.set_grad_enabled(has_gradients):
             for fixated in self._fixated[len(self._maps) : count]:
                 self._maps.append(self._belief_about_all(fixated).class_probabilities()[0])
-            if not count:
-                return torch.zeros(0, len(self.grid), len(self.classes))
-            return torch.stack(self._maps[:count])
+            return _stacked(self._maps[:count], len(self.grid), len(self.classes))
 
     def _belief_about_all(self, fixated: _Fixated) -> Belief:
         """Take the next fixation into the belief about all classes, which may be that of the episode."""
@@ -156,3 +153,8 @@ class Trace:
         before = self.beside.start(1, self.grid, fixated.values) if self._belief is None else self._belief
         self._belief = self.beside(before, fixated.detections, fixated.fixation, self.grid)
         return self._belief
+
+
+def _stacked(tensors: Sequence[Tensor], *shape: int) -> Tensor:
+    """Stack n tensors of a shape, `(n, *shape)`, also none of them: an episode may have no fixation yet."""
+    return torch.stack([*tensors]) if tensors else torch.zeros(0, *shape)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from semfov.data.classes import plural
+from semfov.data.classes import amount, plural
 from semfov.detection import Objects
 from semfov.detection.objects import NO_TRACK
 from semfov.errors import check
@@ -19,7 +19,7 @@ from semfov.paths.base import Moment, Record
 from semfov.paths.conversion import Values
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, SharedFields
 from semfov.paths.late import MadeWhenRead
-from semfov.paths.look import Box, RecordedLook
+from semfov.paths.look import Box, RecordedLook, finite_or_none
 from semfov.paths.words import MomentWords, Words
 from semfov.tracking import Tracks
 from semfov.tracking.files import TRACK_FIELDS, track_tensors, tracks_of
@@ -46,8 +46,9 @@ _LEAST_SAID = 0.5  # expected number from which on it is said of a class without
 _CLEAR = 0.7  # score from which on an object of any class is clear
 _OBJECTS = ("boxes", "scores", "labels", "passes")
 
+# Of n looks with M boxes in all, C classes with the background, and P objects.
 _TENSORS = {
-    "values": Field(("n",), mixed=True, finite=False),
+    "values": Field(("n",), mixed=True, finite=False),  # infinite for the overview
     "cut": Field(("M",), dtype=torch.bool),
     "show": Field(("n", "C-1"), mixed=True),
     "object_boxes": Field(("P", 4), mixed=True, low=-FARTHEST, high=FARTHEST),
@@ -97,7 +98,7 @@ class WindowWords(Words):
     def describe(self) -> str:
         """Describe the result in one line."""
         record = self.record
-        looks = f"{record.passes} look{'s' if record.passes != 1 else ''}"
+        looks = amount(record.passes, "look")
         if record.decision is not None and record.target_name is not None:
             certainty = f"there with probability {record.decision.probability:.2f}"
             return f"{self.verdict(record.target_name, ':')} ({certainty}) in {looks}"
@@ -126,12 +127,13 @@ class WindowWords(Words):
         small rests of all classes add up to many.
         """
         record = self.record
+        # Of one class the name stands before, with the objects that are listed.
+        are_several = len(record.sought) > 1
         expected = []
         for label in record.sought:
             number = self._expected(label)
             if number:
-                name = f" {plural(record.classes[label])}" if len(record.sought) > 1 else ""
-                expected.append(f"{number}{name}")
+                expected.append(f"{number} {plural(record.classes[label])}" if are_several else number)
         text = self._listed
         return f"{text}; expect {', '.join(expected)} in all" if expected else text
 
@@ -154,8 +156,9 @@ class WindowWords(Words):
         if record.unseen is None:
             return ""
         mean, variance = record._numbers().get(label, (math.nan, math.nan))
-        listed = len(record.objects.of([label]))
-        if math.isnan(mean) or (not listed and mean < _LEAST_SAID):
+        are_listed = len(record.objects.of([label])) > 0
+        is_said = mean >= (0.0 if are_listed else _LEAST_SAID)  # never of NaN
+        if not is_said:
             return ""
         error = variance**0.5
         # Whole numbers would hide a small error, and read as `expect 1 cups`.
@@ -171,13 +174,14 @@ class WindowWords(Words):
     @property
     def value(self) -> str:
         """What the values of looks are (`semfov.zoom.policy`); slices are chosen by scores (`semfov.zoom.slices`)."""
-        is_search = self.record.decision is not None
+        # Without learned evidence looks are chosen by scores, and slices of photographs always are.
+        scores = "the sum of the scores that the first look has in it"
+        if self.record.decision is not None:
+            chance = "the probability that it finds the target, also of what closer looks in it would find"
+            return scores if self.decided_by == "score" else chance
         is_photograph = self.record.lattice.levels == 1
-        measure = self.decided_by if is_search else self.measure
-        if measure == "score" or (is_photograph and not is_search):
-            return "the sum of the scores that the first look has in it"
-        if is_search:
-            return "the probability that it finds the target, also of what closer looks in it would find"
+        if is_photograph or self.measure == "score":
+            return scores
         return "the expected number of new objects in it, with a share of those that closer looks would then show"
 
     @property
@@ -185,12 +189,14 @@ class WindowWords(Words):
         """The windows of the lattice and of the closer looks."""
         lattice = self.record.lattice
         width, height = lattice.canvas
+        # Closer looks need not be windows of the lattice.
         closer_ones = {look.window.fixation[2] for look in self.record.window_looks}
         magnifications = sorted({*lattice.magnifications, *closer_ones})
         # Magnifications that read the same are named once.
         names = list(dict.fromkeys(f"{magnification:.2g}" for magnification in magnifications))
         listed = ", ".join(names) if len(names) <= 6 else f"from {names[0]} to {names[-1]}"
-        return f"windows of {width} × {height} px at magnification{'s' if len(names) > 1 else ''} {listed}"
+        noun = "magnification" if len(names) == 1 else "magnifications"
+        return f"windows of {width} × {height} px at {noun} {listed}"
 
     @property
     def lines(self) -> list[str]:
@@ -234,7 +240,7 @@ def look_at_window(
         region=window.region(lattice),
         detections=shown.detections,
         seconds=seconds,
-        value=value if math.isfinite(value) else None,
+        value=finite_or_none(value),
         more={"magnification": window.fixation[2], "level": window.level},
         shown=shown,
     )
@@ -333,25 +339,32 @@ class ZoomPath(Record):
         target of a search is no less than the probability that the picture holds it: E[N] ≥ P(N ≥ 1).
         """
         labels = self.sought or tuple(self.candidates.labels.unique().tolist())
-        scores = {label: self.candidates.of([label]).scores for label in labels}
-        sums = {label: float(scores[label].double().sum()) + 1e-9 for label in labels}  # not 0, to divide by it
-        total = sum(sums.values())
-        mean_unseen, variance_unseen = self.unseen or (0.0, 0.0)
-        numbers = {}
+        sums = {}  # of the probabilities of each class
         for label in labels:
-            if self._reacts_to([label]):
-                share = sums[label] / total
-                unseen = (share * mean_unseen, share * variance_unseen)
-                numbers[label] = number_of(scores[label], unseen, self.spread)
-            elif label in self._countable_if_faint:
-                numbers[label] = number_of_faint(scores[label])
-            else:
-                numbers[label] = (math.nan, math.nan)
+            probabilities = self.candidates.of([label]).scores.double()
+            sums[label] = float(probabilities.sum()) + 1e-9  # not 0, to divide by it
+        total = sum(sums.values())
+        numbers = {label: self._number(label, sums[label] / total) for label in labels}
         if self.decision is not None and self.target in numbers:
             mean, variance = numbers[self.target]
             # The decision knows the prior and the closer looks, which the candidates do not.
             numbers[self.target] = (max(mean, self.decision.probability), variance)  # NaN stays
         return numbers
+
+    def _number(self, label: int, share: float) -> tuple[float, float]:
+        """Mean and variance of the number of objects of a class; NaN where none is estimated.
+
+        Args:
+            label: the class.
+            share: its share of the objects that no look has shown.
+        """
+        scores = self.candidates.of([label]).scores  # (N,)
+        if self._reacts_to([label]):
+            mean_unseen, variance_unseen = self.unseen or (0.0, 0.0)
+            return number_of(scores, (share * mean_unseen, share * variance_unseen), self.spread)
+        if label in self._countable_if_faint:
+            return number_of_faint(scores)
+        return math.nan, math.nan
 
     @cached_property
     def _countable_if_faint(self) -> set[int]:
@@ -378,8 +391,8 @@ class ZoomPath(Record):
         if self.candidates.track_ids is not None:
             tensors["object_track_ids"] = self.candidates.track_ids
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
-        tensors["cut"] = torch.cat([look.cut for look in looks])
-        tensors["show"] = torch.stack([look.show for look in looks])
+        tensors["cut"] = torch.cat([look.cut for look in looks])  # (M,), which `lengths` separates again
+        tensors["show"] = torch.stack([look.show for look in looks])  # (n, K)
         record = {
             "lattice": {name: getattr(self.lattice, name) for name in _LATTICE},
             "windows": [_values_of(look.window) for look in looks],
@@ -399,10 +412,8 @@ class ZoomPath(Record):
         _check_below("object_passes", tensors, len(detections))
         windows = [_window_from(values, lattice) for values in record["windows"]]
         cuts = tensors["cut"].split(record["lengths"])
-        shown = [
-            WindowLook(window, seen, cut, show, None)
-            for window, seen, cut, show in zip(windows, detections, cuts, tensors["show"], strict=True)
-        ]
+        columns = zip(windows, detections, cuts, tensors["show"], strict=True)
+        shown = [WindowLook(*column, gist=None) for column in columns]
         boxes, scores, labels, passes = (tensors[f"object_{name}"] for name in _OBJECTS)
         unseen = record.get("unseen")
         spread = record.get("spread")
@@ -444,12 +455,12 @@ class WindowMomentWords(WindowWords, MomentWords):
         A stream lists objects of low probabilities, too, so that it may list more of them than there are.
         """
         record = self.record
-        doubtful = [
-            label
-            for label in record.sought
-            if self._expected(label) and len(record.objects.of([label])) > round(record.expected[record.classes[label]])
-        ]
-        return f"{super()._listed}, some of them doubtful" if doubtful else super()._listed
+        listed = super()._listed
+        for label in record.sought:
+            number = len(record.objects.of([label]))
+            if self._expected(label) and number > round(record.expected[record.classes[label]]):
+                return f"{listed}, some of them doubtful"
+        return listed
 
     @property
     def lines(self) -> list[str]:

@@ -276,6 +276,7 @@ def _file_name(path: str) -> str:
 def _share_out(fixations: Iterable[_Fixation], views: Sequence[_View]) -> None:
     """Give each fixation to the view in whose time it begins."""
     ordered = sorted(views, key=lambda view: view.start)
+    # Views follow each other, so that of those that have begun only the last can still be on the screen.
     starts = np.array([view.start for view in ordered])
     for fixation in fixations:
         number = int(np.searchsorted(starts, fixation.start, side="right")) - 1
@@ -312,7 +313,7 @@ def _lost(lines: Sequence[str]) -> list[str]:
 
 def _outside_views(trials: Sequence[_Trial], fixations: Sequence[_Fixation]) -> list[str]:
     """Say of how many trials all fixations lie outside the time of their pictures."""
-    starts = np.sort([fixation.start for fixation in fixations])
+    starts = np.sort([fixation.start for fixation in fixations])  # (n,), to find those of a trial by bisection
     missed = []
     for trial in trials:
         first, end = np.searchsorted(starts, (trial.start, trial.end))

@@ -247,6 +247,7 @@ class _Measures:
         def measure(points: _Points, others: Sequence[_Points]) -> float:
             fixated = np.concatenate([self._inside(other) for other in others])
             density = _people_density(fixated, self.size, (rows, columns))
+            # A person who is compared is not among the others, whose density would else know where they looked.
             x, y = _map_points(self._inside(points), self.size, (rows, columns)).T
             return _mean(score(density, x, y).tolist())
 
@@ -307,8 +308,8 @@ def _people_density(points: _Points, size: tuple[int, int], shape: tuple[int, ..
     sigma = _BLUR * max(shape)
     twice_variance = 2 * sigma**2
     # A Gaussian is the product of one along the rows and one along the columns.
-    of_columns = np.exp(-((columns[:, None] - x) ** 2) / twice_variance)
-    of_rows = np.exp(-((rows[:, None] - y) ** 2) / twice_variance)
+    of_columns = np.exp(-((columns[:, None] - x) ** 2) / twice_variance)  # (columns, n)
+    of_rows = np.exp(-((rows[:, None] - y) ** 2) / twice_variance)  # (rows, n)
     return np.asarray(of_rows @ of_columns.T)
 
 
@@ -330,10 +331,11 @@ def compare_density(prediction: GazePrediction, people: _People) -> dict[str, fl
     later = []
     for fixations in viewed:
         resized = fixations.resized(prediction.size)
+        # The first fixation is where the trial begins, and not chosen by the picture.
         later.append(resized.points[1:][resized.inside[1:]])
     points = np.concatenate(later)
     check(len(points) > 0, "people", "fixations inside the picture after the first of each person", "none")
-    cells = prediction.cells.double().numpy()
+    cells = prediction.cells.double().numpy()  # (rows, columns), with sum 1
     x, y = _map_points(points, prediction.size, cells.shape).T
     people_density = _people_density(points, prediction.size, cells.shape)
     return {

@@ -31,7 +31,7 @@ def found_at(points: ArrayLike, box: ArrayLike) -> int:
     """
     x, y = as_path(points, "points", least=1).T
     x1, y1, x2, y2 = _corners(box)
-    on_target = (x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)
+    on_target = (x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)  # (n,)
     return int(on_target.argmax()) if on_target.any() else -1
 
 
@@ -66,6 +66,7 @@ def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: i
     by_group: dict[Hashable, list[float]] = {}
     for shift, group in zip(shifts_found, names, strict=True):
         by_group.setdefault(group, []).append(shift)
+    # Groups count the same, however many searches they have.
     curves = [cumulative_performance(np.array(searches), shifts) for searches in by_group.values()]
     return np.asarray(np.mean(curves, axis=0))
 
@@ -167,6 +168,7 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
     path = as_path(points, "points", least=1)
     edges = _corners(box)
     last = found_at(path, edges)
+    # Before a saccade there is no length to compare with.
     if last < 1:
         return float("nan")
     length = np.linalg.norm(np.diff(path[: last + 1], axis=0), axis=1).sum()

@@ -189,6 +189,7 @@ def merge_close(points: ArrayLike, size: tuple[float, float]) -> NDArray[np.floa
     path = list(as_path(points, "points"))
     check_sides("size", size)
     half = np.array(size) / 2
+    # A merged fixation may be close to the next one, too, so that it is compared again.
     index = 0
     while index < len(path) - 1:
         if (np.abs(path[index] - path[index + 1]) < half).all():
