@@ -13,7 +13,7 @@ from semfov.cli.outcome import table_lines
 from semfov.cli.rivals import ALL_SLICES, SEMFOV, Point, Scores, Way, all_slices, best_slices, by_semfov, warm_up
 from semfov.cli.sources import PictureSource, example_source, picture_sources
 from semfov.cli.truth import Truth
-from semfov.data.classes import number_of
+from semfov.data.classes import amount
 from semfov.data.large import open_large
 from semfov.errors import SemfovError, check
 from semfov.io.files import check_writable, write_text
@@ -147,7 +147,7 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
 def _agreement(last: Point, slices: Point) -> list[str]:
     """Say what semfov lists after its last pass of what all slices list, which stand for the truth."""
     found = f"{last.right} of the {last.reference} objects that all slices list"
-    false_alarms = number_of(last.listed - last.right, "other")
+    false_alarms = amount(last.listed - last.right, "other")
     share = last.seconds / slices.seconds
     return [
         f"After {_passes(last)} semfov lists {found} and {false_alarms}, in {share:.2f} of their time.",
@@ -161,7 +161,7 @@ def _about(options: CompareOptions, pictures: int, targets: Sequence[str] | None
     judge = "all slices are taken as the truth"
     if options.annotations is not None:
         judge = f"the truth is {options.annotations}"
-    return f"{number_of(pictures, 'picture')}, {', '.join(targets or ['all classes'])}; {judge}"
+    return f"{amount(pictures, 'picture')}, {', '.join(targets or ['all classes'])}; {judge}"
 
 
 def _passes(point: Point) -> str:

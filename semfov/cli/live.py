@@ -11,7 +11,7 @@ from time import perf_counter
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, white_of
 from semfov.cli.results import held_outputs
-from semfov.data.classes import class_index, number_of
+from semfov.data.classes import amount, class_index
 from semfov.data.sources import Picture, Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.io.files import check_apart, check_writable, write_text
@@ -140,7 +140,7 @@ def _moments(live: LivePerception, stream: Stream) -> Iterator[tuple[Picture, Mo
 
 def _totals(stream: Stream, speed: "_Speed") -> str:
     """Say how many frames were looked at, how many were not, and how fast it was."""
-    totals = [number_of(speed.frames, "frame")]
+    totals = [amount(speed.frames, "frame")]
     totals += [f"{number} {kind}" for kind, number in stream.gaps.items() if number]
     mean = speed.mean()
     if mean:

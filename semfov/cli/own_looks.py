@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.agent import ActivePerception
-from semfov.data.classes import number_of
+from semfov.data.classes import amount
 from semfov.detection.placement import resize
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import confident_detections, detections_in_words
@@ -91,7 +91,7 @@ class OwnLooks(NamedTuple):
 
 def _outcome(record: Record) -> str:
     """Say whether the target was found, and in how many looks."""
-    count = number_of(len(record), "look")
+    count = amount(len(record), "look")
     return f"found in {count}" if record.found else f"not found in {count}"
 
 

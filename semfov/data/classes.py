@@ -139,10 +139,10 @@ def counted(number: int, name: str) -> str:
     return f"{number or 'no'} {name if number < 2 else plural(name)}"
 
 
-def number_of(count: int, noun: str) -> str:
+def amount(count: int, noun: str) -> str:
     """Write how many there are of a thing, in figures.
 
-    >>> number_of(0, "look"), number_of(1, "look"), number_of(3, "pass")
+    >>> amount(0, "look"), amount(1, "look"), amount(3, "pass")
     ('0 looks', '1 look', '3 passes')
     """
     return f"{count} {noun if count == 1 else plural(noun)}"

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from semfov.data.classes import number_of
+from semfov.data.classes import amount
 from semfov.detection.objects import box_text
 from semfov.paths.look import CONFIDENT
 from semfov.report.episode import Data
@@ -98,7 +98,7 @@ def _overview(data: Data, place: str) -> str:
     for (number, box), tag in zip(windows, tags, strict=True):
         shapes.append(_window_shape(number, box, tag, unit))
 
-    objects = number_of(data["count"], "object")
+    objects = amount(data["count"], "object")
     label = f"The picture with {len(windows)} numbered {_view_word(data)}s and {objects}"
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
@@ -197,7 +197,7 @@ def _look(data: Data, index: int, place: str) -> str:
     number = index + 1
     width, height = look["size"]
     count = look["count"]
-    label = f"The window of look {number} with {number_of(count, 'detection')}"
+    label = f"The window of look {number} with {amount(count, 'detection')}"
     title = f"Look {number}{': the whole picture' if look['whole'] else ''}"
     return (
         f'<section class="look" data-look="{index}" id="{place}" aria-labelledby="{place}-title">'

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.data.classes import number_of
+from semfov.data.classes import amount
 from semfov.errors import check
 from semfov.metrics.calibration import reliability
 from semfov.viz.style import COLOURS, LineStyle, line_style, make_figure, only, styled
@@ -81,7 +81,7 @@ def plot_curves(
 
 def _draw_grey_curves(axes: Axes, curves: Sequence[NDArray[np.float64]]) -> None:
     """Draw the curves that the legend does not name, with one entry that counts them."""
-    text: str | None = number_of(len(curves), "other")
+    text: str | None = amount(len(curves), "other")
     for curve in curves:
         shifts = np.arange(len(curve))
         axes.plot(shifts, 100 * curve, color=_REST, linewidth=0.8, label=text, zorder=1)

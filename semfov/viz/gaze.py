@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
-from semfov.data.classes import number_of
+from semfov.data.classes import amount
 from semfov.data.fixations import Fixations
 from semfov.errors import check
 from semfov.paths.areas import AreasLike, percent, shares_around
@@ -187,7 +187,7 @@ def animate_gaze(
         else:
             begun = [replace(viewer, points=viewer.points[:number], durations=None) for viewer in viewers]
             figure = plot_gaze(prediction, scanpaths=begun, cells=prediction.given(viewers, number))
-        figure.axes[0].set_title(f"after {number_of(number, 'fixation')} of {people} viewers")
+        figure.axes[0].set_title(f"after {amount(number, 'fixation')} of {people} viewers")
         return figure
 
     frames = render(frame(number) for number in range(max(map(len, viewers)) + 1))
