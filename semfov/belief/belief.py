@@ -1,7 +1,7 @@
 """Beliefs of a batch of episodes about the cells of an image."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self, TypeVar
 
@@ -157,7 +157,13 @@ class Belief(ABC):
         Returns:
             A new belief.
         """
-        return self.map(Tensor.detach)
+
+        def detached(value: Any) -> Any:
+            if isinstance(value, Mapping):
+                return {key: detached(part) for key, part in value.items()}
+            return value.detach() if isinstance(value, Tensor | Belief) else value
+
+        return with_fields(self, detached)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from semfov.detection.detections import Detections
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Field, Schema
 from semfov.observation.matching import box_iou
-from semfov.observation.thresholds import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
+from semfov.observation.thresholds import THRESHOLDS, DecidingModule, Thresholds, thresholds_of, thresholds_record
 
 CLOSER_FEATURES = 7  # number of features of a closer look (`closer_features`)
 _MATCHED = 0.3  # least overlap (intersection over union) of a detection with a box at which it shows the same object
@@ -19,7 +19,7 @@ _MATCHED = 0.3  # least overlap (intersection over union) of a detection with a 
 _FLOOR = 1e-3
 
 
-class Verification(PretrainedForEye):
+class Verification(DecidingModule, PretrainedForEye):
     r"""Probabilities of a target after a closer look: that it is at the examined place, and that the image holds it.
 
     A search that is about to end with `found` looks closely at the place first (`semfov.Eye.close_up`). Both

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,11 @@ _KEY = "_extra_state"
 
 
 class StatedModule(nn.Module):
-    """Base of modules whose settings, as bytes of JSON, are in their state; one without them is loaded, too."""
+    """Base of modules whose settings, as bytes of JSON, are in their state; one without them is loaded, too.
+
+    Settings that a module has by construction are compared where a state is loaded. Values that a fit has chosen beside
+    parameters, such as thresholds, are loaded with it.
+    """
 
     _setting_names: ClassVar[tuple[str, ...]] = ()
     """Names of the settings that are no parameters."""
@@ -22,12 +26,20 @@ class StatedModule(nn.Module):
         """List the settings that are no parameters, as JSON values."""
         return {name: getattr(self, name) for name in self._setting_names}
 
+    def _fitted_values(self) -> dict[str, object]:
+        """List the values that a fit has chosen beside parameters, as JSON values."""
+        return {}
+
+    def _load_fitted_values(self, values: Mapping[str, Any]) -> None:
+        """Take those of a state, which may lack them."""
+
     def get_extra_state(self) -> Tensor:
-        """Write the settings as bytes of JSON."""
-        return torch.frombuffer(bytearray(json.dumps(self._stated()).encode()), dtype=torch.uint8)
+        """Write the settings and the values of a fit as bytes of JSON."""
+        values = {**self._stated(), **self._fitted_values()}
+        return torch.frombuffer(bytearray(json.dumps(values).encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Refuse the state of a module with other settings."""
+        """Refuse the state of a module with other settings, and take the values of its fit."""
         theirs = json.loads(bytes(state.tolist()))
         for name, value in json.loads(json.dumps(self._stated())).items():  # as JSON, where tuples are lists
             if theirs.get(name, value) != value:
@@ -35,6 +47,7 @@ class StatedModule(nn.Module):
                     f"state_dict: expected the state of a {type(self).__name__} with {name} {value!r:.200}, got one "
                     f"with {theirs[name]!r:.200}; make the module with these settings"
                 )
+        self._load_fitted_values(theirs)
 
     def _load_from_state_dict(
         self,

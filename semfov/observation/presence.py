@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_tensor
 from semfov.io.schema import Field
-from semfov.observation.thresholds import Thresholds
+from semfov.observation.thresholds import DecidingModule, Thresholds
 
 SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
 """Schema of the shares, by class, of the searches of a fit whose target was there, in the file of a model."""
@@ -52,7 +52,7 @@ def presence_facts(probability: Tensor, log_score: Tensor) -> Tensor:
     return torch.stack([log_odds_of_cells(probability.amax(-1)), log_score], -1)
 
 
-class Presence(nn.Module):
+class Presence(DecidingModule):
     r"""Probability that a picture holds a class, from the most probable cell, and from the scores of all looks.
 
     .. math:: \operatorname{logit} P(t) = a + b \operatorname{logit} \max_x P(t \in x)
@@ -121,6 +121,15 @@ class Presence(nn.Module):
             `(...)`, differentiable in the facts and the three numbers.
         """
         return self.offset.to(facts) + facts @ self.weight.to(facts)
+
+    def detach(self) -> "Presence":
+        """Copy the module with numbers that are constants, through which no gradient flows.
+
+        Returns:
+            The copy.
+        """
+        constant = Presence(self.offset, self.weight, self.shares, self.thresholds, place=self.place)
+        return constant.requires_grad_(False)
 
     def of_cells(self, probability: Tensor) -> Tensor:
         """Make the probabilities of cells true, where all cells under a detection have its weight.

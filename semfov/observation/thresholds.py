@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from semfov.io.schema import Maybe, Number, Object
+from semfov.io.state import StatedModule
 
 
 @dataclass(frozen=True)
@@ -75,3 +77,21 @@ def thresholds_of(record: Mapping[str, float] | None) -> Thresholds | None:
     if record is None:
         return None
     return Thresholds(record["confirm"], record["give_up"], record.get("place", 0.0))
+
+
+class DecidingModule(StatedModule):
+    """Base of modules with thresholds at which searches decide, which are in their state.
+
+    Attributes:
+        thresholds: the thresholds; None if none were chosen.
+    """
+
+    thresholds: Thresholds | None = None
+
+    def _fitted_values(self) -> dict[str, object]:
+        return {"thresholds": thresholds_record(self.thresholds)}
+
+    def _load_fitted_values(self, values: Mapping[str, Any]) -> None:
+        # A state of an earlier version has none; those of the module stay.
+        if "thresholds" in values:
+            self.thresholds = thresholds_of(values["thresholds"])

@@ -17,7 +17,7 @@ from semfov.io.compatibility import Settings, check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
 from semfov.observation.presence import SHARES
-from semfov.observation.thresholds import THRESHOLDS, Thresholds, thresholds_of, thresholds_record
+from semfov.observation.thresholds import THRESHOLDS, DecidingModule, Thresholds, thresholds_of, thresholds_record
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import USUAL_WINDOW
 from semfov.zoom.hint_maps import CROWD, features, hint_maps, memory_maps, neighbourhood_mean, tapered, through
@@ -111,7 +111,7 @@ _PHOTOGRAPH = Object(
 )
 
 
-class GlimpseEvidence(Pretrained):
+class GlimpseEvidence(DecidingModule, Pretrained):
     r"""Predicts from a look at a window what looks at its parts find that are one to three octaves closer.
 
     It answers one question about a part w of the window and a class t, and one about the whole picture. Small networks

@@ -201,7 +201,24 @@ def test_map_is_applied_to_every_tensor_of_every_kind_and_a_detached_belief_has_
     assert belief.probability(2).requires_grad
     apart = belief.detach()
     assert not any(tensor.requires_grad for tensor in tensors_of(apart))
+    assert not any(number.requires_grad for number in (apart.probability(2), apart.presence(2), apart.chance(2)))
+    assert torch.equal(apart.presence(2), belief.presence(2))
     assert torch.equal(apart.probability(2), belief.probability(2))
+
+
+def test_a_detached_belief_of_a_model_that_learns_is_constant_until_the_next_look():
+    """Also where it says whether the target is there, by numbers of the model; what is seen later teaches these."""
+    model = small.search_model().double()
+    for observer in (SemanticSearch(model), AnyOf(SemanticSearch(model), {1: 0.3, 2: 1.0})):
+        belief = seen(observer)
+        assert belief.presence(2).requires_grad
+        apart = belief.detach()
+        assert torch.equal(apart.presence(2), belief.presence(2))
+        for values in (apart.presence(2), apart.probability(2), apart.chance(2)):
+            assert not values.requires_grad
+        after = observer.update(apart, observer.weigh(looks(), FIXATIONS, GRID, 2))
+        (slope,) = torch.autograd.grad(after.presence(2).sum(), model.presence.offset)
+        assert float(slope) > 0
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)

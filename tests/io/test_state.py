@@ -10,7 +10,10 @@ from safetensors.torch import save as save_tensors
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, InputError
 from semfov.belief import Verification
 from semfov.io.state import without_settings
+from semfov.observation.presence import Presence
+from semfov.observation.thresholds import Thresholds
 from semfov.sensor import LogPolar, MultiScaleFovea
+from semfov.zoom import GlimpseEvidence
 from tests.small import Blobs, Coloured, agent
 
 PAIRS = {
@@ -63,6 +66,71 @@ def test_learned_settings_are_no_obstacle():
     target.load_state_dict(source.state_dict())
     assert float(target.sigma.detach()) == pytest.approx(10.0)
     assert all(isinstance(value, torch.Tensor) for value in source.state_dict().values())
+
+
+def deciding_modules():
+    """One of each kind that decides at thresholds, of which none are chosen yet."""
+    presence = Presence(torch.tensor(0.0), torch.ones(2), torch.full((2,), 0.5))
+    return {
+        "presence": presence,
+        "verification": Verification(),
+        "evidence": GlimpseEvidence(2),
+        "model": FovealObservationModel.identity(["cup", "cat"], [0.2], presence=presence),
+    }
+
+
+@pytest.mark.parametrize("kind", deciding_modules())
+def test_thresholds_are_in_the_state(kind):
+    """A state of an earlier version has none; then those of the module stay. Settings that differ are refused still."""
+    chosen = Thresholds(0.7, 0.1, 0.05)
+    source, target = deciding_modules()[kind], deciding_modules()[kind]
+
+    def decides(module):
+        return module.presence if kind == "model" else module
+
+    decides(source).thresholds = chosen
+    torch.save(source.state_dict(), stream := io.BytesIO())
+    stream.seek(0)
+    target.load_state_dict(torch.load(stream, weights_only=True))
+    assert decides(target).thresholds == chosen
+    target.load_state_dict(without_settings(source.state_dict()))
+    assert decides(target).thresholds == chosen
+    target.load_state_dict(deciding_modules()[kind].state_dict())
+    assert decides(target).thresholds is None
+
+
+def observation_model(**settings):
+    return FovealObservationModel.identity(["cup", "cat"], [0.2], **settings)
+
+
+def test_a_state_of_an_earlier_version_leaves_what_it_lacks_as_it_is():
+    """Alone, and as a part of another module; with a warning that names what was left."""
+    presence = Presence(torch.tensor(1.5), torch.ones(2), torch.full((2,), 0.5))
+    source = observation_model(tempering=0.5)
+    former = {name: value for name, value in source.state_dict().items() if "log_cell" not in name}
+    target = observation_model(cell=(0.1, 1.0, 1.0), presence=presence)
+    for module, prefix in ((target, ""), (torch.nn.ModuleList([target]), "0.")):
+        with pytest.warns(UserWarning, match="earlier version, without log_cell, presence; those of the module stay"):
+            module.load_state_dict({prefix + name: value for name, value in former.items()})
+    assert float(target.tempering) == 0.5
+    assert target.log_cell.exp().tolist() == pytest.approx([0.1, 1.0, 1.0])
+    assert float(target.presence.offset.detach()) == 1.5
+    target.load_state_dict(former, strict=False)  # which asks for nothing
+    nothing = {name: value for name, value in former.items() if name != "log_alpha"}
+    with pytest.raises(RuntimeError, match="log_alpha"):
+        target.load_state_dict(nothing)
+
+
+def test_a_part_that_the_module_lacks_is_refused_with_the_way_to_load_it():
+    presence = Presence(torch.tensor(1.5), torch.ones(2), torch.full((2,), 0.5))
+    rates = torch.full((3, 2), 0.1)
+    for name, source in (
+        ("presence", observation_model(presence=presence)),
+        ("miss_rate", observation_model(miss_rate=rates)),
+    ):
+        message = f"expected the state of a model without {name}, got one with it; make the model with {name}="
+        with pytest.raises(InputError, match=message):
+            observation_model().load_state_dict(source.state_dict())
 
 
 def test_files_and_digests_hold_tensors_alone(tmp_path):

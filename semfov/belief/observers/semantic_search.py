@@ -99,6 +99,10 @@ class SearchBelief(DirichletBelief):
         """Compute the log odds that the image holds the target: 0 before the first look, and where all has faded."""
         return self.looks.clamp(max=1) * calibration(self.facts(target))
 
+    def detach(self) -> Self:
+        belief = super().detach()
+        return belief if self.calibration is None else replace(belief, calibration=self.calibration.detach())
+
     def facts(self, target: int | Tensor) -> Tensor:
         """Give what the probability of presence depends on (`semfov.observation.presence.presence_facts`).
 
@@ -245,6 +249,8 @@ class SemanticSearch(Observer):
             log_score=old.log_score + seen.log_score.to(old.beta),
             looks=old.looks + 1,
             closest=torch.minimum(old.closest, seen.distance),
+            # That of a belief that was detached is a copy, through which the model would not learn.
+            calibration=self.model.presence,
         )
 
     def _fuse(self, look: SearchLook, weight: Tensor) -> Tensor:
