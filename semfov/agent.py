@@ -30,11 +30,11 @@ from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
 from semfov.kinds import KindName, Quality
 from semfov.live import LivePerception
-from semfov.model_folder import open_folder
+from semfov.model_folder import is_model_file, open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazePrediction, Record
 from semfov.paths.viewed import ScanpathLike
-from semfov.presets import published_arguments, raw_arguments, recommended_arguments
+from semfov.presets import model_file_arguments, published_arguments, raw_arguments, recommended_arguments
 from semfov.settings import (
     ExploreSettings,
     FindSettings,
@@ -137,9 +137,13 @@ class ActivePerception(nn.Module):
     def from_pretrained(cls, name: str | PathLike[str] = "yolox-nano", **options: Any) -> Self:
         """Load the agent from a folder that `semfov.fit_detector` wrote, or the recommended agent for a detector.
 
+        The file of one model, such as `python -m train.fit_search` writes it, gives the recommended agent with that
+        model in place of the shipped one.
+
         Args:
-            name: the folder, or the name of a detector as for `recommended`.
-            options: options of `recommended`; for a folder, of `semfov.model_folder.ModelFolder.load_detector`.
+            name: the folder, the file of a model, or the name of a detector as for `recommended`.
+            options: options of `recommended`; for a folder, of `semfov.model_folder.ModelFolder.load_detector`; for a
+                file, `detector=` where it is not the one that its model was fitted to by name.
 
         Returns:
             The agent, in `eval` mode and without gradients.
@@ -148,6 +152,8 @@ class ActivePerception(nn.Module):
             InputError: it is no folder, and no models are shipped for the name; the message has the commands for both.
             DataError: a file is missing or damaged, or the detector is not the one that the models were fitted to.
         """
+        if is_model_file(name):
+            return cls._of(model_file_arguments, name, **options)
         folder = open_folder(name)
         return cls.recommended(fspath(name), **options) if folder is None else cls._of(folder.arguments, **options)
 

@@ -12,13 +12,15 @@ from semfov.belief.verification import Verification
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.detection.weights import WEIGHTS
-from semfov.errors import DataError, InputError, lookup
+from semfov.errors import DataError, InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
+from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import NETWORKS
 from semfov.io.files import inside
 from semfov.io.manifest import PARTS, Manifest
 from semfov.io.pretrained import fit_command
+from semfov.io.storage import kind_of_file
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.named import SENSORS
 from semfov.zoom.evidence import GlimpseEvidence
@@ -32,6 +34,38 @@ KINDS: dict[str, type[_FolderModel]] = {
     "windows": GlimpseEvidence,
 }
 """Classes of the parts that are models."""
+
+
+def is_model_file(name: str | PathLike[str]) -> bool:
+    """Tell by its name whether it is the file of one model, and neither a folder of models nor a detector.
+
+    Args:
+        name: a folder, a file, or the name of a detector.
+    """
+    return Path(name).suffix == ".safetensors" and not Path(name).is_dir()
+
+
+def open_model(path: str | PathLike[str]) -> _FolderModel:
+    """Load a model that stands alone, as the commands that fit one write it.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The model, of one of the kinds that folders of models hold.
+
+    Raises:
+        InputError: it is a model of another kind.
+        DataError: the file is missing or damaged.
+    """
+    by_kind = {model.kind: model for model in KINDS.values()}
+    kind = kind_of_file(path)
+    if kind == FixationDensity.kind:
+        remedy = "it says where people look, and `semfov gaze --model FILE` takes it"
+        raise InputError(f"models: expected a model of searches or explorations, got {os.fspath(path)}; {remedy}")
+    expected = " or ".join(model.title for model in by_kind.values())
+    check(kind in by_kind, "models", f"a file of {expected}", f"{os.fspath(path)} with {kind or 'something else'}")
+    return by_kind[kind].from_pretrained(path)
 
 
 def open_folder(name: str | PathLike[str]) -> "ModelFolder | None":

@@ -16,7 +16,7 @@ from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.io.compatibility import searching_for, trained_for
 from semfov.io.pretrained import shipped_model
-from semfov.model_folder import open_folder
+from semfov.model_folder import open_folder, open_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.named import SENSORS, named_sensor
 from semfov.zoom import GlimpseEvidence
@@ -30,7 +30,7 @@ def recommended_arguments(name: str, grid: tuple[int, int], **options: Any) -> d
     check_cells(grid)
     detector = load_detector(name, **options)
     eye = Eye(named_sensor("gradual"), detector)
-    fitted = shipped_model(FovealObservationModel, searching_for(detector.name), name)
+    fitted = shipped_model(FovealObservationModel, searching_for(detector.name), detector.name, name)
     return {
         "eye": eye,
         "search": (SemanticSearch(FovealObservationModel.from_pretrained(fitted)), Policy("non-predictive")),
@@ -42,6 +42,28 @@ def recommended_arguments(name: str, grid: tuple[int, int], **options: Any) -> d
         "windows": GlimpseEvidence.if_shipped(detector.name),
         "grid": grid,
     }
+
+
+def model_file_arguments(
+    path: str | PathLike[str],
+    *,
+    detector: str | PathLike[str] | None = None,
+    grid: tuple[int, int] = (10, 10),
+    **options: Any,
+) -> dict[str, Any]:
+    """Make the arguments of the recommended agent with the model of a file in place of the shipped one of its kind."""
+    model = open_model(path)
+    name = detector or model.metadata.get("detector", {}).get("name")
+    check(name is not None, "detector", "the detector that the model was fitted to, which its file does not name", None)
+    arguments = recommended_arguments(fspath(name), grid, **options)
+    if isinstance(model, GlimpseEvidence):
+        return {**arguments, "windows": model}
+    if isinstance(model, Verification):
+        return {**arguments, "verification": model}
+    if model.presence is None:  # it was not fitted to searches
+        _, policy = arguments["explore"]
+        return {**arguments, "explore": (SemanticMap(model), policy)}
+    return {**arguments, "search": (SemanticSearch(model), Policy("non-predictive"))}
 
 
 def published_model(detector: str, sensor: str, threshold: float) -> str:
@@ -77,7 +99,8 @@ def published_arguments(
         grid = (10, 10)
         eye = Eye(named_sensor(fovea), load_detector(name, **options))
         fitted = published_model(eye.detector.name, fovea, eye.detector.selection.threshold)
-        model = FovealObservationModel.from_pretrained(shipped_model(FovealObservationModel, fitted, fspath(name)))
+        found = shipped_model(FovealObservationModel, fitted, eye.detector.name, fspath(name))
+        model = FovealObservationModel.from_pretrained(found)
     observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
     policy = Policy("predictive", model) if search == "predictive" else Policy("non-predictive")
     return {"eye": eye, "search": (observer, policy), "explore": (observer, Policy("kl", model)), "grid": grid}

@@ -9,15 +9,19 @@ import pytest
 import torch
 
 import semfov
-from semfov import FovealObservationModel
+from semfov import ActivePerception, FovealObservationModel
 from semfov.belief import Verification
+from semfov.cli.agent import detector_classes, make_agent
+from semfov.cli.options import SearchOptions
 from semfov.observation.presence import presence_facts
+from semfov.observation.thresholds import Thresholds
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import CASE
 from semfov.zoom.hint_maps import features
 from semfov.zoom.hints import Gist
+from tests.refusals import refused, unusable
 
 KINDS = (FovealObservationModel, Verification, GlimpseEvidence, semfov.saliency.FixationDensity)
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
@@ -238,3 +242,67 @@ def test_recommended_agent_searches_and_explores():
     present = agent.search(scene.image, target, start=0, shifts=4, boxes=nowhere)
     absent = agent.search(scene.image, "toaster", start=0, shifts=4, boxes=nowhere)
     assert present.presence[-1] > 0.5 > absent.presence[-1]
+
+
+@pytest.fixture(scope="module")
+def one_of_each(tmp_path_factory):
+    """Models of all kinds in files of their own, with thresholds by which they are known again."""
+    folder = tmp_path_factory.mktemp("fitted")
+    known = Thresholds(0.9375, 0.125, 0.0625)
+    search = FovealObservationModel.from_pretrained("yolox-nano-search")
+    search.presence.thresholds = known
+    verification = Verification.from_pretrained("yolox-nano")
+    verification.thresholds = known
+    windows = GlimpseEvidence.from_pretrained("yolox-nano")
+    windows.thresholds = known
+    explore = FovealObservationModel.from_pretrained("yolox-nano")
+    with torch.no_grad():
+        explore.log_cell += 0.125
+    models = {
+        "search": search,
+        "explore": explore,
+        "verification": verification,
+        "windows": windows,
+    }
+    for name, model in models.items():
+        model.save(folder / f"{name}.safetensors")
+    return folder, models
+
+
+@pytest.mark.parametrize("part", ["search", "explore", "verification", "windows"])
+def test_the_file_of_one_model_takes_the_place_of_the_shipped_one(part, one_of_each):
+    """In Python and in commands, which take it as they take a folder; the other models are the shipped ones."""
+    folder, models = one_of_each
+    file = folder / f"{part}.safetensors"
+    agents = [ActivePerception.from_pretrained(file), make_agent(SearchOptions(models=file))]
+    shipped = _parts(ActivePerception.recommended())
+    for agent in agents:
+        parts = _parts(agent)
+        assert parts[part].digest() == models[part].digest() != shipped[part].digest()
+        for other in parts.keys() - {part}:
+            assert parts[other].digest() == shipped[other].digest()
+
+
+def _parts(agent):
+    return {
+        "search": agent.searching.observer.model,
+        "explore": agent.exploring.observer.model,
+        "verification": agent.verification,
+        "windows": agent.windows,
+    }
+
+
+def test_the_file_of_a_model_names_its_detector_and_what_else_it_may_be(one_of_each, tmp_path):
+    folder, models = one_of_each
+    file = folder / "search.safetensors"
+    assert detector_classes(SearchOptions(models=file)) == models["search"].classes
+    for kind in ("published", "raw"):
+        refused("agent: expected recommended with --models FILE", make_agent, SearchOptions(models=file, agent=kind))
+    refused("yolov3-tiny", ActivePerception.from_pretrained, file, detector="nothing")
+    gaze = semfov.saliency.FixationDensity.shipped / "yolox-nano.safetensors"
+    refused("models: expected .* `semfov gaze --model FILE` takes it", ActivePerception.from_pretrained, gaze)
+    unnamed = FovealObservationModel.from_pretrained(file)
+    unnamed.metadata = {}
+    unnamed.save(tmp_path / "unnamed.safetensors")
+    refused("detector: expected the detector that", ActivePerception.from_pretrained, tmp_path / "unnamed.safetensors")
+    unusable("no such file", ActivePerception.from_pretrained, tmp_path / "missing.safetensors")

@@ -10,7 +10,8 @@ then, from searches for present and for absent classes, whether a photograph hol
 model (`<name>.safetensors`) with the thresholds of its decisions, and a report that evaluates it on held-out
 photographs. If the looking is interrupted, repeat the command to continue.
 
-Use the model with `--policies [recommended] --belief.search_model runs/fit_search/<name>.safetensors`.
+Search with the model by `semfov search … --models runs/fit_search/<name>.safetensors --how fovea`, in Python by
+`ActivePerception.from_pretrained(<file>)`, and in studies by `--policies [recommended] --belief.search_model <file>`.
 """
 
 import json

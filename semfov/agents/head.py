@@ -83,7 +83,7 @@ class HeadAgent(nn.Module):
             DataError: the weights cannot be obtained, or are damaged.
         """
         eye = Eye(Foveation(_SIGMA, growth=2.0), load_detector(name, **options))
-        fitted = shipped_model(FovealObservationModel, searching_for(eye.detector.name), name)
+        fitted = shipped_model(FovealObservationModel, searching_for(eye.detector.name), eye.detector.name, name)
         search = FovealObservationModel.from_pretrained(fitted)
         explore = FovealObservationModel.from_pretrained(trained_for(eye.detector.name, growth=2))
         search.check_compatible(eye.settings())

@@ -15,6 +15,7 @@ from semfov.detection.onnx_file import write_settings
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check, check_device
 from semfov.io.manifest import Manifest
+from semfov.model_folder import is_model_file, open_model
 
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
@@ -30,9 +31,9 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
         InputError: there is no such detector, it has classes of its own, or the weights are of another kind.
     """
     names = detector_options(options).get("classes")
-    if options.models is not None:
+    if options.models is not None and not is_model_file(options.models):
         return Manifest.read(options.models).classes
-    classes = check_detector(options.detector)
+    classes = check_detector(_detector_of(options))
     if classes is not None and names is not None:
         expected = f"none for {options.detector}, which has its own; `semfov find --target CLASS` looks for one of them"
         raise InputError(f"classes: expected {expected}, got {', '.join(names)}")
@@ -48,6 +49,14 @@ def _check_kind_of_weights(options: AgentOptions) -> None:
         return
     expected = f"Darknet weights for {options.detector}; an ONNX file is a detector of its own, --detector FILE"
     check(registered.file.endswith(".onnx"), "weights", expected, weights)
+
+
+def _detector_of(options: AgentOptions) -> str:
+    """Name the detector: the one that is given, or else the one that the file of a model was fitted to."""
+    is_given = options.detector != AgentOptions.detector
+    if is_given or options.models is None:
+        return options.detector
+    return str(open_model(options.models).metadata.get("detector", {}).get("name", options.detector))
 
 
 def detector_options(options: DetectorOptions) -> dict[str, Any]:
@@ -161,9 +170,11 @@ def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePercept
 
 
 def _load_from_folder(options: AgentOptions, folder: Path, loading: dict[str, Any]) -> ActivePerception:
-    """Load an agent from a folder of models, which says what its detector is."""
-    made_of_a_folder = options.agent in ("recommended", "published")
-    check(made_of_a_folder, "agent", "recommended or published with --models", options.agent)
+    """Load an agent from a folder of models, or the file of one, which say what their detector is."""
+    is_file = is_model_file(folder)
+    kinds = ("recommended",) if is_file else ("recommended", "published")
+    form = "--models FILE, which takes the place of a shipped model" if is_file else "--models FOLDER"
+    check(options.agent in kinds, "agent", f"{' or '.join(kinds)} with {form}", options.agent)
     if options.detector != AgentOptions.detector:
         # The file of the detector is elsewhere now.
         loading = {"detector": options.detector, **loading}

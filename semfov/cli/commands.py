@@ -36,7 +36,7 @@ class Subcommand(NamedTuple):
 _AGENT = """\
   --detector NAME      yolox-nano (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
   --classes cat,dog    what an ONNX file lacks: names, --head, --colour; --remember them (semfov detectors --help)
-  --models FOLDER      from semfov fit; --agent recommended (default), published, or raw (any file)"""
+  --models FOLDER      from semfov fit (or one FILE.safetensors); --agent recommended (default), published, or raw"""
 
 _LOOKS = """\
   --how KIND           auto (default: windows of any picture), fovea, windows, or head (in a panorama)

@@ -34,6 +34,7 @@ from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.io.ranges import CheckedSettings
 from semfov.kinds import Drawing
+from semfov.model_folder import is_model_file
 from semfov.paths import Record
 from semfov.runs.config import WHERE
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
@@ -119,7 +120,8 @@ class PictureJob(ABC, Generic[_Options_co]):
     def depends_on(self) -> dict[str, object]:
         """List what outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
         agent = self.agent
-        folder = self.options.models
+        models = self.options.models
+        manifest = None if models is None else models if is_model_file(models) else models / MANIFEST
         options = self.options.plain()
         return {
             "options": {name: value for name, value in options.items() if name not in (*WHERE, "quiet")},
@@ -131,7 +133,7 @@ class PictureJob(ABC, Generic[_Options_co]):
                 (place, type(part).__qualname__, _plain_attributes(part)) for place, part in agent.named_modules()
             ],
             "weights": self.weights,
-            "folder": None if folder is None else sha256(folder / MANIFEST),
+            "folder": None if manifest is None else sha256(manifest),
             "annotations": None if self.truth is None else self.truth.digest,
         }
 
@@ -210,7 +212,8 @@ class SearchJob(PictureJob[SearchOptions]):
         """Find the classes that the target may mean, each with a weight."""
         options = self.options
         if not options.target:
-            name = options.detector if options.models is None else options.models
+            is_folder = options.models is not None and not is_model_file(options.models)
+            name = options.models if is_folder else options.detector
             raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
         if classes is not None and self.weights is None:
             self.weights = meant_classes(options, classes)

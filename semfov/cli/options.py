@@ -79,7 +79,8 @@ class AgentOptions(StartSettings, DetectorOptions):
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are).
         detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
-        models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor.
+        models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor. The file of
+            one model, as `python -m train.fit_search` writes it, takes the place of the shipped one.
         half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.
         sensor: sensor of a fovea (`semfov.sensor.SENSORS`; none: the agent's own).
         quiet: print errors and warnings alone.

@@ -135,12 +135,13 @@ def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
     return f"semfov fit {model} --data.root PHOTOS --data.annotations instances.json --out {out}"
 
 
-def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
+def shipped_model(kind: type[Pretrained], name: str, detector: str, model: str) -> str:
     """Find the name under which a kind of model is shipped.
 
     Args:
         kind: the kind.
-        name: name of the detector.
+        name: name of the model: that of the detector, with an ending for models of one purpose.
+        detector: name of the detector.
         model: the detector as the command of a fit names it.
 
     Returns:
@@ -151,10 +152,10 @@ def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
     """
     if (kind.shipped / f"{name}.safetensors").is_file():
         return name
-    # Models of one purpose have the same ending.
-    ending = name.removeprefix(model) if name.startswith(model) else ""
-    names = sorted(path.stem.removesuffix(ending) for path in kind.shipped.glob(f"*{ending}.safetensors"))
-    detector = name.removesuffix(ending)
+    ending = name.removeprefix(detector)
+    stems = sorted(path.stem.removesuffix(ending) for path in kind.shipped.glob(f"*{ending}.safetensors"))
+    # Without an ending there are those of other purposes among them.
+    names = [stem for stem in stems if not any(stem.startswith(f"{other}-") for other in stems)]
     raise InputError(
         f"detector: no {kind.title} is shipped for {detector!r}, only for {', '.join(names)}; without a fit use "
         f"ActivePerception.raw, or fit all models to it with `{fit_command(model)}` or semfov.fit_detector, and load "

@@ -71,6 +71,22 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], JsonO
     return tensors, record
 
 
+def kind_of_file(path: str | PathLike[str]) -> str:
+    """Tell which kind of file it is that `write_file` wrote, without verifying it.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The kind, such as `foveal-observation-model`; empty where the file does not say.
+
+    Raises:
+        DataError: the file is missing, or is none that semfov wrote.
+    """
+    _, record = _read_unverified(path)
+    return str(record.get("kind", "")) if isinstance(record, dict) else ""
+
+
 def _read_unverified(path: str | PathLike[str]) -> tuple[dict[str, Tensor], object]:
     """Read the tensors of a safetensors file, and the JSON value of its record."""
     from safetensors import SafetensorError, safe_open

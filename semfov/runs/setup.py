@@ -150,7 +150,7 @@ def make_searching(name: str | None, eye: Eye) -> FovealObservationModel:
     """Load an observation model that was fitted to search: by name, or the one shipped for the detector."""
     if name is None:
         _fovea_of(eye)
-        name = shipped_model(FovealObservationModel, searching_for(eye.detector.name), "MODEL")
+        name = shipped_model(FovealObservationModel, searching_for(eye.detector.name), eye.detector.name, "MODEL")
     return make_observation(name, eye)
 
 
@@ -181,14 +181,16 @@ def observation_name(eye: Eye) -> str:
 
 def _own_model(eye: Eye) -> str:
     """Name our own observation model for a detector and the growth of a fovea."""
-    return shipped_model(FovealObservationModel, trained_for(eye.detector.name, float(_fovea_of(eye).growth)), "MODEL")
+    detector = eye.detector.name
+    name = trained_for(detector, float(_fovea_of(eye).growth))
+    return shipped_model(FovealObservationModel, name, detector, "MODEL")
 
 
 def make_verification(name: str | None, eye: Eye) -> Verification:
     """Load the verification of targets by name, or the one shipped for the detector; check that it fits the eye."""
     if name is None:
         _fovea_of(eye)
-        name = shipped_model(Verification, eye.detector.name, "MODEL")
+        name = shipped_model(Verification, eye.detector.name, eye.detector.name, "MODEL")
     model = Verification.from_pretrained(name)
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
