@@ -66,11 +66,9 @@ def with_target(options: PictureOptions) -> PictureOptions:
     pictures = tuple(name for name in options.pictures if name not in words)
     if len(words) != 1 or not pictures:
         return options
-    classes = detector_classes(options)
-    if classes is None:
-        return options
     try:
-        several_classes(words[0], classes)
+        # The names of some files are known only after they are loaded; then the word is taken for a class.
+        several_classes(words[0], detector_classes(options))
     except InputError:
         return options  # it is refused as a picture that is not there, with the way to name a class
     return replace(options, target=words[0], pictures=pictures)

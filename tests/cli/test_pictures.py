@@ -420,7 +420,7 @@ def test_folders_have_pictures_of_all_formats_that_are_read_alone(tmp_path):
     assert all(read_image(path).shape == (3, 6, 8) for path in picture_files(tmp_path))
 
 
-def test_the_names_of_a_shell_are_those_of_a_folder_and_a_class_may_stand_among_them(folder):
+def test_the_names_of_a_shell_are_those_of_a_folder_and_a_class_may_stand_among_them(folder, tmp_path):
     for name in ("film.mp4", "notes.txt"):
         (folder / name).touch()
     said = r"2 files are no photographs and are left out, such as film.mp4; `semfov live` takes videos"
@@ -435,6 +435,8 @@ def test_the_names_of_a_shell_are_those_of_a_folder_and_a_class_may_stand_among_
     for others in (("a.jpg", "cupp"), ("a.jpg", "cup", "fork"), ("cup",)):
         options = FindOptions(pictures=others)
         assert with_target(options) is options
+    unnamed = FindOptions(pictures=("a.jpg", "cupp"), detector=str(write_network(tmp_path / "mine.onnx")))
+    assert with_target(unnamed).target == "cupp"  # checked against its classes once these are known
 
 
 def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_path):
