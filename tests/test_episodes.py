@@ -163,7 +163,7 @@ def test_closer_looks_of_a_fovea_are_among_its_looks(tmp_path):
     """With their window and what it shows, in files, too; the fixations are those without them."""
     record = on_photograph(1).run()
     (closer,) = [look for look in record.looks if look.is_closer]
-    assert record.closer[0].number == closer.index == len(record) - 1
+    assert record.closer[0].index == closer.index == len(record) - 1
     assert len(record.fixated) == len(record.cells) == len(record) - 1
     x1, y1, x2, y2 = closer.region
     assert x1 <= 130

@@ -594,6 +594,6 @@ def _objects_in_frame(tracks: Tracks, places: Mapping[int, int], size: tuple[int
 
 
 def _renumbered(closer: Sequence[CloseUp], places: Mapping[int, int]) -> tuple[CloseUp, ...]:
-    """Give the closer looks that count the places of their looks in the record as numbers."""
-    counting = [look for look in closer if look.number is not None and look.number in places]
-    return tuple(replace(look, number=places[look.number]) for look in counting if look.number is not None)
+    """Give the closer looks that count the places of their looks in the record as indices."""
+    counting = [look for look in closer if look.index is not None and look.index in places]
+    return tuple(replace(look, index=places[look.index]) for look in counting if look.index is not None)

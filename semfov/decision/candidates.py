@@ -94,7 +94,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
     grid: Grid | None = None
 
     _fixation: int | None = None  # the fixation after which the last closer look was made
-    _number: int | None = None  # the number of the last closer look, where it has one of its own
+    _index: int | None = None  # the index of the look that the last closer look was, once there is one
 
     def __init__(self, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
@@ -154,7 +154,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
             The closer look, for the record of the search.
         """
         self._places.append(_CloserPlace(self._now, box, place))
-        return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._number)
+        return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._index)
 
     def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
         """Look closely at a candidate, unless a look showed it so, and dismiss it.
@@ -261,7 +261,7 @@ class CandidateCells(CandidatePlaces[Step]):
 
     grid: Grid
     _step: Step
-    _next = 0  # number of the next look, closer looks included
+    _next = 0  # index of the next look, closer looks included
 
     def see(self, look: Step) -> None:
         self._step = look
@@ -323,7 +323,7 @@ class CandidateCells(CandidatePlaces[Step]):
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the search."""
-        self._number = self._next
+        self._index = self._next
         self._next += 1
         return super().look_at(candidate, close_up)
 

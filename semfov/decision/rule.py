@@ -59,13 +59,14 @@ class CloseUp:
     """A closer look at a place that seemed to hold the target, and what it says.
 
     Attributes:
-        fixation: place of the fixation after which it was made, from 0; None for windows.
+        fixation: index of the fixation after which it was made, from 0; None for windows.
         target: class 1..K that was looked for.
         cell: cell that the box covers most, where places are cells.
         box: box `(4,)` of the target, or the examined one where the look does not show the target.
         place: probability that the target is there, after the look.
         presence: probability that the picture holds the target, after the look.
-        number: place in the record, from 0, of the look that it is, where closer looks are looks as all others are.
+        index: place of the look that it is in its record, `record[index]`, from 0; None in files of earlier versions,
+            where closer looks were no looks of the record.
     """
 
     fixation: int | None
@@ -74,12 +75,17 @@ class CloseUp:
     box: Tensor
     place: float
     presence: float
-    number: int | None = None
+    index: int | None = None
 
     @property
-    def of_look(self) -> int:
-        """Number of the look that it is, or after which it was made."""
-        return (self.fixation if self.number is None else self.number) or 0
+    def number(self) -> int | None:
+        """Number of the look that it is, as that of a look (`semfov.paths.RecordedLook.number`): the first is 1."""
+        return None if self.index is None else self.index + 1
+
+    @property
+    def index_of_look(self) -> int:
+        """Index of the look that it is, or after which it was made."""
+        return (self.fixation if self.index is None else self.index) or 0
 
 
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:

@@ -109,11 +109,11 @@ class Record(Conversion):
         """Width in pixels after which the picture repeats, as a panorama does; None for other pictures."""
         return None
 
-    def belief_map(self, number: int) -> tuple[Grid, Tensor] | None:
+    def belief_map(self, index: int) -> tuple[Grid, Tensor] | None:
         """Return the belief after a look.
 
         Args:
-            number: place of the look in the record, from 0; negative ones count from the end.
+            index: place of the look in the record, from 0; negative ones count from the end.
 
         Returns:
             The cells, and the probability `(cells,)` that each of them holds the target, or any object; None for
@@ -122,14 +122,14 @@ class Record(Conversion):
         Raises:
             InputError: the record has no such look.
         """
-        self._place(number)
+        self._place(index)
         return None
 
-    def regions(self, number: int = -1) -> Sequence[Region]:
+    def regions(self, index: int = -1) -> Sequence[Region]:
         """Find the regions of the map of what is where, as an exploration with a fovea makes it.
 
         Args:
-            number: place of the look after which the map is read, from 0; negative ones count from the end.
+            index: place of the look after which the map is read, from 0; negative ones count from the end.
 
         Returns:
             Regions of adjacent cells with the same class, the largest first; none without such a map.
@@ -345,6 +345,8 @@ class Moment(Record):
 
     number: int
 
+    _goes_on = True
+
     @property
     def seen(self) -> Detections:
         """Detections of the look at this frame, a batch of one."""
@@ -353,7 +355,7 @@ class Moment(Record):
     @property
     def examined(self) -> CloseUp | None:
         """The closer look, if this frame was spent on one; otherwise None."""
-        return next((look for look in self.closer if look.number == len(self) - 1), None)
+        return next((look for look in self.closer if look.index == len(self) - 1), None)
 
     @property
     @abstractmethod

@@ -42,7 +42,7 @@ _PLACE = ("x", "y", "x1", "y1", "x2", "y2")
 COLUMNS = ("object", "class", "score", "confirmed", *_PLACE, "look")
 """Columns of the table of objects."""
 
-DECISION_COLUMNS = ("target", "outcome", "probability", "assumed", *_PLACE, "passes")
+DECISION_COLUMNS = ("target", "outcome", "probability", "assumed", "place_probability", *_PLACE, "passes")
 """Values of `to_dict` that stand in a table of searches, a line for each picture."""
 
 
@@ -100,7 +100,7 @@ class Conversion(Outcome, OtherWords):
             One dictionary for each look.
         """
         # Of several closer looks after one look, the surest counts: it comes last.
-        closer = {look.of_look: look.place for look in sorted(self.closer, key=lambda look: look.place)}
+        closer = {look.index_of_look: look.place for look in sorted(self.closer, key=lambda look: look.place)}
         brought = Counter(self.objects.passes.tolist())
         rows: list[Values] = []
         for look in self:
@@ -135,7 +135,8 @@ class Conversion(Outcome, OtherWords):
 
         Returns:
             Values by name. Point and box of a search are those of the found target, or of the best place of one that
-            leaves it open, as `outcome` tells; None without one, and for numbers and errors that are not claimed.
+            leaves it open, as `outcome` tells; `place_probability` is that the target is there, and `probability` that
+            it is anywhere in the picture. None without a place, and for numbers and errors that are not claimed.
         """
         width, height = self.size
         return {
@@ -165,6 +166,7 @@ class Conversion(Outcome, OtherWords):
             "confirm": digits(decision.confirm),
             "prior": self.prior,
             "assumed": None if self.assumed is None else round(self.assumed, 6),
+            "place_probability": digits(self.place_probability),
             **self._decided_place(decision),
         }
 

@@ -35,7 +35,7 @@ _DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell"
 _DECISION_SINCE = {"confirm": Maybe(Number())}  # what files of earlier versions lack
 _CLOSER = {
     "fixation": Maybe(WHOLE),
-    "number": Maybe(WHOLE),
+    "index": Maybe(WHOLE),
     "target": WHOLE,
     "cell": Maybe(WHOLE),
     "place": CHANCE,
@@ -267,6 +267,10 @@ def _rename_former(record: dict[str, Any]) -> None:
     ending = record.get("ending")
     if isinstance(ending, str):
         record["ending"] = FORMER.get(ending, ending)
+    closer = record.get("closer")
+    for values in closer if isinstance(closer, list) else ():
+        if isinstance(values, dict) and "number" in values:
+            values["index"] = values.pop("number")
 
 
 def _check_shared(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
@@ -293,7 +297,7 @@ def _check_closer(closer: Sequence[Mapping[str, Any]], boxes: int, looks: int, c
     expected = f"a look below {looks} and the index of a class"
     for values in closer:
         # Either number may be missing, and neither may be beyond the looks.
-        look = max(values["fixation"] or 0, values["number"] or 0)
+        look = max(values["fixation"] or 0, values["index"] or 0)
         check(look < looks and _is_class(values["target"], classes), "closer", expected, values)
 
 

@@ -352,9 +352,9 @@ class HeadPath(Record):
         x1, y1, x2, y2 = places.boxes[0].tolist()
         return torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
 
-    def belief_map(self, number: int) -> tuple[Grid, Tensor]:
+    def belief_map(self, index: int) -> tuple[Grid, Tensor]:
         """Probability of the target, or of any object, in each cell of the scene after a look."""
-        return self.views.world.scene, self.maps[self._place(number)]
+        return self.views.world.scene, self.maps[self._place(index)]
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
         """Render the views of the head from a picture of the scene in any size."""

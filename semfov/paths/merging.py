@@ -61,7 +61,7 @@ def _columns_of_fixation(detections: Detections, distances: Tensor, cut: Tensor,
 def _columns_of_closer_look(look: CloseUp) -> list[Tensor]:
     """Make the columns of the box of a closer look, which is sharper than all fixations."""
     # The sharpness of a fixation is a distance with a minus, at most 0.
-    values = (look.place, look.target, look.of_look, False, 1.0)
+    values = (look.place, look.target, look.index_of_look, False, 1.0)
     return [look.box[None].detach().cpu(), *(torch.tensor([value]) for value in values)]
 
 

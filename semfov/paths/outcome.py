@@ -76,6 +76,9 @@ class Outcome(ABC):
     kind: ClassVar[LookKind]
     """Kind of look: of a fovea, at windows, or of a head that turns."""
 
+    _goes_on: ClassVar[bool] = False
+    """Whether further looks may follow, as after each frame of a stream, so that no decision is the last one."""
+
     @property
     @abstractmethod
     def size(self) -> tuple[int, int]:
@@ -115,16 +118,16 @@ class Outcome(ABC):
         check(not isinstance(index, str), "record", "the place of a look, from 0", f"{index!r}{remedy}")
         return self.looks[index]
 
-    def _place(self, number: int, argument: str = "number") -> int:
+    def _place(self, index: int, argument: str = "index") -> int:
         """Count a look from the start; refuse one that the record has not."""
         count = len(self)
-        check_whole(number, argument, -count, count - 1)
-        return number % count
+        check_whole(index, argument, -count, count - 1)
+        return index % count
 
     @property
     def passes(self) -> int:
         """Number of passes of the detector, closer looks included."""
-        return len(self) + sum(look.number is None for look in self.closer)
+        return len(self) + sum(look.index is None for look in self.closer)
 
     @property
     def target_name(self) -> str | None:
@@ -203,7 +206,8 @@ class Outcome(ABC):
     def objects(self) -> Objects:
         """The candidates of the targets that have at least the score `score_threshold`, or that were confirmed.
 
-        One that was confirmed has the box that confirmed it, and that box's probability where it is higher.
+        One that was confirmed has the box that confirmed it, and that box's probability where it is higher. A search
+        that did not find its target lists none: `best_place` is where the target is most likely.
         """
         return self._outcome[0]
 
@@ -264,6 +268,20 @@ class Outcome(ABC):
         return self.targets or (() if self.target is None else (self.target,))
 
     @property
+    def place_probability(self) -> float | None:
+        """Probability that the target of a search is at the place that it names: where it was found, or most likely.
+
+        The decision's own probability is that the picture holds the target anywhere. None where no place is named, or
+        where only a score of it is known.
+        """
+        best = self.best_place
+        if best is not None:
+            is_probability = len(self.closer) > 0 or self.unseen is not None
+            return best[1] if is_probability else None
+        decision = self.decision
+        return None if decision is None or decision.outcome != "found" else decision.place
+
+    @property
     def is_doubtful(self) -> bool:
         """Whether a search leaves it open if the target is there: it is undecided, or only probably absent."""
         decision = self.decision
@@ -295,7 +313,7 @@ class Outcome(ABC):
             # The box of the decision is often that of a closer look, and is listed once.
             is_found_place = found_place is not None and look.box.equal(found_place.box)
             if look.place >= _CONFIRMING and not is_found_place:
-                places.append(_ConfirmedPlace(look.box, look.target, look.place, look.of_look))
+                places.append(_ConfirmedPlace(look.box, look.target, look.place, look.index_of_look))
         return places if found_place is None else [*places, found_place]
 
     @property
@@ -307,13 +325,24 @@ class Outcome(ABC):
         if decision.box is None or self.target is None:
             return None
         probability = decision.probability if decision.place is None else decision.place
-        looks = [look.of_look for look in self.closer if look.box.equal(decision.box)]
+        looks = [look.index_of_look for look in self.closer if look.box.equal(decision.box)]
         # A box of no closer look is of the look by which the search decided, its last one.
         return _ConfirmedPlace(decision.box, self.target, probability, looks[0] if looks else len(self) - 1)
 
+    @property
+    def _has_missed(self) -> bool:
+        """Whether a search is over and has not found its target."""
+        return self.decision is not None and self.decision.outcome != "found" and not self._goes_on
+
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
-        """The objects, and which of them were confirmed."""
+        """The objects, and which of them were confirmed; none of a search that has not found its target."""
+        objects, confirmed = self._shown_objects
+        return (objects[:0], confirmed[:0]) if self._has_missed else (objects, confirmed)
+
+    @cached_property
+    def _shown_objects(self) -> tuple[Objects, Tensor]:
+        """The objects that the looks show, whatever was decided, and which of them were confirmed."""
         listing = _Listing(self.candidates.of(self.sought), self.score_threshold)
         for place in self._confirmed_places:
             listing.confirm(place)

@@ -270,23 +270,23 @@ class Scanpath(_CellRecord):
             raise InputError("scanpath: expected one with its stimulus, as an agent makes it, got one without")
         return self.stimulus.views(self.fixations)
 
-    def fixation_after(self, number: int) -> int:
+    def fixation_after(self, index: int) -> int:
         """Count to the last fixation up to a look, from 0: the index of the tensors of the fixations.
 
         Args:
-            number: place of the look in the record, from 0; negative ones count from the end.
+            index: place of the look in the record, from 0; negative ones count from the end.
 
         Returns:
-            The number of the fixation.
+            The index of the fixation.
 
         Raises:
             InputError: the record has no such look.
         """
-        return sum(not look.is_closer for look in self.looks[: self._place(number) + 1]) - 1
+        return sum(not look.is_closer for look in self.looks[: self._place(index) + 1]) - 1
 
-    def belief_map(self, number: int) -> tuple[Grid, Tensor]:
+    def belief_map(self, index: int) -> tuple[Grid, Tensor]:
         """Probability in each cell after a look: of the target by the belief of the search, or of any object."""
-        fixation = self.fixation_after(number)
+        fixation = self.fixation_after(index)
         if self.target is None:
             # Class 0 is the background.
             return self.grid, self.probabilities[fixation, :, 1:].amax(-1)
@@ -294,11 +294,11 @@ class Scanpath(_CellRecord):
         posterior = self.probabilities[..., self.target] if self.posterior is None else self.posterior  # (n, X·Y)
         return self.grid, posterior[fixation]
 
-    def regions(self, number: int = -1) -> Sequence[Region]:
+    def regions(self, index: int = -1) -> Sequence[Region]:
         """Find the regions of the map of what is where after a look of an exploration; a search has none."""
         if self.target is not None:
             return ()
-        return named_regions(self.grid, self.probabilities[self.fixation_after(number)], self.classes)
+        return named_regions(self.grid, self.probabilities[self.fixation_after(index)], self.classes)
 
     def figures(self, boxes: Tensor | None = None) -> dict[str, Callable[[], Figure]]:
         """List the path, the foveated views, and the belief of a search or the map of an exploration."""
@@ -372,9 +372,9 @@ def _looks_of_file(
     """Make the looks of a scanpath from the tensors and values of a file.
 
     Detections are of all looks in their order; other tensors are of the fixations alone, or of the closer looks alone.
-    Closer looks of earlier versions have no number: they are in `closer` alone, not among the looks.
+    Closer looks of earlier versions have no index: they are in `closer` alone, not among the looks.
     """
-    close_ups = {close_up.number: close_up for close_up in shared["closer"] if close_up.number is not None}
+    close_ups = {close_up.index: close_up for close_up in shared["closer"] if close_up.index is not None}
     detections = shared["detections"]
     seconds = record["seconds"] or [{}] * len(detections)
     cells = tensors["cells"].tolist()
@@ -503,9 +503,9 @@ class FoveaMoment(_CellRecord, Moment):
         """`(2,)`, the centre of the cell as `(x, y)` in pixels."""
         return torch.tensor(self.looks[0].fixation, dtype=self.probability.dtype)
 
-    def belief_map(self, number: int) -> tuple[Grid, Tensor]:
+    def belief_map(self, index: int) -> tuple[Grid, Tensor]:
         """Give the probability of the target, or of any object, in each cell."""
-        self._place(number)
+        self._place(index)
         return self.grid, self.probability
 
     @classmethod

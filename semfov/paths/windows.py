@@ -324,7 +324,7 @@ class ZoomPath(Record):
         return any(self._reacts_to([label]) for label in self.sought or self.candidates.labels.unique().tolist())
 
     def _reacts_to(self, labels: Sequence[int]) -> bool:
-        return len(self.objects.of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
+        return len(self._shown_objects[0].of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
         """Mean and variance of the number of objects of each class; NaN where none is estimated."""

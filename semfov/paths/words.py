@@ -176,7 +176,7 @@ class Words(ABC):
     def _why_decided(self, decision: Decision) -> str:
         """Say on what evidence the search decided: closer looks have sentences of their own in some kinds of look."""
         # Look 0 shows the whole picture; a search that looked at it alone has looked at nothing closer.
-        looked_closer = any(look.number != 0 for look in self.record.closer)
+        looked_closer = any(look.index != 0 for look in self.record.closer)
         name = f"closer {decision.outcome}" if looked_closer else decision.outcome
         return self._sentences.get(name, self._sentences[decision.outcome])
 
@@ -186,8 +186,8 @@ class Words(ABC):
         sentence = self._sentences["closer found"]
         if decision is None or decision.box is None:
             return sentence
-        numbers = [look.number for look in self.record.closer if look.box.equal(decision.box)]
-        return self._sentences.get("first found", sentence) if numbers == [0] else sentence
+        indices = [look.index for look in self.record.closer if look.box.equal(decision.box)]
+        return self._sentences.get("first found", sentence) if indices == [0] else sentence
 
     def assumption(self) -> str:
         """Say how many pictures the probability assumes to hold the target, and what it would be with half of them.

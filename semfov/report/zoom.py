@@ -130,7 +130,7 @@ def _status(path: Record, look: RecordedLook, magnification: float, pose: str | 
 
 def _closer_look(path: Record, look: RecordedLook) -> CloseUp | None:
     """Find the closer look that a look is, of several the surest; None for others."""
-    closer = [close_up for close_up in path.closer if close_up.number == look.index]
+    closer = [close_up for close_up in path.closer if close_up.index == look.index]
     return max(closer, key=lambda close_up: close_up.place, default=None)
 
 

@@ -134,7 +134,7 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
     """
     if last is None:
         last = len(record)
-    marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.of_look <= last]
+    marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.index_of_look <= last]
     rows = [row for row in record.object_rows() if row["look"] - 1 <= last]
     for row in reversed(rows):
         marks += _marks_of_object(row, record, many=len(rows) > _NAMED)

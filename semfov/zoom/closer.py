@@ -74,14 +74,14 @@ class SearchLook(NamedTuple):
 
     Attributes:
         detections: what may hold the target (`WindowLook.candidates`).
-        number: number of the next look of the path.
+        index: index of the next look of the path, from 0.
         presence: probability that the picture holds the target.
         best: highest score of the target in any look.
         hit_chance: chance that the best remaining window shows the target.
     """
 
     detections: Detections
-    number: int
+    index: int
     presence: float
     best: float
     hit_chance: float
@@ -109,7 +109,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
     places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
 
     Private attributes: `_look` is the last look of the search. `_looks` has the boxes of the target that looks have
-    shown, where they lie in the present frame, each with the time of the look. `_next` is the number of the next look.
+    shown, where they lie in the present frame, each with the time of the look. `_next` is the index of the next look.
 
     Invariant: `_most_evident`, once it was computed, is that of `_looks`, the examined places and the present time.
     What changes one of these calls `_change`.
@@ -132,7 +132,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._change()
         self._look = look
-        self._next = look.number
+        self._next = look.index
         self.detections = look.detections
         self.presence = self.prior(look.presence)
         scores = look.detections.scores[0, :, self.target]
@@ -174,7 +174,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
 
     def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
         """Look closely at a candidate, in the next look of the path."""
-        self._number = self._next
+        self._index = self._next
         self._next += 1
         return super().look_at(candidate, close_up)
 
@@ -263,12 +263,12 @@ class PhotographPlaces(CandidateBoxes):
         super().__init__(target, 0.0, forgetting, prior)
         self._lattice = lattice
         self._window = window
-        self._shown: dict[Window, tuple[int, Detections]] = {}  # by window, the number of the look and what it shows
+        self._shown: dict[Window, tuple[int, Detections]] = {}  # by window, the index of the look and what it shows
 
     def see(self, look: SearchLook) -> None:
         """Take in a look at the whole photograph."""
         super().see(look)
-        self._shown[Window.overview(self._lattice)] = look.number - 1, look.detections
+        self._shown[Window.overview(self._lattice)] = look.index - 1, look.detections
 
     @property
     def hit_chance(self) -> float:
@@ -290,7 +290,7 @@ class PhotographPlaces(CandidateBoxes):
         window = self._showing(candidate)
         if window not in self._shown:
             self._shown[window] = self._next, super().look_at(candidate, close_up)
-        self._number, detections = self._shown[window]
+        self._index, detections = self._shown[window]
         return replace(detections, mask=detections.mask & ~self._are_examined(detections.boxes[0]))
 
     def wait(self, passed: float = FRAME) -> None:

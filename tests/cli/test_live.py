@@ -230,7 +230,7 @@ def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
     assert changed[110:190, 110].all()
     assert not changed[115:185, 115:185].any()
     # A closer look is marked around its box instead of at the fixated point.
-    closer = CloseUp(0, 1, 6, box, 0.9, 0.95, number=0)
+    closer = CloseUp(0, 1, 6, box, 0.9, 0.95, index=0)
     there = {"grid": grid, "cell": 6, "next_cell": 6}
     close = draw_moment(grey, moment(**there, closer=(closer,)), "cup").astype(int)
     changed = abs(close - draw_moment(grey, moment(**there), "cup")).max(-1) > 8

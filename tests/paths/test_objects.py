@@ -65,14 +65,20 @@ def test_the_nearest_fixation_and_the_closer_look_have_the_box():
     assert refuted.objects.boxes.tolist() == [RIGHT]
 
 
-def test_what_was_not_sure_enough_for_the_decision_is_not_called_confirmed():
-    """It is listed by its probability, from the threshold on."""
+def test_what_was_not_sure_enough_for_the_decision_is_not_called_confirmed(monkeypatch):
+    """Nothing is listed beside `undecided` or `absent`; at a frame of a stream it is, by its probability."""
     path = scanpath(
         look((LEFT, 1, 0.2)), look((LEFT, 1, 0.1)), target=1, decision=Decision("undecided", 0.9, None, None)
     )
     unsure = replace(path, closer=(CloseUp(0, 1, 0, torch.tensor(LEFT), 0.55, 0.9),))
-    assert unsure.objects.scores.tolist() == pytest.approx([0.55])
-    assert unsure.confirmed.tolist() == [False]
+    for outcome in ("undecided", "absent"):
+        without = replace(unsure, decision=Decision(outcome, 0.9))
+        assert (len(without.objects), len(without.confirmed), without.object_rows()) == (0, 0, [])
+        assert len(without.candidates) == 1
+    monkeypatch.setattr(type(unsure), "_goes_on", True)
+    followed = replace(unsure)
+    assert followed.objects.scores.tolist() == pytest.approx([0.55])
+    assert followed.confirmed.tolist() == [False]
     assert len(replace(unsure, score_threshold=0.6).objects) == 0
     assert "(confirmed)" not in repr(unsure)
 
@@ -97,6 +103,11 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     assert list(_crops(path, source, options)) == [str(Path("out/cup/in/a-best.jpg"))]
     values = path.to_dict()
     assert [values[name] for name in ("outcome", "x", "y", "x1", "y1", "x2", "y2")] == ["undecided", 60, 47.5, *RIGHT]
+    assert (values["probability"], values["place_probability"]) == (0.7, 0.3)
+    assert replace(path, closer=()).to_dict()["place_probability"] is None  # it has a score alone
+    found = Decision("found", 0.9, 0, torch.tensor(LEFT), 0.8)
+    for decision, number in ((found, 0.8), (replace(found, place=None), None), (Decision("absent", 0.09), None)):
+        assert replace(path, decision=decision).to_dict()["place_probability"] == number
     assert replace(path, decision=Decision("absent", 0.1)).words.best_place == path.words.best_place
     for other in (None, Decision("absent", 0.09), Decision("found", 0.9, 0, torch.tensor(LEFT))):
         assert replace(path, decision=other).words.best_place == ""
@@ -135,7 +146,7 @@ def test_what_the_decision_found_is_among_the_objects():
         assert decided.confirmed.tolist() == [True, False]
         assert decided.objects.scores.tolist() == pytest.approx([0.8, 0.31])
     absent = replace(weak, decision=Decision("absent", 0.1, None, None))
-    assert absent.objects.boxes.tolist() == [RIGHT]
+    assert absent.objects.boxes.tolist() == []
 
 
 def test_objects_are_those_of_the_targets_from_the_threshold_on():

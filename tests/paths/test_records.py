@@ -87,7 +87,7 @@ def zoom_path():
         looks=looks_at_windows(window_looks, lattice, (float("inf"), 0.1 + 0.2, 0.75)),
         candidates=objects,
         decision=Decision("found", 0.9, None, BOX, 0.8),
-        closer=(CloseUp(None, 1, None, BOX, 0.8, 0.9, number=2),),
+        closer=(CloseUp(None, 1, None, BOX, 0.8, 0.9, index=2),),
         ending="decision",
     )
 
@@ -194,9 +194,23 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
     assert "cup" in shown or "cat" in shown
 
 
+def test_closer_looks_are_counted_as_looks_are_also_those_of_earlier_files(tmp_path):
+    """Their `index` is that of `record[index]`, and their `number` from 1 as in tables; files called it `number`."""
+    path = zoom_path()
+    (look,) = path.closer
+    assert (look.index, look.number) == (path[look.index].index, path[look.index].number) == (2, 3)
+    file = tmp_path / "record.safetensors"
+    path.save(file)
+    tensors, values = read(file, "zoom path")
+    former = [{**values["closer"][0]}]
+    former[0]["number"] = former[0].pop("index")
+    write_file(file, tensors, {**values, "closer": former})
+    assert ZoomPath.load(file).closer[0].index == 2
+
+
 def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
     path = zoom_path()
-    whole = dataclasses.replace(path.closer[0], number=0)
+    whole = dataclasses.replace(path.closer[0], index=0)
     first = dataclasses.replace(path, closer=(whole,))
     assert first.why_it_ended() == "The first look shows the target closely enough."
     doubt = dataclasses.replace(first, decision=Decision("undecided", 0.5))
@@ -427,7 +441,7 @@ def test_every_record_is_saved_and_loaded(make, tmp_path):
     assert loaded.rows() == record.rows()
     loaded.save(tmp_path / "b.safetensors")
     assert (tmp_path / "b.safetensors").read_bytes() == file.read_bytes()
-    closer = (CloseUp(0, 1, 5, BOX, 0.8, 0.9, number=0),) if make is moment else ()
+    closer = (CloseUp(0, 1, 5, BOX, 0.8, 0.9, index=0),) if make is moment else ()
     bare = replace(record, target=None, decision=None, closer=closer, ending=None)
     bare.save(file)
     again = type(record).load(file)
@@ -581,7 +595,7 @@ def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
         ({**tensors, "object_labels": torch.tensor([3])}, values, "object_labels"),
         ({**tensors, "object_passes": torch.tensor([3])}, values, "object_passes"),
         (tensors, {**values, "windows": windows}, "windows: expected levels below"),
-        (tensors, {**values, "closer": [{**values["closer"][0], "number": 3}]}, "closer"),
+        (tensors, {**values, "closer": [{**values["closer"][0], "index": 3}]}, "closer"),
     ):
         write_file(file, parts, record)
         unusable(message, ZoomPath.load, file)

@@ -119,7 +119,7 @@ def test_a_look_that_brought_nothing_has_no_line_of_what_it_brought(zoom_path, l
 
 
 def test_the_only_look_is_no_closer_one(zoom_path, large_picture):
-    shown = CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, number=0)
+    shown = CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, index=0)
     path = replace(
         zoom_path, looks=zoom_path.looks[:1], closer=(shown,), ending="decision", candidates=zoom_path.candidates[:0]
     )
@@ -131,7 +131,7 @@ def test_the_only_look_is_no_closer_one(zoom_path, large_picture):
 
 def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
     path = replace(
-        zoom_path, closer=(CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, number=2),), ending="decision"
+        zoom_path, closer=(CloseUp(None, 1, None, zoom_path.decision.box, 0.875, 0.9, index=2),), ending="decision"
     )
     data = zoom_data(path, large_picture, name="field")
     assert data["decision"].endswith("0.93. A closer look confirmed the target.")
@@ -223,9 +223,10 @@ def test_an_undecided_search_has_the_best_place_of_the_record_on_its_page(zoom_p
     nothing = page_html("t", [data | {"objects": [], "count": 0, "looks": data["looks"][:1]}])
     entries = [re.findall(r'<i class="of-(\w+)">', text) for text in (page, nothing)]
     assert "No objects were found. The best place, not sure enough, is dashed." in nothing
-    assert entries == [["objects", "best", "windows", "now"], ["best"]]
+    assert entries == [["best", "windows", "now"], ["best"]]
     (dashed,) = re.findall(r"<rect [^>]*stroke-dasharray[^>]*><title>([^<]*)</title>", path._repr_html_())
     assert dashed == f"best place {path.best_place[1]:.2f}"
+    assert data["objects"] == []
     assert "dash" not in zoom_path._repr_html_()
     assert not Elements(page_html("t", [zoom_data(zoom_path, large_picture, name="field.png")])).of("best")
 

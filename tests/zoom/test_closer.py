@@ -214,10 +214,10 @@ def test_a_search_looks_closely_before_it_finds(detector, picture):
     path = agent.search(picture, "red")
     (look,) = path.closer
     assert (path.decision.outcome, path.passes) == ("found", plain.passes + 1)
-    assert (look.number, path.decision.place) == (path.passes - 1, look.place)
+    assert (look.index, path.decision.place) == (path.passes - 1, look.place)
     assert path.decision.probability == pytest.approx(max(look.place, look.presence))
     # The look is a window around the box that the search without it would have found.
-    assert path.window_looks[look.number].window == closer_window(path.lattice, plain.decision.box)
+    assert path.window_looks[look.index].window == closer_window(path.lattice, plain.decision.box)
     assert path.decision.box.tolist() == look.box.tolist()
     x1, y1, x2, y2 = path.decision.box.tolist()
     assert max(x1, 640) < min(x2, 672)
@@ -225,7 +225,7 @@ def test_a_search_looks_closely_before_it_finds(detector, picture):
     assert path.why_it_ended() == "A closer look confirmed the target."
     # It costs one of the passes.
     short = agent.search(picture, "red", SearchSettings(passes=plain.passes))
-    assert [look.number for look in short.closer] == [plain.passes - 1]
+    assert [look.index for look in short.closer] == [plain.passes - 1]
     assert agent.search(picture, "red", SearchSettings(passes=1)).closer == ()
 
 
@@ -243,7 +243,7 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     # As long as nothing is found the search goes on.
     looked = []
     path = agent.search(image, "red", SearchSettings(confirm=1.0, on_look=lambda record: looked.append(record.passes)))
-    assert path.passes > path.closer[0].number + 1
+    assert path.passes > path.closer[0].number
     assert path.decision.outcome != "found"
     assert looked == [*range(1, path.passes + 1)]
 
@@ -510,7 +510,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     assert x1 < 160 < x2
     assert y1 < 112 < y2
     assert path.passes == 1 + len(path.closer)
-    assert [look.number for look in path.closer] == list(range(1, path.passes))
+    assert [look.index for look in path.closer] == list(range(1, path.passes))
     nothing = agent.search(photograph, "blue")
     assert nothing.decision.outcome == "absent"
     assert nothing.passes == 1
@@ -524,7 +524,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     assert len(made[0].closer) == len(made[1].closer) > max(len(path.closer), 2)
     for each in made:
         assert len({window_look.window for window_look in each.window_looks}) == each.passes < 1 + len(each.closer)
-        assert {look.number for look in each.closer} == set(range(1, each.passes))
+        assert {look.index for look in each.closer} == set(range(1, each.passes))
         rows = [row["closer"] for row in each.rows()]
         best = [max(c.place for c in each.closer if c.number == n) for n in range(1, each.passes)]
         assert rows == [None, *(pytest.approx(place, abs=5e-5) for place in best)]  # tables have four digits
