@@ -1,5 +1,6 @@
 """Annotations in COCO's format whose ids results take, and the average precision against them."""
 
+import re
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
@@ -24,7 +25,7 @@ class Truth:
         self.annotations = read_annotations(path)
         self._images: dict[str, list[Id]] = defaultdict(list)
         for image, entry in self.annotations.images.items():
-            self._images[_plain(_parts(entry["file_name"])[-1])].append(image)
+            self._images[_uploaded(_parts(entry["file_name"])[-1])].append(image)
         self._warn_of_boxes()
 
     @property
@@ -52,7 +53,7 @@ class Truth:
         """Find the id of a picture by its name; of several of one name that whose folders agree best.
 
         Where no image is named as the picture is, names agree in any letter case, and as other systems and addresses
-        write them: `K%C3%BCche.JPG` for `Küche.jpg`.
+        write them: `K%C3%BCche.JPG` for `Küche.jpg`. Last come the names that programs give to uploaded pictures.
 
         Args:
             name: path of the picture.
@@ -64,11 +65,14 @@ class Truth:
         Raises:
             DataError: no image, or several, have this name, or its size is another one.
         """
-        images = self._named(name, str)
-        if len(images) != 1:
-            images = self._named(name, _plain)
+        for spelled in (str, _plain, _uploaded):
+            images = self._named(name, spelled)
+            if len(images) == 1:
+                break
         expected = f"one image with the file_name of {name}"
-        check_data(len(images) == 1, f"annotations {self.path}", expected, len(images))
+        names = [entry["file_name"] for entry in self.annotations.images.values()]
+        got = f"{len(images)} of {len(names)}, which are named as {names[0]!r:.100}" if names else "no images"
+        check_data(len(images) == 1, f"annotations {self.path}", expected, got)
         (image,) = images
         stated = self.annotations.size(image)
         if size is not None and stated is not None and stated != size:
@@ -87,7 +91,7 @@ class Truth:
         """
         parts = _parts(name)
         agreements = {}
-        for image in self._images.get(_plain(parts[-1]), ()):
+        for image in self._images.get(_uploaded(parts[-1]), ()):
             image_parts = _parts(self.annotations.images[image]["file_name"])
             agreements[image] = _common_end([*map(spelled, parts)], [*map(spelled, image_parts)])
         best = max(agreements.values(), default=0)
@@ -139,6 +143,16 @@ class Truth:
 def _plain(part: str) -> str:
     """Write a part of a path without what differs between systems: letter case, composed letters, percent signs."""
     return normalize("NFC", unquote(part)).casefold()
+
+
+def _uploaded(part: str) -> str:
+    """Write a part of a path plainly, without what programs add to the names of pictures that are uploaded to them.
+
+    Label Studio puts eight digits before a name, `0b51f2a7-kitchen.jpg`, and Roboflow its own suffix behind it,
+    `kitchen_jpg.rf.4a1cdeb7f3.jpg`.
+    """
+    plain = re.sub(r"^[0-9a-f]{8}-(?=.)", "", _plain(part))
+    return re.sub(r"_(jpe?g|png|bmp|tiff?|webp)\.rf\.[0-9a-z]+\.[a-z]+$", r".\1", plain)
 
 
 def _common_end(parts: Sequence[str], others: Sequence[str]) -> int:

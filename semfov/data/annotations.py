@@ -54,6 +54,12 @@ class Annotations:
         return int(width), int(height)
 
 
+_OF_YOLO = (
+    "labels of YOLO; supervision.DetectionDataset.from_yolo(…).as_coco(annotations_path=…) writes them in this format"
+)
+_OF_LABEL_STUDIO = "tasks of Label Studio, whose menu Export also offers COCO"
+
+
 def read_annotations(path: str | PathLike[str]) -> Annotations:
     """Read and check a COCO instances file.
 
@@ -70,8 +76,12 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
         DataError: the file is missing or damaged; the message names the entry and the field.
     """
     name = f"annotations {Path(path)}"
-    data = read_json(path, name=name)
     expected = "an object with images, annotations and categories"
+    is_yolo = Path(path).suffix.lower() in (".txt", ".yaml", ".yml") or any(Path(path).glob("*.txt"))
+    check_data(not is_yolo, name, "a file in COCO's format, .json", _OF_YOLO)
+    data = read_json(path, name=name)
+    is_of_label_studio = isinstance(data, list) and bool(data) and isinstance(data[0], dict) and "data" in data[0]
+    check_data(not is_of_label_studio, name, expected, _OF_LABEL_STUDIO)
     check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
     images = _images(data, name)
     categories = _by_id(data, "categories", name, {"name": _NAME})

@@ -271,7 +271,18 @@ def test_pictures_are_found_as_other_systems_and_addresses_write_their_names(mak
     assert truth.image_id("/photos/my photo.jpg") == 2
     assert [truth.image_id(name) for name in ("b/x.jpg", "B/X.jpg", "c/x.jpg")] == [3, 4, 3]
     assert truth.image_id("100%.png") == 5
-    unusable("expected one image with the file_name of", truth.image_id, "z.jpg")
+    unusable("expected one image .* of z.jpg, got 0 of 5, which are named as 'a/K", truth.image_id, "z.jpg")
+
+
+def test_pictures_have_the_names_that_programs_gave_to_what_was_uploaded(make_truth):
+    """Label Studio and Roboflow; a picture of that very name comes first, and other digits belong to names."""
+    names = r"images\\0b51f2a7-kitchen.jpg", "00ff00ff-kitchen.jpg.png", "Hall_JPG.rf.4a1cdeb7f3.jpg", "a1-hall.jpg"
+    truth = make_truth(*names)
+    assert [truth.image_id(name) for name in ("photos/kitchen.jpg", "0b51f2a7-kitchen.jpg", "hall.jpg")] == [1, 1, 3]
+    unusable("expected one image", truth.image_id, "1-hall.jpg")
+    truth = make_truth("0b51f2a7-a.jpg", "00ff00ff-a.jpg", "a.jpg")
+    assert [truth.image_id(name) for name in ("a.jpg", "00ff00ff-a.jpg")] == [3, 2]
+    unusable("got 2 of 3", truth.image_id, "11111111-a.jpg")
 
 
 def test_an_exact_name_wins_and_no_two_pictures_take_one_image(run, photo, make_truth, tmp_path):

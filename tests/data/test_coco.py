@@ -140,6 +140,19 @@ def test_what_is_no_file_of_annotations_is_refused(tmp_path, make_coco):
     for text in [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 10_000]:
         (tmp_path / "a.json").write_bytes(text)
         unusable(r"a\.json: cannot be read as JSON", read_annotations, tmp_path / "a.json")
+    for name, text, remedy in (
+        ("labels.txt", "0 .5 .5 .1 .1", "labels of YOLO; supervision"),
+        ("data.yaml", "names: [cup]", "labels of YOLO; supervision"),
+        (
+            "export.json",
+            '[{"id": 1, "data": {"image": "a.jpg"}, "annotations": []}]',
+            "tasks of Label Studio, whose menu",
+        ),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(DataError, match=remedy):
+            read_annotations(tmp_path / name)
+    unusable("labels of YOLO", read_annotations, tmp_path)  # the folder of its labels
     with pytest.raises(DataError, match=r"expected an object with images, annotations and categories, got \[\]"):
         read_annotations(make_coco(data=[]))
 
