@@ -13,6 +13,7 @@ from semfov import ActivePerception, FovealObservationModel
 from semfov.belief import Verification
 from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.options import SearchOptions
+from semfov.io.pretrained import shipped_model
 from semfov.observation.presence import presence_facts
 from semfov.observation.thresholds import Thresholds
 from semfov.presets import PUBLISHED_SENSORS, published_model
@@ -306,3 +307,11 @@ def test_the_file_of_a_model_names_its_detector_and_what_else_it_may_be(one_of_e
     unnamed.save(tmp_path / "unnamed.safetensors")
     refused("detector: expected the detector that", ActivePerception.from_pretrained, tmp_path / "unnamed.safetensors")
     unusable("no such file", ActivePerception.from_pretrained, tmp_path / "missing.safetensors")
+
+
+@pytest.mark.parametrize("name", ["mine-search", "mine", "mine-published", "mine-published-0.1"])
+def test_a_detector_without_shipped_models_is_named_with_those_that_have_them(name):
+    """By their names alone, whatever the purpose of the model, though the file of the detector is called otherwise."""
+    others = "nanodet-plus-m-1.5x, yolov3-tiny, yolox-nano" if "0.1" not in name else "yolov3-tiny, yolox-nano"
+    message = rf"no observation model is shipped for 'mine', only for {others}; .* `semfov fit my/mine\.onnx "
+    refused(message, shipped_model, FovealObservationModel, name, "mine", "my/mine.onnx")

@@ -474,7 +474,7 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
             visited=step.visited[0],
             next_cell=int(step.next_cell) if next_cell is None else next_cell,
             # Of one look, which is that of the frame.
-            closer=tuple(replace(close_up, fixation=0, number=0) for close_up in closer),
+            closer=tuple(replace(close_up, fixation=0, index=0) for close_up in closer),
             found=decision is not None and decision.outcome == "found",
             prior=self.plan.given_share,
             assumed=self.plan.prior.assumed,
