@@ -29,7 +29,6 @@ _MOST_TEMPERING = 100
 _MOST_DISTANCE = 10  # larger ones are taken for pixels: no fixation lies ten longer sides from a box of its image
 _MOST_LOG_CELL = 50  # of the logarithms of m, a and w
 _SINCE = ("log_exponents", "refutation", "log_cell", "presence")  # parts that states of earlier versions lack
-_OPTIONAL = ("expected", "miss_rate", "log_miss", "presence")  # parts that a model may lack
 
 
 class FovealObservationModel(Pretrained):
@@ -460,22 +459,14 @@ class FovealObservationModel(Pretrained):
             model.check_compatible(detector.settings(), detector.classes)
         return model
 
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Tensor], prefix: str, local_metadata: JsonObject, strict: bool, *faults: list[str]
-    ) -> None:
-        """Load, where a state of an earlier version lacks parts, with those of the module; refuse parts that it lacks.
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *settings: Any) -> None:
+        """Load; parts that a state of an earlier version lacks stay as they are.
 
-        The children of the module read what is added to the state here.
+        They are added to the state here, where the children of the module, such as `presence`, read them.
         """
-        in_state = {name.removeprefix(prefix).partition(".")[0] for name in state_dict if name.startswith(prefix)}
-        surplus = [part for part in _OPTIONAL if part in in_state and getattr(self, part) is None]
-        if strict and surplus:
-            raise InputError(
-                f"state_dict: expected the state of a model without {surplus[0]}, got one with it; make the model with "
-                f"{surplus[0]}=, or keep it in a file: model.save(path), FovealObservationModel.from_pretrained(path)"
-            )
-        lacking = [part for part in _SINCE if part not in in_state and getattr(self, part) is not None]
-        if strict and lacking and "log_alpha" in in_state:
+        parts = {name.removeprefix(prefix).partition(".")[0] for name in state_dict if name.startswith(prefix)}
+        lacking = [part for part in _SINCE if part not in parts and getattr(self, part) is not None]
+        if lacking and "log_alpha" in parts:
             for name, value in self.state_dict(keep_vars=True).items():
                 if name.partition(".")[0] in lacking:
                     state_dict[prefix + name] = value
@@ -483,7 +474,7 @@ class FovealObservationModel(Pretrained):
                 f"state_dict: it is of an earlier version, without {', '.join(lacking)}; those of the module stay",
                 stacklevel=2,
             )
-        super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, *faults)
+        super()._load_from_state_dict(state_dict, prefix, *settings)
 
     def extra_repr(self) -> str:
         """Write the sizes for the `repr` of the module.

@@ -84,7 +84,7 @@ def test_a_still_picture_at_rate_zero_is_searched_frame_by_frame(one_thread):
         for one, other in zip(closely, searched.closer, strict=True):
             assert torch.equal(one.box, other.box)
             # A moment has one look of the fovea, and a search has all of them.
-            apart = {"box": None, "fixation": 0, "number": None}
+            apart = {"box": None, "fixation": 0, "index": None}
             assert one.fixation == 0
             assert vars(one) | apart == vars(other) | apart
         for before, after in pairwise(moments):

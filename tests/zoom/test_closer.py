@@ -158,7 +158,7 @@ def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcom
     judge = verifier(FromScore(presence), scores)
     judge.see(look(5, 0.9, 0.0 if over else 0.5, ONE, OTHER))
     made = judge.look_closely(9)
-    assert [each.number for each in judge.looks] == list(range(5, 5 + count))
+    assert [each.index for each in judge.looks] == list(range(5, 5 + count))
     assert [round(each.place, 4) for each in judge.looks] == scores
     assert [round(each.probability, 4) for each in made] == [0.9] * count
     assert OUTCOMES[judge.outcome()] == judge.decision_at_end().outcome == outcome
@@ -420,11 +420,11 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     features, box = places.examine(large, close_up)
     expected = closer_features(0.8, large.probability, 0.5, whole, large.box, 1)
     assert torch.equal(features, expected[0])
-    assert (looked, places.record(box, 0.4, 0.5).number) == ([], 0)
+    assert (looked, places.record(box, 0.4, 0.5).index) == ([], 0)
     small = places.due(Thresholds(1.0, 0.1), last=True)
     assert not places.is_shown(small)
     _, box = places.examine(small, close_up)
-    assert (len(looked), places.record(box, 0.4, 0.5).number) == (1, 1)
+    assert (len(looked), places.record(box, 0.4, 0.5).index) == (1, 1)
 
 
 @pytest.mark.parametrize(("rate", "passes"), [(0.0, 1), (2.5, 2)])
@@ -449,7 +449,7 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
     assert looked[0] == boxes[0, 0].tolist()
     assert looked[1] == boxes[0, 3 - passes].tolist()
     second = judge.looks[1]
-    assert (second.number, second.box.tolist()) == (passes, closely.boxes[0, 1].tolist())
+    assert (second.index, second.box.tolist()) == (passes, closely.boxes[0, 1].tolist())
     expected, _ = closer_features(0.9, due.probability, due.evidence, closely, due.box, 1)
     assert second.place == pytest.approx(Alike()(expected).sigmoid()[0].item())
 
@@ -526,7 +526,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
         assert len({window_look.window for window_look in each.window_looks}) == each.passes < 1 + len(each.closer)
         assert {look.index for look in each.closer} == set(range(1, each.passes))
         rows = [row["closer"] for row in each.rows()]
-        best = [max(c.place for c in each.closer if c.number == n) for n in range(1, each.passes)]
+        best = [max(c.place for c in each.closer if c.index == n) for n in range(1, each.passes)]
         assert rows == [None, *(pytest.approx(place, abs=5e-5) for place in best)]  # tables have four digits
 
 
@@ -616,7 +616,7 @@ def test_a_stream_of_a_photograph_gives_what_a_search_gives(detector, photograph
     assert moment.decision.outcome == path.decision.outcome
     assert moment.decision.probability == pytest.approx(path.decision.probability, abs=1e-9)
     assert torch.equal(moment.decision.box, path.decision.box)
-    assert moment.examined.number == path.passes - 1
+    assert moment.examined.index == path.passes - 1
     assert [look.number for look in moment.closer] == [look.number for look in path.closer]
     assert [look.box.tolist() for look in moment.closer] == [look.box.tolist() for look in path.closer]
     path = ZoomAgent(WindowEye(detector), own_evidence()).search(photograph, "red", SearchSettings(closer=0))
