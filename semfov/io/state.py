@@ -33,6 +33,9 @@ class StatedModule(nn.Module):
     def _load_fitted_values(self, values: Mapping[str, Any]) -> None:
         """Take those of a state, which may lack them."""
 
+    def _complete_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Add to a state what those of earlier versions lack."""
+
     def get_extra_state(self) -> Tensor:
         """Write the settings and the values of a fit as bytes of JSON."""
         values = {**self._stated(), **self._fitted_values()}
@@ -51,7 +54,7 @@ class StatedModule(nn.Module):
 
     def _load_from_state_dict(
         self,
-        state_dict: Mapping[str, Tensor],
+        state_dict: dict[str, Tensor],
         prefix: str,
         local_metadata: Mapping[str, object],
         strict: bool,
@@ -64,6 +67,7 @@ class StatedModule(nn.Module):
         # Before the tensors, so that the message names the setting and not the shapes that follow from it.
         if key in state_dict:
             self.set_extra_state(state_dict[key])
+        self._complete_state(state_dict, prefix)
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
         )

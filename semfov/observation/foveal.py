@@ -459,22 +459,20 @@ class FovealObservationModel(Pretrained):
             model.check_compatible(detector.settings(), detector.classes)
         return model
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *settings: Any) -> None:
-        """Load; parts that a state of an earlier version lacks stay as they are.
-
-        They are added to the state here, where the children of the module, such as `presence`, read them.
-        """
-        parts = {name.removeprefix(prefix).partition(".")[0] for name in state_dict if name.startswith(prefix)}
+    def _complete_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Add the module's own values of parts that a state of an earlier version lacks, so that they stay."""
+        parts = {name.removeprefix(prefix).partition(".")[0] for name in state if name.startswith(prefix)}
         lacking = [part for part in _SINCE if part not in parts and getattr(self, part) is not None]
-        if lacking and "log_alpha" in parts:
-            for name, value in self.state_dict(keep_vars=True).items():
-                if name.partition(".")[0] in lacking:
-                    state_dict[prefix + name] = value
-            warnings.warn(
-                f"state_dict: it is of an earlier version, without {', '.join(lacking)}; those of the module stay",
-                stacklevel=2,
-            )
-        super()._load_from_state_dict(state_dict, prefix, *settings)
+        if not lacking or "log_alpha" not in parts:
+            return
+        # The children of the module, such as `presence`, read the same state later.
+        for name, value in self.state_dict(keep_vars=True).items():
+            if name.partition(".")[0] in lacking:
+                state[prefix + name] = value
+        warnings.warn(
+            f"state_dict: it is of an earlier version, without {', '.join(lacking)}; those of the module stay",
+            stacklevel=2,
+        )
 
     def extra_repr(self) -> str:
         """Write the sizes for the `repr` of the module.
