@@ -178,7 +178,9 @@ def _matching(word: str) -> list[str]:
 def _check_may_be_picture(name: str, *, has_target: bool) -> None:
     """Raise `InputError` for what cannot be a picture: an address, a word that is no file, or a video."""
     path = Path(name)
-    check("://" not in name, "picture", "a file on this machine (`semfov live` takes streams)", repr(name))
+    is_stream = name.lower().startswith(("rtsp", "rtmp", "udp", "tcp", "srt"))
+    remedy = "`semfov live` takes streams" if is_stream else "download it first"
+    check("://" not in name, "picture", "a file on this machine", f"{name!r}; {remedy}")
     looks_like_file = path.exists() or bool(path.suffix) or len(path.parts) > 1
     of_class = f" (a class is given by --target {name})" if has_target else ""
     check(looks_like_file, "picture", f"a file or folder{of_class}", f"{name}, which does not exist")

@@ -228,7 +228,7 @@ class _MosaicSearch(TargetSearch[SearchLook]):
         return len(self.steps)
 
     def look(self, index: int, number: int) -> SearchLook:
-        return self.steps[index]._replace(number=number)
+        return self.steps[index]._replace(next_index=number)
 
     def candidates(self) -> CandidateBoxes:
         return CandidateBoxes(self.target, self.least)

@@ -74,14 +74,14 @@ class SearchLook(NamedTuple):
 
     Attributes:
         detections: what may hold the target (`WindowLook.candidates`).
-        index: index of the next look of the path, from 0.
+        next_index: index of the next look of the path, from 0.
         presence: probability that the picture holds the target.
         best: highest score of the target in any look.
         hit_chance: chance that the best remaining window shows the target.
     """
 
     detections: Detections
-    index: int
+    next_index: int
     presence: float
     best: float
     hit_chance: float
@@ -132,7 +132,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._change()
         self._look = look
-        self._next = look.index
+        self._next = look.next_index
         self.detections = look.detections
         self.presence = self.prior(look.presence)
         scores = look.detections.scores[0, :, self.target]
@@ -268,7 +268,7 @@ class PhotographPlaces(CandidateBoxes):
     def see(self, look: SearchLook) -> None:
         """Take in a look at the whole photograph."""
         super().see(look)
-        self._shown[Window.overview(self._lattice)] = look.index - 1, look.detections
+        self._shown[Window.overview(self._lattice)] = look.next_index - 1, look.detections
 
     @property
     def hit_chance(self) -> float:

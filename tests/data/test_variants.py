@@ -1,6 +1,7 @@
 """The product of what a picture's file may be: every reader shows what its numbers say."""
 
 import itertools
+import re
 import sys
 from contextlib import nullcontext
 
@@ -326,8 +327,8 @@ def test_percentiles_are_those_of_pixels_with_data(tmp_path):
 
 FOREIGN = {
     "JPEG XL": b"\xff\x0a" + bytes(40),
-    "HEIC": b"\0\0\0\x18ftypheic" + bytes(40),
-    "PDF": b"%PDF-1.4",
+    "HEIC (`heif-convert": b"\0\0\0\x18ftypheic" + bytes(40),
+    "PDF (`pdftoppm": b"%PDF-1.4",
     "a web page": b"<!DOCTYPE html><p>404</p>",
     "an empty file": b"",
     "OpenEXR": b"\x76\x2f\x31\x01" + bytes(40),
@@ -340,7 +341,11 @@ FOREIGN = {
 def test_files_of_other_kinds_are_refused_by_name(tmp_path, kind, end):
     (tmp_path / f"a.{end}").write_bytes(FOREIGN[kind])
     for read in (read_image, open_large, picture_size):
-        unusable(f"not an image in a format that is read .*, got {kind}.*; convert it", read, tmp_path / f"a.{end}")
+        unusable(
+            rf"not an image in a format that is read .*, got {re.escape(kind)}.*; convert it",
+            read,
+            tmp_path / f"a.{end}",
+        )
 
 
 def test_more_than_8_bits_of_jpeg_2000_need_the_reader_that_keeps_them(tmp_path):
