@@ -307,6 +307,9 @@ def test_the_file_of_a_model_names_its_detector_and_what_else_it_may_be(one_of_e
     unnamed.save(tmp_path / "unnamed.safetensors")
     refused("detector: expected the detector that", ActivePerception.from_pretrained, tmp_path / "unnamed.safetensors")
     unusable("no such file", ActivePerception.from_pretrained, tmp_path / "missing.safetensors")
+    detector = tmp_path / "mine.onnx"
+    detector.touch()
+    unusable("or the .safetensors of one, got a file; .* --detector ", detector_classes, SearchOptions(models=detector))
 
 
 @pytest.mark.parametrize("name", ["mine-search", "mine", "mine-published", "mine-published-0.1"])

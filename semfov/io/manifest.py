@@ -131,6 +131,11 @@ _AGAIN = "run semfov fit again, or copy the folder again"
 
 def _read_record(path: Path) -> JsonObject:
     """Read the record of a folder, and verify its checksum, its version and its values."""
+    if path.parent.is_file():
+        got = f"a file; a detector is given as detector=, on a command line as --detector {path.parent}"
+        raise DataError(
+            f"{path.parent}: expected {_expected_folder(path.parent)}, or the .safetensors of one, got {got}"
+        )
     if not path.exists():
         raise DataError(f"{path}: no such file; expected {_expected_folder(path.parent)}")
     record: JsonObject = read_json(path, most=_MOST_BYTES)

@@ -277,7 +277,7 @@ def test_a_detector_without_a_model_is_told(run, photos, monkeypatch):
     monkeypatch.setattr("semfov.cli.gaze.load_detector", lambda name, **options: other)
     code, _, err = run(photos / "0.png")
     assert code == 1
-    assert "semfov fit other --gaze.fixations" in err
+    assert "semfov fit MODEL --gaze.fixations" in err
     assert "colours" in err
 
 

@@ -257,7 +257,7 @@ def test_detectors_are_listed_with_licence_and_models(capsys):
 def test_an_agent_without_models_is_not_made_from_a_folder():
     from semfov.cli.options import SearchOptions
 
-    with pytest.raises(InputError, match="agent: expected recommended or published with --models, got raw"):
+    with pytest.raises(InputError, match="agent: expected recommended or published with --models FOLDER, got raw"):
         make_agent(SearchOptions(agent="raw", models="mymodels"))
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.detection import Detector, FeatureMaps
+from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check, check_shape
 from semfov.gaze.saliency.likeness import PictureLikeness
 from semfov.gaze.saliency.oculomotor import OculomotorBias
@@ -435,9 +436,10 @@ def shared_density(detector: Detector) -> FixationDensity:
     path = folder / f"{detector.name}.safetensors"
     if not path.is_file():
         names = ", ".join(sorted(path.stem for path in folder.glob("*.safetensors")))
+        model_name = detector.name if detector.name in WEIGHTS else "MODEL"  # a file has more than its name
         raise InputError(
             f"detector: a model of where people look is shipped for {names}, got {detector.name}; fit one to "
-            f"fixations with `semfov fit {detector.name} --gaze.fixations FILE --gaze.pictures FOLDER`"
+            f"fixations with `semfov fit {model_name} --gaze.fixations FILE --gaze.pictures FOLDER`"
         )
     model = _read(path)
     model.check_compatible(detector)
