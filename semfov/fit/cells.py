@@ -13,6 +13,7 @@ from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.fit.samples import Samples
 from semfov.metrics.episodes import answers_of
+from semfov.observation.descent import Lbfgs
 from semfov.observation.foveal import FovealObservationModel
 
 MOST_PHOTOGRAPHS = 200
@@ -131,7 +132,7 @@ def fit_cells(model: FovealObservationModel, photographs: Sequence[MappedLooks],
         ratio = torch.cat([_closest_looks(observer, mapped, generator) for mapped in photographs]).double()
     answers = torch.cat([mapped.answers.expand(_COUNTS, -1, -1) for mapped in photographs])
     start = model.log_cell.detach().clone()
-    optimiser = torch.optim.LBFGS([model.log_cell], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
+    optimiser = Lbfgs([model.log_cell], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
 
     def loss_of() -> Tensor:
         optimiser.zero_grad()

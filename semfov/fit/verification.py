@@ -16,6 +16,7 @@ from semfov.errors import DataError
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, TargetSearch, photograph_searches
 from semfov.fit.settings import FitOnCellsConfig
 from semfov.io.ranges import Count, Positive, Range, Share
+from semfov.observation.descent import Lbfgs
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.thresholds import Thresholds
 
@@ -339,7 +340,7 @@ def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verifi
     penalty = _Penalty.of(prior, mean, scale, len(features))
     weight = penalty.weight.clone().requires_grad_(True)
     bias = penalty.bias.clone().requires_grad_(True)
-    optimiser = torch.optim.LBFGS([weight, bias], max_iter=200, line_search_fn="strong_wolfe")
+    optimiser = Lbfgs([weight, bias], max_iter=200, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimiser.zero_grad()

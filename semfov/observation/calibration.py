@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
+from semfov.observation.descent import Lbfgs
 from semfov.observation.dirichlet import floor, log_normaliser
 from semfov.observation.foveal import FovealObservationModel
 
@@ -88,7 +89,7 @@ def fit_discriminative(
     unit = torch.eye(components).to(scores)
     common_precision = torch.where(unit[:, None] > 0, bias_decay, decay)
     posterior = _Posterior(groups, unit, common_precision, level_decay, bias_decay)
-    optimiser = torch.optim.LBFGS(
+    optimiser = Lbfgs(
         posterior.variables,
         max_iter=iterations,
         history_size=10,

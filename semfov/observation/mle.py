@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import SemfovError, check, check_finite, check_shape, lookup
+from semfov.observation.descent import Lbfgs
 
 Method = Literal["newton", "fixed_point", "gradient"]
 
@@ -358,7 +359,7 @@ def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
     shift = torch.zeros_like(total, requires_grad=True)
     of_total = start.sum(-1).lgamma()
     of_each = start.lgamma()
-    optimiser = torch.optim.LBFGS(
+    optimiser = Lbfgs(
         [offset, shift], max_iter=25, tolerance_grad=1e-13, tolerance_change=0, line_search_fn=line_search
     )
 
