@@ -218,9 +218,10 @@ class CandidatePlaces(ABC, Generic[LookType]):
         if not self._examined:
             return []
         boxes = torch.stack([place.boxes for place in self._examined])  # (places, 2, 4)
-        are_ahead = motion.shows(boxes).all(-1).tolist()
-        moved = zip(self._examined, motion.boxes(boxes), are_ahead, strict=True)
-        return [place._replace(boxes=moved_boxes) for place, moved_boxes, is_ahead in moved if is_ahead]
+        moved_boxes, boxes_ahead = motion.boxes_ahead(boxes)
+        are_ahead = boxes_ahead.all(-1).tolist()
+        moved = zip(self._examined, moved_boxes, are_ahead, strict=True)
+        return [place._replace(boxes=boxes_of_place) for place, boxes_of_place, is_ahead in moved if is_ahead]
 
     def cell(self, box: Tensor) -> int | None:
         """Find the cell that a box `(4,)` covers most; None where places are no cells."""

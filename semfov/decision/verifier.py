@@ -124,18 +124,19 @@ class Verifier(Generic[LookType]):
     def _moved_candidate(self, motion: Motion) -> CandidatePlace | None:
         """Move the candidate with the camera; None if it is behind the camera now, or there is none."""
         candidate = self.candidate
-        if candidate is None or not bool(motion.shows(candidate.box)):
+        if candidate is None:
             return None
         # The closer look that is due is made in the next frame, wherever the camera has turned.
-        return candidate._replace(box=motion.boxes(candidate.box))
+        moved_box, is_ahead = motion.boxes_ahead(candidate.box)
+        return candidate._replace(box=moved_box) if bool(is_ahead) else None
 
     def _moved_verdicts(self, motion: Motion, size: tuple[int, int]) -> list[_Verdict]:
         """Move the places of the verdicts with the camera, without those that are behind it now."""
         if not self.verdicts:
             return []
         boxes = torch.stack([verdict.look.box for verdict in self.verdicts])
-        ahead = motion.shows(boxes).tolist()
-        moved_boxes = motion.boxes(boxes)
+        moved_boxes, boxes_ahead = motion.boxes_ahead(boxes)
+        ahead = boxes_ahead.tolist()
         in_view = inside_frame(moved_boxes, size).tolist()
         moved_verdicts = []
         for number, verdict in enumerate(self.verdicts):

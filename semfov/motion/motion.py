@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -18,6 +18,8 @@ _BEYOND = -1e6  # pixels where there is no frame
 
 _STILL = np.eye(3)
 _ROUNDING = 1e-9 + 1e-5 * _STILL  # by so much the matrix of a camera that stands still may differ from it
+
+_OF_NUMPY = (torch.float32, torch.float64)  # which NumPy converts in a third of the time
 
 # A point on the horizon has the weight 0: its place is infinite, which is no reason to warn.
 _with_horizon = np.errstate(divide="ignore", invalid="ignore")
@@ -192,12 +194,25 @@ class Motion:
         Returns:
             `(..., 4)` in pixels of the second frame.
         """
-        moved, _ = _moved_boxes(self.matrix, self._determinant, _values(boxes))
-        return torch.from_numpy(moved).to(boxes)
+        return self.boxes_ahead(boxes)[0]
+
+    def boxes_ahead(self, boxes: Tensor) -> tuple[Tensor, Tensor]:
+        """Map boxes (`boxes`), and tell which of them are before the camera (`shows`), in one go.
+
+        Args:
+            boxes: `(..., 4)`, `(x1, y1, x2, y2)` in pixels of the first frame.
+
+        Returns:
+            `(..., 4)` in pixels of the second frame, and `(...)` boolean.
+        """
+        moved = _moved_boxes(self.matrix, self._determinant, _values(boxes))
+        return torch.from_numpy(moved.boxes).to(boxes), torch.from_numpy(moved.are_ahead)
 
 
 def _values(tensor: Tensor) -> NDArray[np.float64]:
     """View numbers as an array: maps are so few numbers that PyTorch spends four times as long in calls."""
+    if tensor.dtype in _OF_NUMPY:
+        return np.asarray(tensor.numpy(force=True), np.float64)
     return np.asarray(tensor.detach().cpu().double().numpy())
 
 
@@ -240,22 +255,32 @@ def moved_boxes(matrices: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     (tensor([10.,  0., 18.,  4.]), tensor(2.))
     """
     maps = _values(matrices)
-    moved, scales = _moved_boxes(maps, np.linalg.det(maps), _values(boxes))
-    return torch.from_numpy(moved).to(boxes), torch.from_numpy(scales).to(boxes)
+    moved = _moved_boxes(maps, np.linalg.det(maps), _values(boxes))
+    return torch.from_numpy(moved.boxes).to(boxes), torch.from_numpy(moved.scales).to(boxes)
+
+
+class _MovedBoxes(NamedTuple):
+    """Boxes `(..., 4)` in another frame, the scales `(...)` there, and which are before the camera, `(...)`."""
+
+    boxes: NDArray[np.float64]
+    scales: NDArray[np.float64]
+    are_ahead: NDArray[np.bool_]
 
 
 @_with_horizon
 def _moved_boxes(
     maps: NDArray[np.float64], determinants: NDArray[np.float64], boxes: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Map boxes `(..., 4)` by matrices with these determinants; moved boxes and scales, as of `moved_boxes`."""
+) -> _MovedBoxes:
+    """Map boxes `(..., 4)` by matrices with these determinants, as `moved_boxes` does."""
     low = boxes[..., :2]
     high = boxes[..., 2:]
     centres = (low + high) / 2
     mapped = (maps[..., :2] @ centres[..., None])[..., 0] + maps[..., 2]
     weights = mapped[..., 2]
     scales = _local_scales(determinants, weights)
-    is_ahead = _are_ahead(maps, determinants, weights)[..., None]
+    are_ahead = _are_ahead(maps, determinants, weights)
+    is_ahead = are_ahead[..., None]
     moved_centres = np.where(is_ahead, mapped[..., :2] / weights[..., None], _BEYOND)
     half_sizes = np.where(is_ahead, (high - low) / 2 * scales[..., None], 0.0)
-    return np.concatenate([moved_centres - half_sizes, moved_centres + half_sizes], -1), scales
+    corners = np.concatenate([moved_centres - half_sizes, moved_centres + half_sizes], -1)
+    return _MovedBoxes(corners, scales, are_ahead)

@@ -198,8 +198,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         parts = [scored.boxes for _, scored in self._looks]
         counts = [len(boxes) for boxes in parts]
         together = torch.cat(parts)
-        moved = motion.boxes(together)
-        is_ahead = motion.shows(together)
+        moved, is_ahead = motion.boxes_ahead(together)
         are_all_ahead = bool(is_ahead.all())  # mostly; selecting from each look takes longer than moving them
         columns = [column.split(counts) for column in (moved, inside_frame(moved, size), is_ahead)]
         moved_looks = []
@@ -230,7 +229,10 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
             return torch.zeros(0, 4), torch.zeros(0)
         keep = self.forgetting.keep
         boxes = torch.cat([scored.boxes for _, scored in self._looks])
-        faded_scores = torch.cat([scored.scores * keep ** (self._now - time) for time, scored in self._looks])
+        counts = torch.tensor([len(scored.boxes) for _, scored in self._looks])
+        scores = torch.cat([scored.scores for _, scored in self._looks])
+        shares_left = scores.new_tensor([keep ** (self._now - time) for time, _ in self._looks])
+        faded_scores = scores * shares_left.repeat_interleave(counts)
         in_view = torch.cat([scored.in_view for _, scored in self._looks])
         return boxes[in_view], faded_scores[in_view]
 

@@ -55,6 +55,18 @@ def test_boxes_move_with_their_centres_and_keep_their_precision():
     assert motion.boxes(boxes).dtype == torch.float32
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_boxes_are_moved_and_told_to_be_ahead_as_their_centres_are(dtype):
+    quarter = Motion(np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.1]]))  # to the right
+    boxes = torch.tensor([[2.0, 0.0, 4.0, 2.0], [-4.0, 0.0, -2.0, 2.0]], dtype=dtype)
+    moved, are_ahead = quarter.boxes_ahead(boxes)
+    assert are_ahead.tolist() == quarter.is_ahead((boxes[:, :2] + boxes[:, 2:]) / 2).tolist() == [True, False]
+    centre = quarter.points(torch.tensor([[3.0, 1.0]], dtype=dtype))[0]
+    torch.testing.assert_close((moved[0, :2] + moved[0, 2:]) / 2, centre)
+    assert moved.dtype == dtype
+    assert torch.equal(moved, quarter.boxes(boxes))
+
+
 def test_matrices_of_opencv_are_taken_and_others_refused():
     similarity = cv2.getRotationMatrix2D((10.0, 20.0), 30, 1.5)
     place = torch.tensor([[10.0, 20.0]])
