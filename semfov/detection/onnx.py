@@ -200,7 +200,8 @@ class OnnxDetector(Detector):
             check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", remedy)
             candidates = self._rounded_scores(candidates)
         self._first_checked |= first
-        return keep_classes(candidates, self._places, self._scores)
+        candidates = keep_classes(candidates, self._places, self._scores)
+        return candidates.as_checked() if values_known(candidates.boxes) else candidates
 
     def _rounded_scores(self, candidates: Candidates) -> Candidates:
         """Clamp scores that rounding has put a little outside [0, 1], with one warning."""

@@ -1,7 +1,7 @@
 """Score vectors with a background component, from a detector's raw class scores."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -24,6 +24,7 @@ class Candidates:
         classes: `(B, N, K)`, the head's score of each class, in [0, 1].
         objectness: `(B, N)` in [0, 1]; None for heads without objectness.
         background: `(B, N)` in [0, 1], the head's own background probability; None for heads without one.
+        are_checked: whether the boxes are known to be finite, and the scores to lie in [0, 1] (`as_checked`).
 
     >>> classes = torch.tensor([[[0.5, 0.25], [0.5, 1.0]]])
     >>> Candidates(torch.zeros(1, 2, 4), classes, torch.tensor([[0.5, 1.0]])).confidence
@@ -34,12 +35,24 @@ class Candidates:
     classes: Tensor
     objectness: Tensor | None = None
     background: Tensor | None = None
+    are_checked: bool = field(default=False, init=False)
 
     @cached_property
     def confidence(self) -> Tensor:
         """Objectness times the best class score, `(B, N)`, by which detectors rank their boxes."""
         best = self.classes.amax(-1)
         return best if self.objectness is None else best * self.objectness
+
+    def as_checked(self) -> "Candidates":
+        """Say that the boxes are finite, and that the scores lie in [0, 1], so that nobody looks again.
+
+        Parts and copies on another device keep it; other numbers in place of some (`dataclasses.replace`) do not.
+
+        Returns:
+            The same boxes.
+        """
+        object.__setattr__(self, "are_checked", True)
+        return self
 
     def precise(self) -> "Candidates":
         """Convert half precision, which is too coarse for pixels, to float32; other precisions stay as they are."""
@@ -73,7 +86,8 @@ class Candidates:
         """Apply a function to each tensor."""
         objectness = None if self.objectness is None else function(self.objectness)
         background = None if self.background is None else function(self.background)
-        return Candidates(function(self.boxes), function(self.classes), objectness, background)
+        mapped = Candidates(function(self.boxes), function(self.classes), objectness, background)
+        return mapped.as_checked() if self.are_checked else mapped
 
 
 def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual") -> Tensor:

@@ -104,22 +104,24 @@ def _select_of_image(
     confidence = candidates.confidence[image]
     index = (confidence >= selection.threshold).nonzero()[:, 0]
     boxes = candidates.boxes[image].index_select(0, index)
-    check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
+    if not candidates.are_checked:
+        check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
     if placement is not None:
         boxes = placement.boxes_to_image(boxes)
     labels = index  # any numbers do where they are not read
     if selection.per_class:
         labels = candidates.classes[image, index].argmax(-1)
-    survivors = suppress(boxes, confidence.index_select(0, index), labels, selection)
+    remaining = suppress(boxes, confidence.index_select(0, index), labels, selection)
 
     # The scores of a few boxes are read after suppression, not those of all cells before.
-    rows = candidates.take(image, index[survivors])
-    check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
+    rows = candidates.take(image, index[remaining])
+    if not candidates.are_checked:
+        check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
     scores = score_vectors(rows, policy)
     # Suppression ranks by confidence; the shares of a vector can rank otherwise.
     best_score = scores[:, 1:].detach().amax(-1)
     order = best_score.argsort(descending=True, stable=True)
-    boxes = boxes.index_select(0, survivors[order])
+    boxes = boxes.index_select(0, remaining[order])
     scores = scores.index_select(0, order)
     confidence = rows.confidence.index_select(0, order)
     mask = torch.ones_like(order, dtype=torch.bool)
@@ -143,6 +145,10 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
     if boxes.dtype in HALVES:  # too coarse for pixels, and not there on a CPU
         boxes = boxes.float()
         confidence = confidence.float()
+    if boxes.device.type == "cpu" and values_known(boxes, confidence, labels):
+        return torch.from_numpy(remaining_rows(boxes.numpy(), confidence.numpy(), labels.numpy(), selection))
+    from torchvision.ops import batched_nms, nms  # with it comes a compiler, which takes seconds to import
+
     # A box without area overlaps none, so nothing would suppress it.
     has_area = (boxes[:, 2:] > boxes[:, :2]).all(-1)
     with_area = has_area.nonzero()[:, 0]
@@ -150,40 +156,58 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
     order = with_area[order]
     boxes = boxes.index_select(0, order)
     labels = labels[order]
-    if boxes.device.type == "cpu" and values_known(boxes):
-        return order[_survivors(boxes, labels, selection)]
-    from torchvision.ops import batched_nms, nms  # with it comes a compiler, which takes seconds to import
-
     if selection.per_class:
-        survivors = batched_nms(boxes, ranked, labels, selection.iou)
+        remaining = batched_nms(boxes, ranked, labels, selection.iou)
     else:
-        survivors = nms(boxes, ranked, selection.iou)
-    return order[survivors[: selection.limit]]
+        remaining = nms(boxes, ranked, selection.iou)
+    return order[remaining[: selection.limit]]
 
 
-def _survivors(boxes: Tensor, labels: Tensor, selection: Selection) -> Tensor:
+def remaining_rows(
+    boxes: NDArray[np.floating], confidence: NDArray[np.floating], labels: NDArray[np.integer], selection: Selection
+) -> NDArray[np.int64]:
+    """Find the boxes that survive suppression, as `suppress` does with tensors.
+
+    Args:
+        boxes: `(N, 4)`, `(x1, y1, x2, y2)`.
+        confidence: `(N,)`.
+        labels: `(N,)`, best classes; read where the selection is for each class.
+        selection: overlap from which on boxes suppress each other, and largest number of boxes.
+
+    Returns:
+        Their indices, most confident first.
+    """
+    # A box without area overlaps none, so nothing would suppress it.
+    with_area = ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])).nonzero()[0]
+    order = with_area[(-confidence[with_area]).argsort(kind="stable")]
+    return order[_remaining_ranks(boxes[order], labels[order], selection)]
+
+
+def _remaining_ranks(
+    corners: NDArray[np.floating], classes: NDArray[np.integer], selection: Selection
+) -> NDArray[np.int64]:
     """Find the boxes `(N, 4)`, most confident first, that survive suppression, block by block of them.
 
     A block is compared with the survivors of the blocks before it, and with itself.
     """
-    corners = boxes.numpy()
-    classes = labels.numpy()
-    survivors = np.zeros(0, np.int64)
+    ranks = np.zeros(0, np.int64)
     for start in range(0, len(corners), _BLOCK):
         block = np.arange(start, min(start + _BLOCK, len(corners)))
-        rivals = np.concatenate([survivors, block])
+        rivals = np.concatenate([ranks, block])
         overlaps = _overlaps(corners[rivals], corners[block], selection.iou)  # (rivals, block)
         if selection.per_class:
             overlaps &= classes[rivals, None] == classes[block]
-        by_earlier = overlaps[: len(survivors)]
+        by_earlier = overlaps[: len(ranks)]
         suppressed: NDArray[np.bool_] = by_earlier.any(axis=0)  # type: ignore[assignment]
-        for number, by_this in enumerate(overlaps[len(survivors) :]):
+        # Of the block each box overlaps itself; few overlap others after it.
+        by_block = np.triu(overlaps[len(ranks) :], 1)
+        for number in np.flatnonzero(by_block.any(axis=1)).tolist():
             if not suppressed[number]:
-                suppressed[number + 1 :] |= by_this[number + 1 :]
-        survivors = np.concatenate([survivors, block[~suppressed]])
-        if len(survivors) >= selection.limit:
+                suppressed |= by_block[number]
+        ranks = np.concatenate([ranks, block[~suppressed]])
+        if len(ranks) >= selection.limit:
             break
-    return torch.from_numpy(survivors[: selection.limit])
+    return ranks[: selection.limit]
 
 
 def _overlaps(boxes: NDArray[np.floating], others: NDArray[np.floating], iou: float) -> NDArray[np.bool_]:

@@ -21,13 +21,13 @@ def cheapest_pairs(costs: NDArray[np.float64]) -> NDArray[np.intp]:
     >>> cheapest_pairs(np.array([[-3.0, -2.0], [-2.5, np.inf], [1.0, 4.0]])).tolist()
     [[0, 1], [1, 0]]
     """
-    rows, columns = np.nonzero(costs < 0)
-    if not len(rows):
-        return np.zeros((0, 2), np.intp)
+    are_better = costs < 0
     # Only rows and columns that can have a partner count.
-    kept_rows = np.unique(rows)
-    kept_columns = np.unique(columns)
-    possible = np.minimum(costs[np.ix_(kept_rows, kept_columns)], 0.0)
+    kept_rows = np.flatnonzero(are_better.any(1))
+    kept_columns = np.flatnonzero(are_better.any(0))
+    if not len(kept_rows):
+        return np.zeros((0, 2), np.intp)
+    possible = np.minimum(costs[kept_rows[:, None], kept_columns], 0.0)
     cheapest = possible.argmin(1)
     if len(set(cheapest.tolist())) == len(cheapest):  # each row can have its best: no sum is lower
         return np.stack([kept_rows, kept_columns[cheapest]], -1)

@@ -134,3 +134,21 @@ class Kinematics:
             np.concatenate([self.velocity, others.velocity]),
             np.concatenate([self.covariance, others.covariance]),
         )
+
+    def with_rows(self, rows: NDArray[np.intp], others: "Kinematics") -> "Kinematics":
+        """Put other objects in the places of some.
+
+        Args:
+            rows: `(M,)`, the places.
+            others: M objects in the same frame.
+
+        Returns:
+            The objects with the others among them.
+        """
+        place = self.place.copy()
+        velocity = self.velocity.copy()
+        covariance = self.covariance.copy()
+        place[rows] = others.place
+        velocity[rows] = others.velocity
+        covariance[rows] = others.covariance
+        return Kinematics(place, velocity, covariance)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from semfov.detection.selection import Selection, suppress
+from semfov.detection.selection import Selection, remaining_rows
 from semfov.motion import CameraStep, Motion
 from semfov.tracking.assignment import cheapest_pairs
 from semfov.tracking.kalman import Floats, Kinematics
@@ -218,10 +218,7 @@ class Tracker:
             magnification=np.full(len(rows), seen.magnification),
             passes=np.full(len(rows), seen.number),
         )
-        is_other = np.ones(len(self.tracks), bool)
-        is_other[rows] = False
-        joined = self.tracks[is_other].joined(updated)
-        self.tracks = joined[joined.track_ids.argsort()]
+        self.tracks = self.tracks.with_rows(rows, updated)
 
     def _begin(self, seen: Seen, noise: Floats, is_new: NDArray[np.bool_]) -> None:
         """Begin an object with each of the detections `(M,)` that show none that is known."""
@@ -251,10 +248,10 @@ class Tracker:
     def _merge_doubles(self) -> None:
         """Drop objects that lie on a more probable one of their class."""
         tracks = self.tracks
-        odds = torch.from_numpy(tracks.log_odds).float()
-        kept = suppress(tracks.boxes, odds, torch.from_numpy(tracks.labels), _ONE_OF_CLASS)
-        if len(kept) < len(tracks):
-            self.tracks = tracks[np.sort(kept.numpy())]
+        boxes = tracks.corners.astype(np.float32)
+        rows = remaining_rows(boxes, tracks.log_odds.astype(np.float32), tracks.labels, _ONE_OF_CLASS)
+        if len(rows) < len(tracks):
+            self.tracks = tracks[np.sort(rows)]
 
 
 _SIZE_SPREAD = 0.5  # standard deviation of the logarithm of the sizes of other objects

@@ -181,6 +181,27 @@ class Tracks:
             columns[name] = np.concatenate([mine, theirs]) if is_array else mine.joined(theirs)
         return Tracks(**columns)
 
+    def with_rows(self, rows: NDArray[np.intp], others: "Tracks") -> "Tracks":
+        """Put other objects in the places of some.
+
+        Args:
+            rows: `(M,)`, the places.
+            others: M objects in the same frame.
+
+        Returns:
+            The objects with the others among them.
+        """
+        columns: dict[str, Any] = {}
+        for name in _COLUMNS:
+            column = getattr(self, name)
+            theirs = getattr(others, name)
+            if isinstance(column, np.ndarray):
+                columns[name] = column.copy()
+                columns[name][rows] = theirs
+            else:
+                columns[name] = column.with_rows(rows, theirs)
+        return Tracks(**columns)
+
     def carried(self, motion: Motion) -> "Tracks":
         """Carry the objects along with the camera.
 

@@ -330,8 +330,9 @@ def _hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, fain
     index = (confidence >= faint).nonzero()[:, 0]
     selected = candidates.take(image, index)
     boxes = selected.boxes.detach()
-    check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
-    check_numbers(image, 0, 1, class_scores=selected.classes, objectness=selected.objectness)
+    if not candidates.are_checked:
+        check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
+        check_numbers(image, 0, 1, class_scores=selected.classes, objectness=selected.objectness)
     return Hints(boxes, shares(selected, policy)[1].detach())
 
 

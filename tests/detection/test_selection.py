@@ -1,5 +1,7 @@
 """Suppression and merging of boxes, in a pass, in several crops and in records, against plain loops and torchvision."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -134,6 +136,17 @@ def test_invalid_scores_and_boxes_are_refused_and_are_no_image_without_detection
     image = torch.rand(1, 3, 32, 32)
     assert Fixed(candidates=made_of())(image).count.tolist() == [2]
     refused(message, Fixed(candidates=made_of(**changes)), image)
+
+
+def test_what_is_checked_stays_so_in_parts_and_copies_and_not_with_other_numbers():
+    candidates = made_of().as_checked()
+    image = torch.rand(1, 3, 32, 32)
+    assert candidates.take(0, torch.tensor([1])).are_checked
+    assert candidates.precise().to(torch.device("cpu")).are_checked
+    assert not made_of().are_checked
+    changed = replace(candidates, classes=candidates.classes + 1)
+    assert not changed.are_checked
+    refused(r"class scores.*\[0, 1\]", Fixed(candidates=changed), image)
 
 
 @pytest.mark.slow

@@ -59,3 +59,14 @@ def test_a_velocity_is_carried_as_two_places_are(motion):
     np.testing.assert_allclose(carried.velocity[0], (ends[1] - ends[0]) / step, rtol=1e-5)
     scale = float(motion.scale_at(torch.from_numpy(place))[0])
     np.testing.assert_allclose(carried.covariance, scale**2 * np.eye(2)[None])
+
+
+def test_objects_take_the_places_of_others():
+    generator = np.random.default_rng(0)
+    objects = Kinematics(generator.normal(size=(4, 2)), generator.normal(size=(4, 2)), generator.normal(size=(4, 2, 2)))
+    others = objects[np.array([3, 0])]
+    mixed = objects.with_rows(np.array([1, 2]), others)
+    expected = objects[np.array([0, 3, 0, 3])]
+    for name in ("place", "velocity", "covariance"):
+        np.testing.assert_array_equal(getattr(mixed, name), getattr(expected, name))
+    assert not np.array_equal(objects.place, mixed.place)  # which is a copy
