@@ -200,7 +200,7 @@ class DirichletBelief(Belief):
 
     def probability(self, target: int | Tensor) -> Tensor:
         """Give the posterior of the target class in each cell, `(B, X·Y)`."""
-        return pick(self.beta, torch.as_tensor(target)) / self.beta.sum(-1)
+        return pick(self.beta, target) / self.beta.sum(-1)
 
 
 def dirichlet_belief(belief: Belief) -> DirichletBelief:
@@ -213,12 +213,12 @@ def dirichlet_belief(belief: Belief) -> DirichletBelief:
     return belief
 
 
-def pick(values: Tensor, target: Tensor) -> Tensor:
+def pick(values: Tensor, target: int | Tensor) -> Tensor:
     """Take the values of one class.
 
     Args:
         values: `(B, ..., K+1)`.
-        target: the class, `()`, or one for each episode, `(B,)`.
+        target: the class, a number or `()`, or one for each episode, `(B,)`.
 
     Returns:
         `(B, ...)`.
@@ -227,9 +227,13 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
         InputError: there is no such class.
     """
     components = values.shape[-1]
+    expected = f"a class index from 0 to {components - 1}"
+    if not isinstance(target, Tensor):
+        check(0 <= target < components, "target", expected, target)
+        return values[..., target]
     if values_known(target):
         inside = bool(((target >= 0) & (target < components)).all())
-        check(inside, "target", f"a class index from 0 to {components - 1}", target.tolist())
+        check(inside, "target", expected, target.tolist())
     if target.ndim == 0:
         return values[..., target]
     # `(B, 1, …, 1)`: the class of an episode, at all its places.

@@ -1,7 +1,9 @@
 """How often the target is there: probabilities for another share of searches than that of the fit."""
 
 import math
+import sys
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, Self, TypeAlias, TypeVar
 
 import torch
@@ -107,7 +109,7 @@ class Prior:
             # A certainty stays; its log odds are infinite, and their gradient is no number.
             log_odds = presence.masked_fill(is_certain, 0.5).logit()
             return torch.where(is_certain, presence, with_prior(log_odds, self.share, self.fitted).sigmoid())
-        return float(self(torch.tensor(presence, dtype=torch.float64)))
+        return _changed(self, presence)
 
     def place(self, place: _Odds, presence: _Odds) -> _Odds:
         r"""Change the probability of a place, whose share of that of the picture stays.
@@ -122,8 +124,14 @@ class Prior:
             # No place is more probable than the picture, which two fits may contradict.
             picture = torch.maximum(torch.as_tensor(place), torch.as_tensor(presence))
             return place * (self(picture) / picture.clamp(min=torch.finfo(picture.dtype).tiny))
-        exact = torch.tensor([place, presence], dtype=torch.float64)
-        return float(self.place(exact[0], exact[1]))
+        picture = float(max(place, presence))
+        return float(place * (self(picture) / max(picture, sys.float_info.min)))
+
+
+@lru_cache(256)
+def _changed(prior: Prior, presence: float) -> float:
+    """Change a probability of presence. It is kept, because a search asks for the same one several times a look."""
+    return float(prior(torch.tensor(presence, dtype=torch.float64)))
 
 
 def check_share(prior: Any) -> None:

@@ -35,6 +35,8 @@ _DTYPES = {
 """Dtypes of tensors by the kind and bytes of the numbers of arrays."""
 
 STREAMS = ("rtsp", "rtsps", "rtmp", "srt", "udp", "tcp")  # kinds of addresses of cameras and streams
+_PRECISE = (torch.float32, torch.float64)  # precise enough for positions
+
 FRAME = 1 / 25  # seconds between two frames where nothing tells them
 
 _SMALLEST_SIDE = 16  # of pictures whose channels are last; smaller ones may be maps of features
@@ -295,6 +297,8 @@ def as_positions(values: Tensor, like: Tensor | torch.dtype | None = None) -> Te
     """
     dtype = values.dtype
     device = values.device
+    if like is None and dtype in _PRECISE:
+        return values
     if isinstance(like, Tensor):
         dtype = like.dtype
         device = like.device

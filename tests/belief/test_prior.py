@@ -45,6 +45,8 @@ def test_a_place_keeps_its_share_of_the_picture(place, presence, fitted, share):
     whole = max(place, presence)
     assert prior.place(place, presence) == pytest.approx(place / whole * prior(whole))
     assert prior.place(place, presence) <= prior(whole) + 1e-12
+    exact = torch.tensor([place, presence], dtype=torch.float64)
+    assert prior.place(place, presence) == float(prior.place(exact[0], exact[1]))
     assert prior.inverse(prior(presence)) == pytest.approx(presence, rel=1e-6)
     assert prior.inverse.place(prior.place(place, whole), prior(whole)) == pytest.approx(place, rel=1e-6)
 

@@ -77,7 +77,7 @@ class SearchBelief(DirichletBelief):
         return self.prior.place(fitted, self._fitted_presence(target)[:, None])
 
     def chance(self, target: int | Tensor) -> Tensor:
-        fitted = pick(self.following, torch.as_tensor(target)) / self.following.sum(-1)
+        fitted = pick(self.following, target) / self.following.sum(-1)
         return self.prior(self._true(fitted))
 
     def _true(self, probability: Tensor) -> Tensor:
@@ -112,7 +112,7 @@ class SearchBelief(DirichletBelief):
         Returns:
             `(B, 2)`.
         """
-        mean = pick(self.log_score, torch.as_tensor(target)) / self.looks.clamp(min=torch.finfo(self.looks.dtype).tiny)
+        mean = pick(self.log_score, target) / self.looks.clamp(min=torch.finfo(self.looks.dtype).tiny)
         return presence_facts(super().probability(target), mean)
 
 
@@ -205,8 +205,10 @@ class SemanticSearch(Observer):
         """Compute the likelihoods of the detections, relative to background, the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.model)
         ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
-        weight = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
         covered = grid.footprint(detections.boxes) * detections.mask[..., None]
+        weight = covered
+        if self.footprint != "overlap":
+            weight = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
         highest = highest_score(detections, torch.arange(self.components)).to(ratio)
         return SearchLook(
             ratio,
@@ -241,10 +243,11 @@ class SemanticSearch(Observer):
         share = self.model.refutation.clamp(0, 1).to(old.beta)
         remaining = refuted(weight, seen.covered.to(old.beta), visited, share)
         is_closer = (seen.distance < old.closest)[..., None]
+        odds = self.model.miss_odds(seen.distance).to(weight)
         return replace(
             old,
-            beta=torch.where(is_closer, self._fuse(seen, weight), old.beta),
-            following=torch.where(is_closer, self._fuse(seen, remaining), old.following),
+            beta=torch.where(is_closer, _fusion(seen, weight, odds), old.beta),
+            following=torch.where(is_closer, _fusion(seen, remaining, odds), old.following),
             visited=visited,
             log_score=old.log_score + seen.log_score.to(old.beta),
             looks=old.looks + 1,
@@ -252,20 +255,6 @@ class SemanticSearch(Observer):
             # That of a belief that was detached is a copy, through which the model would not learn.
             calibration=self.model.presence,
         )
-
-    def _fuse(self, look: SearchLook, weight: Tensor) -> Tensor:
-        """Fuse the prior with a look, in which all detections and a miss are alternatives.
-
-        Args:
-            look: the look of each episode.
-            weight: how well each detection fits each cell, `(B, L, X·Y)`.
-
-        Returns:
-            Dirichlet parameters, `(B, X·Y, K+1)`.
-        """
-        odds = self.model.miss_odds(look.distance).to(weight)
-        likelihood = one_of(look.ratio.to(weight), weight, odds)
-        return RULES["kaplan"](torch.full_like(odds, _WEAK), likelihood / likelihood.amax(-1, keepdim=True))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> SearchBelief:
         r"""Move the Dirichlet parameters towards the prior, and the closest looks away.
@@ -284,3 +273,18 @@ class SemanticSearch(Observer):
             looks=keep * old.looks,
             closest=old.closest + farther(keep),
         )
+
+
+def _fusion(look: SearchLook, weight: Tensor, odds: Tensor) -> Tensor:
+    """Fuse the prior with a look, in which all detections and a miss are alternatives.
+
+    Args:
+        look: the look of each episode.
+        weight: how well each detection fits each cell, `(B, L, X·Y)`.
+        odds: of a miss, `(B, X·Y, K+1)`.
+
+    Returns:
+        Dirichlet parameters, `(B, X·Y, K+1)`.
+    """
+    likelihood = one_of(look.ratio.to(weight), weight, odds)
+    return RULES["kaplan"](torch.full_like(odds, _WEAK), likelihood / likelihood.amax(-1, keepdim=True))
