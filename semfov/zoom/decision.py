@@ -338,13 +338,15 @@ class DecisionsByCloserLooks(DecisionsByPresence):
         self.verifier.wait(passed)
 
     def follow(self, motion: Motion | None) -> None:
-        super().follow(motion)
         self.verifier.follow(motion, self.frame)
-        if self._facts.looks:
-            self.verifier.places.presence = self.prior(self._fitted_presence())
         candidate = self.candidate
         if candidate is not None and not bool(inside_frame(candidate.box, self.frame)):
             self.verifier.candidate = None  # a closer look would show another place
+        if self.candidate is None:
+            return  # the look that follows has facts of its own
+        super().follow(motion)
+        if self._facts.looks:
+            self.verifier.places.presence = self.prior(self._fitted_presence())
 
 
 def decisions_of(
