@@ -158,7 +158,9 @@ class WindowEye(nn.Module):
         boxes = place.to_picture(selected.boxes)
         if len(boxes) > 1:  # else there is no padding
             boxes = boxes * selected.mask[..., None]
-        detections = replace(selected, boxes=boxes).to(device)
+        detections = replace(selected, boxes=boxes)
+        if boxes.device != device:
+            detections = detections.to(device)
         detections, cut = self._treat(detections, place.cut(selected).to(device))
         hints_of_looks = self._hints(candidates, place, len(frames), device) if hints else None
         return WindowDetections(detections, cut, hints_of_looks)
