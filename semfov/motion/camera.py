@@ -224,6 +224,23 @@ class CameraMotion:
         if fit is None:
             self._begin_at(present)
             return Motion.still() if self._is_same(last, present) else None
+        return self._by_fit(key, last, present, fit, has_stood=has_stood)
+
+    def _by_fit(
+        self, key: GreyFrame, last: GreyFrame, present: GreyFrame, fit: _Fit, *, has_stood: bool
+    ) -> Motion | None:
+        """Judge a fitted motion, and keep it, or doubt it and begin anew at the present frame.
+
+        Args:
+            key: the frame from which the motion was fitted.
+            last: the last frame.
+            present: the present one.
+            fit: the motion from the key frame to the present one.
+            has_stood: whether the camera stood still in the last frame.
+
+        Returns:
+            The motion since the last frame; None for one that is doubted.
+        """
         to_last = np.linalg.inv(self._key_to_last)
         rival = None if fit.rival is None else fit.rival @ to_last
         since_last = _Fit(fit.similarity @ to_last, rival, fit.median)
