@@ -108,9 +108,9 @@ def _with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
     return table([[row[place] for place in places] for row in (heads, *rows)])
 
 
-def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right", *, ending: str = "") -> list[str]:
+def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right") -> list[str]:
     """Table of the differences of policies from a baseline, paired over images, in percentage points."""
-    names = [policy for policy in policies_of(folder) if policy.endswith(ending)]
+    names = policies_of(folder)
     if baseline not in names:
         raise DataError(f"{folder}: expected records of the policy {baseline!r}, found none; run the experiment again")
     rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind at"]]
@@ -123,8 +123,8 @@ def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "rig
 
 
 def paired_maps(folder: Path, field: str = "right") -> list[str]:
-    """`paired` for explorations by the semantic map."""
-    return paired(folder, "random-learned", (1, 2, 3, 4, 10, 20), field, ending="-learned")
+    """`paired` for explorations by the semantic map, and for what an unfoveated pass shows."""
+    return paired(folder, "random-learned", (1, 2, 3, 4, 10, 20), field)
 
 
 def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> list[str]:
