@@ -37,7 +37,6 @@ from eval.page.tables import (
     by_samples,
     markdown_table,
     paired,
-    paired_maps,
     photographs,
     published,
     readings,
@@ -166,8 +165,6 @@ _TABLES: dict[str, Callable[[Path], list[str]]] = {
     "samples-search": partial(by_samples, shifts=(1, 5, 15, 30)),
     "samples-explore": partial(by_samples, shifts=(1, 2, 5, 10, 20)),
     "samples-objects": partial(by_samples, shifts=(1, 2, 5, 10, 20), field=OBJECTS),
-    "paired-map": paired_maps,
-    "paired-map-objects": partial(paired_maps, field=OBJECTS),
 }
 """Tables of one experiment."""
 

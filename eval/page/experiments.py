@@ -96,9 +96,6 @@ _BEYOND_EXPLORATION = (
 )
 """Exploration policies with fused scores, with semfov's own models."""
 
-_MAPS = ("random-learned", "expected-gain-learned", "closer-look-learned")
-"""Exploration policies with the semantic map."""
-
 _SCORES: tuple[Scores, ...] = ("raw", "calibrated")
 
 _EXPECTED = tuple(PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, 64))
@@ -189,8 +186,8 @@ class ResultsConfig(Settings):
         fit_annotations: their annotation file, in the COCO instances format.
         yolox: ONNX file of YOLOX-nano (None: the published file).
         limit: use only this many photographs, the first ones, for a trial.
-        few: number of photographs, the first ones, for the experiments at every score threshold, for those with an
-            expectation over drawn looks, of which there are many or which take long, for maps, and for controls.
+        few: number of photographs, the first ones, for the experiments at every score threshold and for those with an
+            expectation over drawn looks, of which there are many or which take long.
         study: number of photographs for the studies of settings, which compute new looks for every setting of sensor
             and detector.
         only: names of the experiments to run (None: all); for the others the pages show the results of earlier runs,
@@ -264,13 +261,9 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
             once = ProtocolConfig(1, shifts=20)
             yield "expected-explore", ExploreConfig(**options, protocol=once, policies=_EXPECTED_EXPLORATION)
         yield f"beyond-search-{name}", seek(policies=_BEYOND)
-        for control in ("wrong-class", "permuted"):
-            protocol = ProtocolConfig(control=control)
-            yield f"{control}-{name}", SearchConfig(**few, policies=("random", AGENT), protocol=protocol)
         yield f"decide-{name}", DecideConfig(**common)
         every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
         yield f"beliefs-{name}", CalibrationConfig(**every)
-        yield f"maps-{name}", ExploreConfig(**few, policies=_MAPS)
         yield f"beyond-explore-{name}", tour(policies=_BEYOND_EXPLORATION)
         belief = BeliefConfig(model=f"{settings.name}-sharp")
         yield f"beyond-explore-published-{name}", tour(policies=_BEYOND_EXPLORATION, sensor=sensor, belief=belief)

@@ -122,11 +122,6 @@ def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "rig
     return table(rows)
 
 
-def paired_maps(folder: Path, field: str = "right") -> list[str]:
-    """`paired` for explorations by the semantic map, and for what an unfoveated pass shows."""
-    return paired(folder, "random-learned", (1, 2, 3, 4, 10, 20), field)
-
-
 def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> list[str]:
     """Differences of policies with an expectation over drawn looks from the same with the expected scores."""
     rows = [["difference to the expected scores", *(str(n) for n in shifts)]]

@@ -25,6 +25,9 @@ from semfov.zoom.certainty import SPREAD, number_of, number_of_faint
 from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge
 
+RASTER, SEMFOV = "slices, raster", "semfov"
+"""Names of slices in raster order, and of the agent."""
+
 AFTER = (1, 2, 4, 8, 12, 16, 24)
 """Numbers of passes after which objects are compared with the annotated ones."""
 
@@ -229,14 +232,22 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
     rows = [["", *heads]]
     for way, value, error in zip(groups, figures.value.tolist(), figures.error.tolist(), strict=True):
         rows.append([way, *(f"{each:.3f} ± {apart:.3f}" for each, apart in zip(value, error, strict=True))])
+    apart = figures.less(list(groups).index(SEMFOV))
+    less = [[f"difference to {SEMFOV}", *heads]]
+    for way, value, error in zip(groups, apart.value.tolist(), apart.error.tolist(), strict=True):
+        cells = [f"{each:+.3f} ± {spread:.3f}" for each, spread in zip(value, error, strict=True)]
+        less += [[way, *cells]] if way != SEMFOV else []
     objects = sum(record["objects"] for record in first)
     return [
         f"Objects of {len(first)} pictures with {objects} annotated ones: average precision (IoU 0.5) after n passes; "
         f"after {numbers[-1]} passes, of the objects that are listed, precision, recall, their number for "
         "each annotated object, and the mean absolute error of their number in a picture; that of the sum of all "
-        "scores; and the expected calibration error of the scores. ± is the standard error by bootstrap over pictures.",
+        "scores; and the expected calibration error of the scores. ± is the standard error by bootstrap over pictures; "
+        "differences are paired.",
         "",
         *table(rows),
+        "",
+        *table(less),
         "",
         *plain_table(groups, numbers),
         *in_all_table(records, numbers),

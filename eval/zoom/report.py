@@ -12,6 +12,7 @@ from eval.bootstrap import Bootstrap
 from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_summary
 from eval.zoom.decisions import decision_tables, presence_scores
+from eval.zoom.folds import outcomes_in_folds
 from eval.zoom.objects import object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.runs.results import ResultRecord
@@ -24,8 +25,11 @@ from semfov.viz.style import save_figure
 def zoom(config: ZoomConfig) -> None:
     """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = ZoomRun(config)
-    finish(run, "zooming")
-    records = [*gather(run)]
+    if config.folds:
+        records = outcomes_in_folds(run)
+    else:
+        finish(run, "zooming")
+        records = [*gather(run)]
     text = zoom_summary(records, run)
     written = write_summary(config.out, "zoom", text, records)
     if "recall" in config.measures:

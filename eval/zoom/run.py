@@ -15,7 +15,7 @@ from torch import Tensor
 from eval.comparison.records import own_settings
 from eval.comparison.telling import class_frequencies
 from eval.zoom.decisions import decide_all
-from eval.zoom.objects import AFTER, expected_of, merged, object_record, suppressed, sure_boxes
+from eval.zoom.objects import AFTER, RASTER, SEMFOV, expected_of, merged, object_record, suppressed, sure_boxes
 from eval.zoom.observed import ObservedRates, make_zoom_observation
 from eval.zoom.orders import adaptive_slices, in_order, oracle, quad_tree, shuffled, sparse
 from semfov.agents.episode import Goal
@@ -25,6 +25,7 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode.stopwatch import Stopwatch
+from semfov.errors import check
 from semfov.fit.protocols import choose_classes
 from semfov.fit.window_looking import (
     TileSize,
@@ -32,7 +33,7 @@ from semfov.fit.window_looking import (
     WindowLookingConfig,
     found_in,
 )
-from semfov.io.ranges import Count, Range
+from semfov.io.ranges import Count, Range, Whole
 from semfov.observation.matching import right_boxes
 from semfov.paths import ZoomPath
 from semfov.runs.results import ResultRecord
@@ -46,9 +47,6 @@ from semfov.zoom.objects import merge
 from semfov.zoom.slices import ranked, slices, usual_slices
 
 _Measure = Literal["objects", "recall", "hit", "decision"]
-
-RASTER, SEMFOV = "slices, raster", "semfov"
-"""Names of slices in raster order, and of the agent."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +67,8 @@ class ZoomConfig(WindowLookingConfig):
         closer: largest number of closer looks of a search; by default as many as there are passes for, as in the agent.
         observation: observation model by magnification to compare with, by name or file (None: the one shipped for
             the detector, if there is one).
+        folds: with 2 or more, photographs are judged in so many parts, each with evidence for photographs that was
+            fitted to the others, in one process.
         seed: random seed of mosaics and random orders.
         out: folder for tables, records and figures.
     """
@@ -82,7 +82,14 @@ class ZoomConfig(WindowLookingConfig):
     sought: Count = 4
     closer: Annotated[int, Range(0, 100)] = CLOSER
     observation: str | None = None
+    folds: Whole = 0
     out: Path = Path("runs/zoom")
+
+    def __post_init__(self) -> None:
+        """Check that only photographs as they are have folds."""
+        super().__post_init__()
+        fits = self.folds == 0 or (self.folds > 1 and not self.mosaics)
+        check(fits, "folds", "0, or 2 or more with mosaics 0", self.folds)
 
     @property
     def step(self) -> int:
