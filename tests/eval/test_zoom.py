@@ -1,12 +1,18 @@
 """What large pictures are compared with: sparse slices, and the expectations of an observation model."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
+from eval.zoom import folds
+from eval.zoom.objects import object_table
 from eval.zoom.observed import ObservedRates
 from eval.zoom.orders import sparse
+from eval.zoom.run import ZoomConfig
 from semfov import FovealObservationModel, InputError, WindowEye
+from semfov.observation.thresholds import Thresholds
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import LiveWindowLooks, Window
@@ -81,3 +87,70 @@ def test_expected_finds_of_closer_looks_follow_from_the_model():
 def test_a_model_without_counts_of_cells_is_refused():
     with pytest.raises(InputError, match=r"train\.fit_fom fitted with --mosaics"):
         ObservedRates(FovealObservationModel.identity(("red", "blue"), [0.5]), LATTICE)
+
+
+class _Photographs:
+    """Photographs by their ids."""
+
+    classes = ("cat",)
+    fingerprint = "photographs"
+
+    def __init__(self, count: int) -> None:
+        self.ids = [100 + number for number in range(count)]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def _run(photographs: int, parts: int, photograph: object = None) -> SimpleNamespace:
+    """Make a run whose records say to which photographs its evidence was fitted."""
+    run = SimpleNamespace(
+        config=SimpleNamespace(folds=parts, seed=3),
+        scenes=_Photographs(photographs),
+        eye=None,
+        evidence=SimpleNamespace(photograph=photograph, fitted_to=None),
+    )
+    run.outcomes = lambda index: ([{"scene": run.scenes.ids[index], "fitted to": run.evidence.fitted_to}], {})
+    return run
+
+
+def test_each_photograph_is_judged_with_evidence_of_all_other_folds(monkeypatch):
+    settings = []
+
+    def fit(model, others, eye, chosen):
+        model.fitted_to = [*others.ids]
+        settings.append(chosen)
+
+    monkeypatch.setattr(folds, "fit_photographs", fit)
+    verification = SimpleNamespace(thresholds=Thresholds(0.9, 0.1, 0.1))
+    records = folds.outcomes_in_folds(_run(7, 3, SimpleNamespace(window=(0.3, 3.0), verification=verification)))
+    assert sorted(record["scene"] for record in records) == [100, 101, 102, 103, 104, 105, 106]
+    for record in records:
+        part = {100 + number for number in range(7) if number % 3 == (record["scene"] - 100) % 3}
+        assert {*record["fitted to"]} == {100 + number for number in range(7)} - part
+    assert [each.photographs for each in settings] == [4, 5, 5]
+    assert {(each.window, each.stop_below, each.seed) for each in settings} == {((0.3, 3.0), 0.1, 3)}
+
+
+def test_folds_need_as_many_photographs_and_no_mosaics():
+    with pytest.raises(InputError, match="^folds: expected at most one for each of 2 photographs, got 3"):
+        folds.outcomes_in_folds(_run(2, 3))
+    for wrong in ({"folds": 1, "mosaics": 0}, {"folds": 2, "mosaics": 5}):
+        with pytest.raises(InputError, match="^folds: expected 0, or 2 or more with mosaics 0"):
+            ZoomConfig(**wrong)
+
+
+def test_objects_are_compared_with_those_of_semfov():
+    def record(way: str, scene: int, scores: list[float], right: list[int]) -> dict[str, object]:
+        after = {"scores": scores, "labels": [1] * len(scores), "right": right, "listed": len(scores), "kept": 0}
+        after |= {"listed right": sum(right), "in all": None, "error": None, "given": False}
+        common = {"measure": "objects", "way": way, "scene": scene, "objects": 1, "by class": {"1": 1}, "plain": 0}
+        return common | {"after": {"1": after}}
+
+    records = [record("plain", scene, [0.9, 0.8], [0, 1]) for scene in range(3)]
+    records += [record("semfov", scene, [0.9, 0.2], [1, 0]) for scene in range(3)]
+    _, row = [line for line in object_table(records) if line.startswith("| plain")][:2]
+    # Half of all boxes are right; of semfov, those that come first: its average precision and precision are 1 and 0.5.
+    cells = [cell.strip() for cell in row.split("|")[2:-1]]
+    assert cells[0] == "-0.500 ± 0.000"
+    assert cells[1:4] == ["+0.000 ± 0.000"] * 3

@@ -173,6 +173,7 @@ COMMANDS = {
             (("--tile", "0"), "tile: expected a whole number from 16"),
             (("--seed", "-1"), "seed: expected"),
             (("--mosaics", "-1"), "mosaics: expected"),
+            (("--folds", "2"), "folds: expected 0, or 2 or more with mosaics 0, got 2"),
         ),
     ),
     "eval.stream": Command(
