@@ -48,7 +48,7 @@ def _look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
 
 
 class SamplerSettings(EyeSettings, Protocol):
-    """Settings of looks from random fixations, as those of `train.fit_fom` and `train.fit_tempering`."""
+    """Settings of looks from random fixations, as those of `train.fit_fom`."""
 
     @property
     def fixations(self) -> int:

@@ -1,6 +1,6 @@
 """Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import FOOTPRINT, PartFit, PartInputs, PartResult
 from semfov.fit.samples import Samples
+from semfov.fit.settings import FitDetectorConfig
 from semfov.io.manifest import Part
 from semfov.runs.progress import track
 
@@ -21,22 +22,6 @@ EXPONENTS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
 
 _SETTINGS = ("columns", "rows", "fixations", "max_target_area", "holdout", "seed")
 """Settings of the fit that the exponent depends on."""
-
-
-class StoredSearches(Protocol):
-    """Settings of searches over stored looks."""
-
-    @property
-    def columns(self) -> int:
-        """Columns of the grid."""
-
-    @property
-    def rows(self) -> int:
-        """Rows of the grid."""
-
-    @property
-    def max_target_area(self) -> float:
-        """Share of the image from which on a class is too large to be searched for."""
 
 
 def mean_hits(holdout: int, rates: dict[int, float]) -> dict[str, float]:
@@ -64,14 +49,7 @@ def mean_hits(holdout: int, rates: dict[int, float]) -> dict[str, float]:
 
 
 def hit_rates(
-    config: StoredSearches,
-    scenes: Scenes,
-    samples: Samples,
-    observer: Semantic,
-    title: str,
-    *,
-    least: int,
-    most: int | None = None,
+    config: FitDetectorConfig, scenes: Scenes, samples: Samples, observer: Semantic, title: str
 ) -> dict[int, float]:
     """Compute the share of next fixations that hit the target in each photograph.
 
@@ -81,18 +59,15 @@ def hit_rates(
         samples: labelled detections of their looks.
         observer: makes the belief.
         title: title of the progress bar.
-        least: least number of objects in a photograph.
-        most: use only the first so many photographs (None: all).
 
     Returns:
         The shares by the number of the photograph; those without searches are left out.
     """
     rates = {}
-    count = len(scenes) if most is None else min(most, len(scenes))
-    for index in track(range(count), title, "scene"):
+    for index in track(range(len(scenes)), title, "scene"):
         annotation = scenes.annotation(index)
         targets = legal_targets(annotation, config.max_target_area)
-        if len(annotation.labels) < least or not targets:
+        if not targets:
             continue
         detections, fixations = samples.looks_at(index)
         grid = Grid(config.columns, config.rows, annotation.size)
@@ -183,8 +158,8 @@ class TemperingFit(PartFit):
         return [_Fusion(kind, exponent) for kind in scores for exponent in EXPONENTS]
 
     def _rates(self, observer: Semantic, title: str) -> dict[int, float]:
-        """Measure the hit rates of all photographs with an object."""
-        return hit_rates(self.config, self.run.scenes, self.inputs.samples, observer, title, least=1)
+        """Measure the hit rates of all photographs with a target."""
+        return hit_rates(self.config, self.run.scenes, self.inputs.samples, observer, title)
 
 
 def _title(fusion: _Fusion) -> str:

@@ -133,10 +133,10 @@ def test_each_photograph_is_judged_with_evidence_of_all_other_folds(monkeypatch)
 
 
 def test_folds_need_as_many_photographs_and_no_mosaics():
-    with pytest.raises(InputError, match="^folds: expected at most one for each of 2 photographs, got 3"):
+    with pytest.raises(InputError, match=r"^folds: expected at most one for each of 2 photographs, got 3"):
         folds.outcomes_in_folds(_run(2, 3))
     for wrong in ({"folds": 1, "mosaics": 0}, {"folds": 2, "mosaics": 5}):
-        with pytest.raises(InputError, match="^folds: expected 0, or 2 or more with mosaics 0"):
+        with pytest.raises(InputError, match=r"^folds: expected 0, or 2 or more with mosaics 0"):
             ZoomConfig(**wrong)
 
 

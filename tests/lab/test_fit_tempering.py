@@ -1,4 +1,4 @@
-"""The fit of the tempering of likelihoods: its hit rate against a loop, and its report."""
+"""The fit of the tempering of likelihoods: its hit rate against a loop."""
 
 import pytest
 import torch
@@ -6,8 +6,6 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief.observers import Semantic
 from semfov.fit.tempering import hit_rate
-from tests.small import cells_of
-from train.fit_tempering import _tempering_report
 
 
 def looks(count, boxes=3, classes=4):
@@ -44,13 +42,8 @@ def test_hit_rate_equals_a_loop_over_looks(tempering):
     assert 0 < rate < 1
 
 
-def test_the_report_has_a_row_for_every_exponent_and_no_rate_without_targets():
+def test_a_photograph_whose_first_look_fixates_all_targets_has_no_rate():
     grid, seen = Grid(4, 3, (96, 96)), looks(2)
     goal = torch.ones(1, 12, dtype=torch.bool)
     fixations = torch.tensor([[10.0, 10.0], [80.0, 80.0]])
     assert hit_rate(Semantic(5), seen, fixations, grid, torch.tensor([1]), goal) is None
-    # The best one is that of the photographs to choose by.
-    report = _tempering_report({0.25: {"fitted": 0.5, "held_out": 0.1}, 1.0: {"fitted": 0.4, "held_out": 0.3}})
-    assert "choose by: 0.25." in report
-    rows = cells_of(report)[2:]
-    assert rows == [["0.25", "50.00", "10.00"], ["1", "40.00", "30.00"]]

@@ -218,12 +218,6 @@ COMMANDS = {
         workers=False,
         refused=((("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),),
     ),
-    "train.fit_tempering": Command(
-        settings=(*NETWORK, *PHOTOGRAPHS, "--fixations", "2", "--holdout", "2", "--min_objects", "1", "--shard", "1",
-                  "--exponents", "[0.25, 1.0]"),
-        files=("hits.json", "report.md"),
-        parts="cache/samples/*/*/*.safetensors",
-    ),
     "eval.ivsn.fit": Command(workers=False),
     "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
     "train.fit_shares": Command(workers=False),
