@@ -21,6 +21,7 @@ from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
 from semfov.paths.fovea import FoveaLook, FoveaLooks
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
+from semfov.runs.store import RememberedLooks
 
 CLASSES = ("cat", "cup", "person")
 GRID = Grid(4, 3, (64, 48))
@@ -128,9 +129,14 @@ def run_settings(folder: Path, scenes: int = 1, columns: int = 4, rows: int = 3,
 def looking(classes: tuple[str, ...], grid: Grid, count: int) -> SimpleNamespace:
     """A stand-in for a run with stored looks at embedded scenes, whose detections are random."""
     scenes = EmbeddedScenes(classes, count=count)
-    return SimpleNamespace(
-        scenes=scenes, grid=lambda index: grid, detections=lambda index: scattered(index, grid, len(classes))
-    )
+
+    def detections(index: int) -> Detections:
+        return scattered(index, grid, len(classes))
+
+    def looks(index: int) -> RememberedLooks[int, Detections]:
+        return RememberedLooks(lambda: lambda cell: detections(index)[cell : cell + 1])
+
+    return SimpleNamespace(scenes=scenes, grid=lambda index: grid, detections=detections, looks=looks)
 
 
 def values_of(acquisition: nn.Module, beta: Tensor) -> Tensor:

@@ -4,11 +4,12 @@
 
 Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-The detector looks at every photograph from every cell; `eval.search` shares these looks under the same `--cache`. The
-fit starts from an observation model. It learns the odds of a miss from searches for the classes of the photographs, and
-then, from searches for present and for absent classes, whether a photograph holds the class. The folder `out` gets the
-model (`<name>.safetensors`) with the thresholds of its decisions, and a report that evaluates it on held-out
-photographs. If the looking is interrupted, repeat the command to continue.
+The detector looks at every photograph from every cell, with `--steps 0` only from those that searches fixate;
+`eval.search` shares these looks under the same `--cache`. The fit starts from an observation model. It learns the odds
+of a miss from searches for the classes of the photographs, and then, from searches for present and for absent classes,
+how probable a cell is, and whether a photograph holds the class. The folder `out` gets the model (`<name>.safetensors`)
+with the thresholds of its decisions, and a report that evaluates it on held-out photographs. If the looking is
+interrupted, repeat the command to continue.
 
 Search with the model by `semfov search … --models runs/fit_search/<name>.safetensors --how fovea`, in Python by
 `ActivePerception.from_pretrained(<file>)`, and in studies by `--policies [recommended] --belief.search_model <file>`.
@@ -31,7 +32,8 @@ def fit_search(config: FitSearchConfig) -> None:
     run = Looking(config)
     start = make_observation(config.model, run.eye)  # before the looks, which take long
     search.check_start(start, config)
-    finish(run, "looking")
+    if config.steps > 0:
+        finish(run, "looking")
     fitted = search.fit_search(start, config, run)
     path = model_path(config, run.eye.detector.name)
     fitted.model.save(path)

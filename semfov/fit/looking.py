@@ -14,10 +14,11 @@ from semfov.episode import EpisodeLook, Looks
 from semfov.errors import DataError
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import EyeSettings, LookingConfig
+from semfov.runs.looks import photograph_looks
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, store_folder
 from semfov.runs.setup import check_sources, make_eye, make_scenes
-from semfov.runs.store import cell_store, look_everywhere
+from semfov.runs.store import RememberedLooks, cell_store
 
 
 class LookingSettings(EyeSettings, Protocol):
@@ -86,11 +87,23 @@ class Looking(SceneRun):
         Returns:
             The detections, a batch with a row for each cell.
         """
+        looks = self.looks(index)
+        detections = Detections.stack([looks(cell) for cell in range(len(self.grid(index)))])
+        looks.save()
+        return detections
+
+    def looks(self, index: int) -> RememberedLooks[int, Detections]:
+        """Open a scene for looks from some of its cells, or read them from the store; `save` keeps them.
+
+        Args:
+            index: number of the scene.
+
+        Returns:
+            A function from a cell to the detections, a batch of one.
+        """
         keeps_none = isinstance(self.config, LookingConfig) and not self.config.store
-        return look_everywhere(
-            self.eye,
-            lambda: self.scenes[index].image[None],
-            self.grid(index),
+        return RememberedLooks(
+            lambda: photograph_looks(self.eye, lambda: self.scenes[index].image[None], self.grid(index)),
             None if keeps_none else self.store,
             lambda: self.digest(index),
         )

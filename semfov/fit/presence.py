@@ -7,12 +7,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.decision import place_known
 from semfov.errors import DataError
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.thresholds import Bounds, choose_thresholds
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import area_under_roc
-from semfov.observation.presence import Presence
+from semfov.observation.presence import Presence, log_odds_of_cells
 from semfov.observation.thresholds import Thresholds
 
 COUNTED = (1, 3, 5, 8, 12)
@@ -25,10 +26,14 @@ _RIDGE = 1e-3
 class BeliefsOfSearches:
     """What the beliefs of E searches say after each of n looks; no search ends before the last one.
 
+    Probabilities of cells are those of the belief, which no fit has made true yet (`Presence.of_cells`).
+
     Attributes:
         facts: `(2, n, E)`, what the probability of presence depends on (`semfov.observation.presence.presence_facts`).
-        place: `(n, E)`, probability of the fixated cell that is nearly as probable as any (`place_known`); 0 for none.
+        place: `(n, E)`, largest probability of a fixated cell.
         hit_chance: `(n, E)`, largest probability of a cell that was not fixated, given that no fixated one holds it.
+        holds: `(n, E)` boolean, whether the most probable cell holds the target.
+        hits: `(n, E)` boolean, whether the cell of the hit chance holds it.
         on_target: `(n, E)` boolean, whether the gaze has reached the target.
         there: `(E,)` boolean, whether the photograph holds the target.
         photograph: `(E,)`, number of the photograph.
@@ -38,6 +43,8 @@ class BeliefsOfSearches:
     facts: Tensor
     place: Tensor
     hit_chance: Tensor
+    holds: Tensor
+    hits: Tensor
     on_target: Tensor
     there: Tensor
     photograph: Tensor
@@ -62,7 +69,7 @@ class BeliefsOfSearches:
 
 
 def fit_presence(searches: BeliefsOfSearches, shares: Tensor, bounds: Bounds) -> Presence:
-    """Fit the presence by logistic regression, and choose the thresholds of decisions.
+    """Fit presence and probabilities of cells by logistic regression, and choose the thresholds of decisions.
 
     How often searches for a class were drawn with their target in the photograph says nothing of the belief: its log
     odds are given to the regression, which fits what remains.
@@ -82,7 +89,8 @@ def fit_presence(searches: BeliefsOfSearches, shares: Tensor, bounds: Bounds) ->
     counted = torch.tensor(searches.counted) - 1
     facts = searches.facts[:, counted].flatten(1).mT.double()
     answers = searches.there.repeat(len(counted))
-    known = shares[searches.target - 1].double().logit().repeat(len(counted))
+    of_class = shares[searches.target - 1].double().logit()
+    known = of_class.repeat(len(counted))
     times = torch.full_like(known, 1 / len(counted))  # all looks of a search are one case
     weight = torch.zeros(2)
     kept = [0, 1]  # numbers of the facts that count
@@ -93,9 +101,39 @@ def fit_presence(searches: BeliefsOfSearches, shares: Tensor, bounds: Bounds) ->
         # A surer cell, or a higher score, must not speak against the class: few searches may say so by chance.
         del kept[weights.index(min(weights))]
     weight[kept] = torch.tensor(weights)
-    presence = Presence(torch.tensor(offset), weight, shares).requires_grad_(False)
+    centre = _fit_cells(searches, of_class)
+    presence = Presence(torch.tensor(offset), weight, shares, centre=centre).requires_grad_(False)
     presence.thresholds = thresholds_of_searches(presence, searches, bounds)
     return presence
+
+
+def _fit_cells(searches: BeliefsOfSearches, of_class: Tensor) -> Tensor:
+    """Fit what makes the probabilities of the cells true that decisions read: of the most probable, and of the next.
+
+    Args:
+        searches: searches of photographs.
+        of_class: `(E,)`, log odds that a search for the class has its target in the photograph.
+
+    Returns:
+        Offset and slope of the log odds, `(2,)`.
+    """
+    counted = torch.tensor(searches.counted) - 1
+    each = torch.full_like(searches.place[counted].double(), 1 / len(counted))  # all looks of a search are one case
+    log_odds = torch.stack(
+        [searches.facts[0, counted].double(), log_odds_of_cells(searches.hit_chance[counted]).double()]
+    )
+    answers = torch.stack([searches.holds[counted], searches.hits[counted]])
+    # The chance of a hit is that of a search that goes on.
+    times = torch.stack([each, each * ~searches.on_target[counted]])
+    return torch.tensor(
+        logistic_regression(
+            log_odds.flatten()[:, None],
+            answers.flatten(),
+            times=times.flatten(),
+            known=of_class.expand_as(log_odds).flatten(),
+            ridge=_RIDGE,
+        )
+    )
 
 
 @torch.no_grad()
@@ -111,7 +149,10 @@ def thresholds_of_searches(presence: Presence, searches: BeliefsOfSearches, boun
         The thresholds.
     """
     probability = presence(searches.facts.movedim(0, -1)).sigmoid()
-    return choose_thresholds(bounds, probability, searches.place, searches.hit_chance, searches.there)
+    cells = presence.of_cells(torch.stack([searches.place, searches.facts[0].sigmoid()], -1), covers=False)
+    place = cells[..., 0] * place_known(cells, torch.tensor([True, False]))
+    hit_chance = presence.of_cells(searches.hit_chance, covers=False)
+    return choose_thresholds(bounds, probability, place, hit_chance, searches.there)
 
 
 @torch.no_grad()

@@ -13,11 +13,10 @@ from semfov.belief.observers import SemanticSearch
 from semfov.belief.observers.base import own
 from semfov.belief.observers.semantic_search import SearchBelief
 from semfov.data.scene import Scenes
-from semfov.decision import place_known
-from semfov.episode import Step, StoredLooks, rollout
+from semfov.episode import Step, rollout
 from semfov.errors import DataError, check
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.looking import Looking
+from semfov.fit.looking import CellLooks, Looking
 from semfov.fit.presence import COUNTED, BeliefsOfSearches, fit_presence, judge_presence
 from semfov.fit.protocols import choose_searches, numbers_drawn
 from semfov.fit.settings import FitOnCellsConfig
@@ -185,13 +184,21 @@ def search_photographs(
         DataError: there is nothing to search for.
     """
     found = []
+    observer = SemanticSearch(_without_presence(model))
     for index in track(photographs, title, "photograph"):
-        beliefs = _search_photograph(model, run, config, index)
+        beliefs = _search_photograph(observer, run, config, index)
         if beliefs is not None:
             found.append(beliefs)
     if not found:
         raise DataError("data: expected photographs with a class to search for, got none; raise max_target_area")
     return BeliefsOfSearches.join(found)
+
+
+def _without_presence(model: FovealObservationModel) -> FovealObservationModel:
+    """Copy a model, so that the probabilities of cells are those of the belief alone."""
+    copy = deepcopy(model)
+    copy.presence = None
+    return copy
 
 
 class _SideBySide(NamedTuple):
@@ -220,32 +227,33 @@ def _search_side_by_side(
     if not drawn:
         return None
     targets = torch.tensor([search.target for search in drawn])
-    steps = rollout(
-        StoredLooks(run.detections(index), grid, targets),
+    looks_at_photograph = run.looks(index)
+    rolled = rollout(
+        CellLooks(looks_at_photograph, grid, grid.centres),
         observer,
         lambda episodes, _: TargetPosterior(targets[episodes]),
         torch.cat([search.start for search in drawn]),
         Greedy(drawn_from(torch.cat([search.noise for search in drawn]))),
         most=looks,
     )
-    return _SideBySide(targets, torch.stack([search.goal for search in drawn]), list(steps))
+    steps = list(rolled)
+    looks_at_photograph.save()
+    return _SideBySide(targets, torch.stack([search.goal for search in drawn]), steps)
 
 
 @torch.inference_mode()
 def _search_photograph(
-    model: FovealObservationModel, run: Looking, config: FitSearchConfig, index: int
+    observer: SemanticSearch, run: Looking, config: FitSearchConfig, index: int
 ) -> BeliefsOfSearches | None:
     """Search a photograph for all its classes side by side; None if there is no class to search for."""
-    searched = _search_side_by_side(SemanticSearch(model), run, config, index)
+    searched = _search_side_by_side(observer, run, config, index)
     if searched is None:
         return None
     targets, goal, steps = searched
-    facts, place, hit_chance, on_target = zip(*(_facts(step, targets, goal) for step in steps), strict=True)
+    facts, *by_step = zip(*(_facts(step, targets, goal) for step in steps), strict=True)
     return BeliefsOfSearches(
         torch.stack(facts, 1),
-        torch.stack(place),
-        torch.stack(hit_chance),
-        torch.stack(on_target),
+        *(torch.stack(values) for values in by_step),
         there=goal.any(-1),
         photograph=torch.full((len(targets),), index),
         target=targets,
@@ -264,9 +272,7 @@ def fit_places(model: FovealObservationModel, run: Looking, config: FitSearchCon
     Returns:
         Offset and slope of the log odds, `(2,)` (`Presence.of_cells`).
     """
-    plain = deepcopy(model)
-    plain.presence = None
-    observer = SemanticSearch(plain, footprint="overlap")
+    observer = SemanticSearch(_without_presence(model), footprint="overlap")
     log_odds: list[Tensor] = []
     holds: list[Tensor] = []
     for index in track(range(len(run.scenes)), "looking at cells", "photograph"):
@@ -283,14 +289,16 @@ def fit_places(model: FovealObservationModel, run: Looking, config: FitSearchCon
     return torch.tensor(logistic_regression(torch.cat(log_odds)[:, None], torch.cat(holds), ridge=_RIDGE))
 
 
-def _facts(step: Step, targets: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Read what E beliefs say after a look, as fields of `BeliefsOfSearches`, `(2, E)` and `(E,)` each."""
+def _facts(step: Step, targets: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+    """Read what E beliefs say after a look, as the first fields of `BeliefsOfSearches`, `(2, E)` and `(E,)` each."""
     belief = own(step.belief, SearchBelief, "belief")
-    cells = belief.probability(targets)
     visited = step.visited
-    place = cells.masked_fill(~visited, 0).amax(-1) * place_known(cells, visited)
-    hit_chance = belief.chance(targets).masked_fill(visited, 0).amax(-1)
-    return belief.facts(targets).mT, place, hit_chance, (visited & goal).any(-1)
+    cells = belief.probability(targets)
+    place = cells.masked_fill(~visited, 0).amax(-1)
+    hit_chance, best = belief.chance(targets).masked_fill(visited, 0).max(-1)
+    holds = goal.gather(-1, cells.argmax(-1, keepdim=True))[:, 0]
+    hits = goal.gather(-1, best[:, None])[:, 0] & ~visited.all(-1)
+    return belief.facts(targets).mT, place, hit_chance, holds, hits, (visited & goal).any(-1)
 
 
 def search_report(judged: Sequence[dict[str, float]], presence: Presence, trained: int, held_out: int) -> str:

@@ -15,6 +15,7 @@ PRESENCE = {
     "presence.weight": Field((2,), low=-1e3, high=1e3, optional=True),
     "presence.shares": SHARES,
     "presence.place": Field((2,), low=-1e3, high=1e3, optional=True),
+    "presence.centre": Field((2,), low=-1e3, high=1e3, optional=True),
 }
 """Schema of a `Presence` in the file of a model."""
 
@@ -60,7 +61,8 @@ class Presence(DecidingModule):
 
     A cell takes the closest look alone; the last term, over the detections l of each look i, keeps what all of them
     saw. It assumes that the target is in half of the pictures (`EVEN`), whatever the class. Two further numbers make
-    the probability of a cell true (`of_cells`), where all cells under a detection have its weight:
+    the probability of a cell true (`of_cells`): two where all cells under a detection have its weight, and two where
+    the cell of its centre has all of it.
 
     .. math:: \operatorname{logit} P'(t \in x) = a_x + b_x \operatorname{logit} P(t \in x)
 
@@ -69,7 +71,9 @@ class Presence(DecidingModule):
         weight: b and c, `(2,)`.
         shares: `(K,)`, by class, shares of the searches of the fit whose target was there.
         thresholds: thresholds at which searches decide; None if none were chosen.
-        place: :math:`a_x` and :math:`b_x`, `(2,)`; None leaves the probabilities of cells as they are.
+        place: :math:`a_x` and :math:`b_x`, `(2,)`, where all cells under a detection have its weight; None leaves the
+            probabilities of cells as they are.
+        centre: likewise where the cell of its centre has all of it.
 
     Raises:
         InputError: a shape does not fit, or a number is not finite.
@@ -80,6 +84,10 @@ class Presence(DecidingModule):
     tensor([0.7500])
     """
 
+    offset: Tensor
+    weight: Tensor
+    place: Tensor
+    centre: Tensor | None
     shares: Tensor
 
     def __init__(
@@ -90,24 +98,26 @@ class Presence(DecidingModule):
         thresholds: Thresholds | None = None,
         *,
         place: Tensor | None = None,
+        centre: Tensor | None = None,
     ) -> None:
         super().__init__()
+        check_tensor(shares, "shares")
         place = torch.tensor([0.0, 1.0]).to(shares) if place is None else place
-        for name, values in (("offset", offset), ("weight", weight), ("shares", shares), ("place", place)):
+        numbers = [("offset", offset, ()), ("weight", weight, (2,)), ("place", place, (2,))]
+        if centre is not None:
+            numbers.append(("centre", centre, (2,)))
+        for name, values, shape in [*numbers, ("shares", shares, (shares.numel(),))]:
             check_tensor(values, name)
             check(values.is_floating_point(), name, "a floating-point tensor", values.dtype)
-        check(offset.ndim == 0, "offset", "shape ()", tuple(offset.shape))
-        check(tuple(weight.shape) == (2,), "weight", "shape (2,)", tuple(weight.shape))
-        check(tuple(place.shape) == (2,), "place", "shape (2,)", tuple(place.shape))
-        check(shares.ndim == 1, "shares", "shape (K,)", tuple(shares.shape))
-        for name, values in (("offset", offset), ("weight", weight), ("shares", shares), ("place", place)):
+            check(tuple(values.shape) == shape, name, f"shape {shape}", tuple(values.shape))
             check_finite(values, name)
         are_shares = bool(((shares > 0) & (shares < 1)).all())
         check(are_shares, "shares", "numbers above 0 and below 1", shares.tolist())
         check(thresholds is None or isinstance(thresholds, Thresholds), "thresholds", "Thresholds or None", thresholds)
-        self.offset = nn.Parameter(offset.detach().clone())
-        self.weight = nn.Parameter(weight.detach().clone())
-        self.place = nn.Parameter(place.detach().clone())
+        for name, values, _ in numbers:
+            self.register_parameter(name, nn.Parameter(values.detach().clone()))
+        if centre is None:
+            self.register_parameter("centre", None)
         self.register_buffer("shares", shares.detach().clone())
         self.thresholds = thresholds
 
@@ -128,19 +138,25 @@ class Presence(DecidingModule):
         Returns:
             The copy.
         """
-        constant = Presence(self.offset, self.weight, self.shares, self.thresholds, place=self.place)
+        constant = Presence(
+            self.offset, self.weight, self.shares, self.thresholds, place=self.place, centre=self.centre
+        )
         return constant.requires_grad_(False)
 
-    def of_cells(self, probability: Tensor) -> Tensor:
-        """Make the probabilities of cells true, where all cells under a detection have its weight.
+    def of_cells(self, probability: Tensor, *, covers: bool) -> Tensor:
+        """Make the probabilities of cells true.
 
         Args:
             probability: `(...)`, of the class in each cell.
+            covers: whether all cells under a detection have its weight, or only that of its centre.
 
         Returns:
-            `(...)`.
+            `(...)`; as they are where the numbers are not known.
         """
-        offset, slope = self.place.to(probability)
+        numbers = self.place if covers else self.centre
+        if numbers is None:
+            return probability
+        offset, slope = numbers.to(probability)
         return (offset + slope * log_odds_of_cells(probability)).sigmoid()
 
 
@@ -163,4 +179,5 @@ def presence_of(tensors: dict[str, Tensor], thresholds: Thresholds | None) -> Pr
         return None
     check(all(name in found for name in needed), "presence", f"all of {', '.join(needed)}", ", ".join(found))
     offset, weight, shares = (tensors[name] for name in needed)
-    return Presence(offset, weight, shares, thresholds, place=tensors.get("presence.place"))
+    cells = {name: tensors.get(f"presence.{name}") for name in ("place", "centre")}
+    return Presence(offset, weight, shares, thresholds, **cells)

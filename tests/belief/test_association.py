@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -188,6 +189,27 @@ def test_the_most_probable_cell_and_all_scores_tell_whether_the_picture_holds_th
         assert float(belief.presence(target)) == pytest.approx(1 / (1 + math.exp(-odds)), rel=1e-5)
 
 
+@pytest.mark.parametrize("footprint", ["box_centre", "overlap"])
+def test_two_numbers_of_the_footprint_make_the_probabilities_of_cells_true(looks, footprint):
+    """In all cells, given the looks alone and for the next fixation; presence reads what they were before."""
+    numbers = {"overlap": torch.tensor([-0.5, 0.6]), "box_centre": torch.tensor([1.5, 0.8])}
+    common = torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((3,), 0.5)
+    told = Presence(*common, place=numbers["overlap"], centre=numbers["box_centre"])
+    observers = [
+        SemanticSearch(model(presence=each).requires_grad_(False), footprint=footprint)
+        for each in (Presence(*common, place=torch.tensor([0.0, 1.0])), told)
+    ]
+    plain, true = (watch(observer, looks) for observer in observers)
+    offset, slope = numbers[footprint].tolist()
+    for name in ("probability", "chance"):
+        before, after = (getattr(belief, name)(2)[0].double().tolist() for belief in (plain, true))
+        expected = [1 / (1 + math.exp(-offset - slope * math.log(each / (1 - each)))) for each in before]
+        assert after == pytest.approx(expected, rel=1e-4)
+    assert torch.equal(plain.presence(2), true.presence(2))
+    before, after = (observer.unseen(looks.boxes)[1:].double() for observer in observers)
+    torch.testing.assert_close(after.logit(), offset + slope * before.logit(), rtol=1e-4, atol=1e-4)
+
+
 def draw_search(generator, dtype=torch.float32):
     """Looks from all cells of a 5 × 4 grid at a cup; far from the fovea, cups are seen where there are none."""
     cup, cat = torch.randperm(20, generator=generator)[:2].tolist()
@@ -324,6 +346,7 @@ def test_presence_is_checked(told):
         refused("shares: expected numbers above 0 and below 1", Presence, offset, weight, wrong)
     refused("offset: expected a floating-point tensor", Presence, torch.tensor(1), weight, shares)
     refused("weight: expected shape", Presence, offset, torch.ones(3), shares)
+    refused("centre: expected shape", partial(Presence, centre=torch.ones(3)), offset, weight, shares)
     refused("thresholds: expected Thresholds or None", Presence, offset, weight, shares, (0.5, 0.1))
     refused(
         "presence: expected one of 3 classes, got one of 2",

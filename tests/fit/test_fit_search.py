@@ -65,8 +65,10 @@ def searched_alone(model, run, index, drawn):
             (
                 math.log(max(cells) / (1 - max(cells))),
                 highest / (look + 1),
-                fixated if fixated >= 0.9 * max(cells) else 0.0,
+                fixated,
                 max(left.values()),
+                bool(drawn.goal[cells.index(max(cells))]),
+                bool(drawn.goal[max(left, key=left.__getitem__)]),
                 any(bool(drawn.goal[each]) for each in visited),
             )
         )
@@ -85,8 +87,10 @@ def test_searches_side_by_side_equal_each_search_alone(run, model):
             held = drawn.target in run.scenes.annotation(index).labels.tolist()
             about.append((held, index, drawn.target))
     assert len(found) == len(about) >= 6
-    facts = torch.stack([*found.facts, found.place, found.hit_chance, found.on_target.float()], -1)
-    torch.testing.assert_close(facts, torch.tensor(expected).transpose(0, 1))
+    facts = [*found.facts, found.place, found.hit_chance, found.holds, found.hits, found.on_target]
+    torch.testing.assert_close(
+        torch.stack([each.float() for each in facts], -1), torch.tensor(expected).transpose(0, 1).float()
+    )
     assert [*zip(found.there.tolist(), found.photograph.tolist(), found.target.tolist(), strict=True)] == about
     assert {held for held, *_ in about} == {True, False}
     assert found.place.count_nonzero() > 0
@@ -107,7 +111,9 @@ def beliefs(count=80, looks=13, seed=0):
     target = torch.randint(1, 4, (count,), generator=generator)
     on_target = there & (torch.rand(looks, count, generator=generator) < 0.6).cummax(0).values
     peak = facts[0].sigmoid()
-    return BeliefsOfSearches(facts, 0.9 * peak, 0.3 * peak, on_target, there, torch.arange(count) // 4, target)
+    holds, hits = there & (torch.rand(2, looks, count, generator=generator) < torch.tensor([0.7, 0.2])[:, None, None])
+    photograph = torch.arange(count) // 4
+    return BeliefsOfSearches(facts, 0.95 * peak, 0.3 * peak, holds, hits, on_target, there, photograph, target)
 
 
 SHARES = torch.tensor([0.2, 0.5, 0.7])
@@ -135,8 +141,35 @@ def test_the_presence_maximises_the_likelihood_given_the_shares_of_classes(looks
     assert not any(parameter.requires_grad for parameter in presence.parameters())
     # Thresholds are those of targets that are there in half of the pictures.
     odds = torch.from_numpy(best[0] + best[1] * peak + best[2] * score)
-    expected = choose_thresholds(FitSearchConfig(), odds.sigmoid(), searches.place, searches.hit_chance, searches.there)
+    place, chance = (presence.of_cells(each, covers=False) for each in (searches.place, searches.hit_chance))
+    known = place >= 0.9 * presence.of_cells(searches.facts[0].sigmoid(), covers=False)
+    expected = choose_thresholds(FitSearchConfig(), odds.sigmoid(), place * known, chance, searches.there)
     assert presence.thresholds == expected
+
+
+@pytest.mark.parametrize("looks", [13, 4])
+def test_the_cells_that_decisions_read_are_made_true_given_the_shares_of_classes(looks):
+    searches = beliefs(looks=looks)
+    presence = fit_presence(searches, SHARES, FitSearchConfig())
+    share = SHARES[searches.target - 1].double().logit().tolist()
+    rows = []
+    for look in (number - 1 for number in (1, 3, 5, 8, 12) if number <= looks):
+        for search in range(len(searches)):
+            peak, chance = float(searches.facts[0, look, search]), float(searches.hit_chance[look, search])
+            rows.append((peak, searches.holds[look, search], share[search]))
+            if not searches.on_target[look, search]:
+                rows.append((math.log(chance / (1 - chance)), searches.hits[look, search], share[search]))
+    odds, holds, known = np.array(rows, dtype=float).T
+    count = sum(number <= looks for number in (1, 3, 5, 8, 12))
+
+    def loss(numbers):
+        log_odds = numbers[0] + numbers[1] * odds + known
+        cost = np.logaddexp(0, np.where(holds > 0, -log_odds, log_odds)).sum() / count
+        cost += 0.5 * (np.logaddexp(0, numbers[0]) + np.logaddexp(0, -numbers[0]))
+        return cost + 0.5 * (1e-6 * numbers[0] ** 2 + 1e-3 * numbers[1] ** 2)
+
+    best = minimize(loss, np.zeros(2), tol=1e-12).x
+    assert presence.centre.tolist() == pytest.approx(list(best), abs=1e-3)
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -360,7 +393,7 @@ def test_the_probabilities_of_cells_are_fitted_to_what_the_cells_hold(run, model
     presence = Presence(torch.tensor(0.4), torch.tensor([0.8, 0.3]), SHARES, place=fit_places(model, run, CONFIG))
     ((facts, right),) = given
     # A fit with a free offset has the mean of its answers.
-    mean = presence.of_cells(facts[:, 0].sigmoid()).mean().detach()
+    mean = presence.of_cells(facts[:, 0].sigmoid(), covers=True).mean().detach()
     assert float(mean) == pytest.approx(float(right.double().mean()), abs=2e-3)
     observer, cells = SemanticSearch(model, footprint="overlap"), len(run.grid(0))
     assert len(facts) % cells == 0

@@ -27,9 +27,8 @@ def observation():
 
 
 def searching():
-    presence = Presence(
-        torch.tensor(-0.5), torch.tensor([0.75, 0.125]), torch.tensor([0.25, 0.5]), Thresholds(0.83, 0.05)
-    )
+    numbers = torch.tensor(-0.5), torch.tensor([0.75, 0.125]), torch.tensor([0.25, 0.5])
+    presence = Presence(*numbers, Thresholds(0.83, 0.05), centre=torch.tensor([1.5, 0.75]))
     odds = torch.full((3, 2), 0.125)
     return FovealObservationModel.identity(CLASSES, [0.2], miss_odds=odds, refutation=0.5, presence=presence)
 

@@ -56,8 +56,7 @@ class SearchBelief(DirichletBelief):
         visited: `(B, X·Y)` boolean, the fixated cells.
         log_score: `(B, K+1)`, sum over the looks of the logarithm of the highest score of each class.
         looks: `(B,)`, number of looks.
-        covers: whether all cells under a detection have its weight, so that their probabilities are made true, too
-            (`Presence.of_cells`).
+        covers: whether all cells under a detection have its weight, or only that of its centre (`Presence.of_cells`).
         calibration: by which it says whether the picture holds a class; None takes the most probable cell.
         prior: how often the target is there.
     """
@@ -82,7 +81,7 @@ class SearchBelief(DirichletBelief):
 
     def _true(self, probability: Tensor) -> Tensor:
         """Make the probabilities of cells true, where the fit knows how."""
-        return self.calibration.of_cells(probability) if self.covers and self.calibration is not None else probability
+        return probability if self.calibration is None else self.calibration.of_cells(probability, covers=self.covers)
 
     def presence(self, target: int | Tensor) -> Tensor:
         if self.calibration is None:
@@ -230,9 +229,9 @@ class SemanticSearch(Observer):
         """
         odds = self.model.miss_odds(like.new_ones(())).to(like)
         probability = odds / odds.sum()
-        if self.footprint != "overlap" or self.model.presence is None:
+        if self.model.presence is None:
             return probability
-        return self.model.presence.of_cells(probability)
+        return self.model.presence.of_cells(probability, covers=self.footprint == "overlap")
 
     def update(self, belief: Belief, look: Look) -> SearchBelief:
         """Fuse a look in each episode: given the looks alone, and for the next fixation."""
