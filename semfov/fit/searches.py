@@ -199,7 +199,7 @@ def open_photographs(
 
 
 class _PhotographSearch(TargetSearch[Step]):
-    """A search of a photograph, where the class is most probable."""
+    """A search of a photograph, where the class is most probable; it assumes how often the class is searched for."""
 
     after = (1, 3, 5, 8, 12)
 
@@ -212,7 +212,7 @@ class _PhotographSearch(TargetSearch[Step]):
         self.spare = search.spare
         self.photograph = photograph
         self.search = search
-        self.model = model
+        self.observer = SemanticSearch(model).with_prior("fit", search.target)
         self.most_looks = looks
 
     @cached_property
@@ -222,9 +222,8 @@ class _PhotographSearch(TargetSearch[Step]):
         grid = photograph.grid
         source = CellLooks(photograph.looks, grid, grid.centres, self.target)
         choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), source.like))
-        observer = SemanticSearch(self.model)
         policy = TargetPosterior(self.target)
-        return list(rollout(source, observer, policy, self.search.start, choice, most=self.most_looks))
+        return list(rollout(source, self.observer, policy, self.search.start, choice, most=self.most_looks))
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -233,7 +232,7 @@ class _PhotographSearch(TargetSearch[Step]):
         return self.steps[index]
 
     def candidates(self) -> CandidateCells:
-        return CandidateCells(self.photograph.grid, self.target)
+        return CandidateCells(self.photograph.grid, self.target, prior=self.observer.prior)
 
     def close_up(self, box: Tensor) -> Detections:
         return self.photograph.looks(tuple(box.tolist()))

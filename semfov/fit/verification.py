@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.belief.prior import with_prior
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import FOUND, Verifier, final_outcome, found_at_once
 from semfov.decision.candidates import LookType
@@ -48,8 +49,8 @@ class VerificationConfig(FitOnCellsConfig):
     absent: Count | None = None
     max_target_area: Positive = 0.2
     looks: Annotated[int, Range(2, 10_000)] = 12
-    place: Share = 0.05
-    stop_below: Share = 0.0005
+    place: Share = 0.4
+    stop_below: Share = 0.02
     false_alarms: Share = 0.01
     folds: Annotated[int, Range(2, 1000)] = 5
 
@@ -98,12 +99,14 @@ class CloserLooks(NamedTuple):
         right: `(N,)` boolean, whether the target is at the place.
         present: `(N,)` boolean, whether the picture holds the target.
         fold: `(N,)`, number of the fold of the picture.
+        known: `(N,)`, log odds that a search for the class has its target in the picture, before any look.
     """
 
     features: Tensor
     right: Tensor
     present: Tensor
     fold: Tensor
+    known: Tensor
 
 
 class VerificationInFolds(NamedTuple):
@@ -177,17 +180,21 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
     right: list[bool] = []
     present: list[bool] = []
     fold: list[int] = []
+    known: list[float] = []
     for search in searches:
         if search.spare:
             continue
+        prior = search.candidates().prior
         for features_of_look, box in _examined_places(search):
             features.append(features_of_look)
             right.append(search.right(box))
             present.append(search.present)
             fold.append(search.picture % folds)
+            known.append(with_prior(0.0, prior.share, prior.fitted))
     if len({*right}) < 2:
         return None
-    return CloserLooks(torch.stack(features), torch.tensor(right), torch.tensor(present), torch.tensor(fold))
+    answers = torch.tensor(right), torch.tensor(present)
+    return CloserLooks(torch.stack(features), *answers, torch.tensor(fold), torch.tensor(known))
 
 
 def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:
@@ -314,10 +321,12 @@ class _Penalty(NamedTuple):
 def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
     r"""Fit both logistic regressions by penalised maximum likelihood, or maximum a posteriori.
 
-    .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b, y_i) + \lambda |w'|^2, \quad\text{or}\quad
-              \dots + \frac{\kappa}{N} \left( |w' - w'_0|^2 + (b' - b'_0)^2 \right)
+    .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b + r_i, y_i) + \lambda |w'|^2,
+              \quad\text{or}\quad \dots + \frac{\kappa}{N} \left( |w' - w'_0|^2 + (b' - b'_0)^2 \right)
 
     with w' the weights of features of zero mean and unit variance, λ = 1e-4, and w'₀, b'₀ those of a prior, κ = 10.
+    How often searches for a class have their target in the picture says nothing of a look: these log odds r are known,
+    and the regressions are of what remains.
 
     Args:
         closer_looks: closer looks at N places.
@@ -331,6 +340,7 @@ def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verifi
         DataError: fewer than two closer looks are chosen.
     """
     features = closer_looks.features[chosen].double()
+    known = closer_looks.known[chosen].double()
     if len(features) < 2:
         raise DataError(f"data: expected closer looks in all folds but one, got {len(features)}; give more photographs")
     answers = torch.stack([closer_looks.right, closer_looks.present], -1)[chosen].double()
@@ -344,7 +354,7 @@ def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verifi
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        log_odds = standardised @ weight.mT + bias
+        log_odds = standardised @ weight.mT + bias + known[:, None]
         likelihood = F.binary_cross_entropy_with_logits(log_odds, answers, reduction="none").mean(0).sum()
         value = penalty.add_to(likelihood, weight, bias)
         value.backward()

@@ -63,15 +63,17 @@ def verification_report(fitted: VerificationInFolds, pictures: str, how: str = I
 def _chances(fitted: VerificationInFolds) -> tuple[list[list[str]], dict[str, float | None]]:
     """Measure the probabilities before and after closer looks: rows of a table, and the measures by name."""
     looks = fitted.closer_looks
-    # The log odds after each closer look, by the model that was not fitted to its picture, `(N, 2)`.
+    # The log odds after each closer look, by the model that was not fitted to its picture, `(N, 2)`, with those of the
+    # class.
     by_fold = torch.stack([model(looks.features) for model in fitted.folds])
-    after = by_fold[looks.fold, torch.arange(len(looks.fold))]
+    after = by_fold[looks.fold, torch.arange(len(looks.fold))] + looks.known[:, None]
+    before = looks.features[:, :2] + looks.known[:, None]
     figures: dict[str, float | None] = {}
     rows = [["", "NLL", "ECE", "area under ROC"]]
     for words, name, log_odds, answers in (
-        ("at the place, before", "cell", looks.features[:, 1], looks.right),
+        ("at the place, before", "cell", before[:, 1], looks.right),
         ("at the place, after", "place", after[:, 0], looks.right),
-        ("in the image, before", "image", looks.features[:, 0], looks.present),
+        ("in the image, before", "image", before[:, 0], looks.present),
         ("in the image, after", "presence", after[:, 1], looks.present),
     ):
         measures = {

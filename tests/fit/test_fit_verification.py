@@ -42,9 +42,8 @@ def examined(count=200, seed=0):
     generator = torch.Generator().manual_seed(seed)
     features = 2 * torch.randn(count, 7, generator=generator)
     noise = torch.randn(2, count, generator=generator)
-    return CloserLooks(
-        features, features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1, torch.arange(count) % 4
-    )
+    right, present = features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1
+    return CloserLooks(features, right, present, torch.arange(count) % 4, torch.randn(count, generator=generator))
 
 
 @pytest.mark.parametrize("count", [200, 60])
@@ -55,6 +54,7 @@ def test_the_fit_minimises_the_penalised_cross_entropy(count):
     model = fit_to_closer_looks(known, chosen, prior)
     phi = known.features[chosen].double().numpy()
     mean, scale = phi.mean(0), phi.std(0, ddof=1)
+    of_class = known.known[chosen].double().numpy()
     for row, goal in enumerate((known.right, known.present)):
         there, centre, strength = goal[chosen].numpy(), np.zeros(8), np.array([1e-4] * 7 + [0])
         if prior is not None:
@@ -63,7 +63,7 @@ def test_the_fit_minimises_the_penalised_cross_entropy(count):
             strength = np.full(8, _STRENGTH / len(phi))
 
         def loss(parameters, there=there, centre=centre, strength=strength):
-            odds = (phi - mean) / scale @ parameters[:7] + parameters[7]
+            odds = (phi - mean) / scale @ parameters[:7] + parameters[7] + of_class
             distance = (strength * (parameters - centre) ** 2).sum()
             return np.logaddexp(0, np.where(there, -odds, odds)).mean() + distance
 
@@ -77,7 +77,7 @@ def test_the_fit_ignores_the_closer_looks_that_are_held_out():
     known = examined()
     other = known.features.clone()
     other[known.fold == 2] = 100.0
-    changed = CloserLooks(other, known.right, known.present, known.fold)
+    changed = known._replace(features=other)
     assert torch.equal(
         fit_to_closer_looks(known, known.fold != 2).linear.weight,
         fit_to_closer_looks(changed, known.fold != 2).linear.weight,
@@ -166,7 +166,9 @@ def opened(detector, store=None):
     """Three embedded scenes with classes to search for, and a model that searches them."""
     eye = Eye(Foveation(9.0), detector, reference=64.0).requires_grad_(False)
     scenes = EmbeddedScenes(CLASSES, count=3)
-    presence = Presence(torch.tensor(0.5), torch.tensor([1.0, 0.0]), torch.full((3,), 0.5), Thresholds(0.7, 0.01))
+    presence = Presence(
+        torch.tensor(0.5), torch.tensor([1.0, 0.0]), torch.tensor([0.3, 0.5, 0.8]), Thresholds(0.7, 0.01)
+    )
     odds = torch.full((4, 3), 0.1)
     searching = FovealObservationModel.identity(
         CLASSES, [0.2, 0.5], miss_odds=odds, refutation=0.9, presence=presence
@@ -231,7 +233,7 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
     for photograph in found:
         image = photograph.scenes[photograph.index].image
         for sought in photograph.targets:
-            verified, options = next(searches), {"start": int(sought.start), "shifts": config.looks - 1}
+            verified, options = next(searches), {"start": int(sought.start), "shifts": config.looks - 1, "prior": "fit"}
             scanpath = agent.search(image, sought.target, how="fovea", **options)
             right, looks = verified.found(confirm)
             assert scanpath.found == (right is not None)
@@ -266,6 +268,10 @@ def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
     known = examined_in(found, searching, config)
     assert known.features.shape == (len(known.right), 7)
     assert set(known.fold.tolist()) == {0, 1}
+    # By class, how often it is searched for where it is.
+    sought = [each.target for photograph in found for each in photograph.targets]
+    of_classes = torch.tensor([0.3, 0.5, 0.8]).logit()[torch.tensor(sought) - 1]
+    assert {round(each, 4) for each in known.known.tolist()} <= {round(each, 4) for each in of_classes.tolist()}
     # A place can only be right in a photograph that holds the target.
     assert bool((known.present | ~known.right).all())
     models = [fit_to_closer_looks(known, known.fold != fold) for fold in (0, 1)]
