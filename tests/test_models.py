@@ -163,7 +163,20 @@ def test_yolov3_tiny_searches_with_the_numbers_of_yolox_nano():
     assert "those of yolox-nano-search" in model.metadata["search"]
     assert torch.equal(model.log_miss, other.log_miss)
     assert torch.equal(model.presence.weight, other.presence.weight)
+    assert torch.equal(model.presence.centre, other.presence.centre)
     assert model.presence.thresholds == other.presence.thresholds
+
+
+def test_the_card_has_the_numbers_and_thresholds_of_true_cells():
+    model = semfov.FovealObservationModel.from_pretrained("yolox-nano-search")
+    card = (model.shipped / "README.md").read_text("utf-8")
+    offset, slope = model.presence.centre.tolist()
+    assert f"{offset:.2f} and {slope:.2f} (`presence.centre` in the file)" in card
+    thresholds = model.presence.thresholds
+    # The earlier thresholds were of the chain's own probabilities.
+    place, stop_below = model.presence.of_cells(torch.tensor([0.05, 0.002]), covers=False).tolist()
+    assert (thresholds.place, thresholds.stop_below) == pytest.approx((place, stop_below), abs=0.005)
+    assert f"| {thresholds.place:.2f} | {thresholds.stop_below:.3f} |" in card
 
 
 @pytest.mark.parametrize("name", DETECTORS)

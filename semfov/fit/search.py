@@ -251,13 +251,9 @@ def _search_photograph(
         return None
     targets, goal, steps = searched
     facts, *by_step = zip(*(_facts(step, targets, goal) for step in steps), strict=True)
-    return BeliefsOfSearches(
-        torch.stack(facts, 1),
-        *(torch.stack(values) for values in by_step),
-        there=goal.any(-1),
-        photograph=torch.full((len(targets),), index),
-        target=targets,
-    )
+    photograph = torch.full((len(targets),), index)
+    read = [torch.stack(facts, 1), *map(torch.stack, by_step)]
+    return BeliefsOfSearches(*read, goal.any(-1), photograph, targets)
 
 
 @torch.inference_mode()
