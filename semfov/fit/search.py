@@ -250,10 +250,19 @@ def _search_photograph(
     if searched is None:
         return None
     targets, goal, steps = searched
-    facts, *by_step = zip(*(_facts(step, targets, goal) for step in steps), strict=True)
-    photograph = torch.full((len(targets),), index)
-    read = [torch.stack(facts, 1), *map(torch.stack, by_step)]
-    return BeliefsOfSearches(*read, goal.any(-1), photograph, targets)
+    by_name = zip(*(_facts(step, targets, goal) for step in steps), strict=True)
+    facts, place, hit_chance, holds, hits, on_target = by_name
+    return BeliefsOfSearches(
+        torch.stack(facts, 1),
+        torch.stack(place),
+        torch.stack(hit_chance),
+        torch.stack(holds),
+        torch.stack(hits),
+        torch.stack(on_target),
+        there=goal.any(-1),
+        photograph=torch.full((len(targets),), index),
+        target=targets,
+    )
 
 
 @torch.inference_mode()
