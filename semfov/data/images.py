@@ -360,11 +360,12 @@ def _loaded(image: "Image", *, upright: bool) -> "Image":
     stored = _orientation(image)
     image.load()
     remaining = _orientation(image)  # Pillow turns some pictures when it decodes them
-    orientation = _UPRIGHT
     if upright:
         orientation = remaining
     elif remaining != stored:
         orientation = _INVERSE.get(stored, stored)
+    else:
+        orientation = _UPRIGHT
     return image if orientation == _UPRIGHT else image.transpose(Transpose[_MOVES[orientation]])
 
 

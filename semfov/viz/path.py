@@ -173,15 +173,10 @@ class GazePath:
         sizes = [((0.64 * count * _POINTS + 4.5) * scale, height) for count in digits]
         points = [(float(x), float(y)) for x, y in self.path]
         places = place_numbers(points, sizes, self.frame, 60 * scale)
-        self.number_boxes: list[LabelBox] = []
-        numbers: list[Annotation | None] = []
-        for index, place in enumerate(places):
-            if place is None:
-                numbers.append(None)
-                continue
-            self.number_boxes.append(place)
-            numbers.append(self._number(axes, index, place, scale))
-        return numbers
+        self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
+        return [
+            None if place is None else self._number(axes, index, place, scale) for index, place in enumerate(places)
+        ]
 
     def _number(self, axes: Axes, index: int, place: LabelBox, scale: float) -> Annotation:
         """Write the number of a fixation into a rectangle; a line joins it to its dot if it is not written on it."""
