@@ -41,7 +41,7 @@ class VerificationFit(PartFit):
             return self.left_out("not fitted, since the agent does not use the model of searches")
         photographs = self._photographs()
         config = self._settings_for(len(photographs), model)
-        prior = Verification.from_pretrained(_SHIPPED)
+        prior = Verification.from_pretrained(_SHIPPED).requires_grad_(False)
         fitted = fit_in_folds(photographs, model, config, prior, SUREST_OF_FEW)
         verification = fitted.model
         verification.metadata = {**self.run.eye.settings(), **training_of(config, self.run.scenes)}
