@@ -26,15 +26,12 @@ class TrackingModel:
     Objects that are hard to see are missed again and again, so that w is less than 1. What a look as close has shown is
     seen again with the probability :math:`\rho q`, where q is that of what was shown, and a miss counts in full.
 
-    The box of a faint detection fits less well: the variances of its place and size are those of a sure one, times
-    :math:`\max(1, (1 - c) / c)`. So faint looks do not spoil the box of a sure one.
-
     Attributes:
         speed: standard deviation of each coordinate of an object's velocity, in sides a second.
         acceleration: density of the noise of the velocity, in square sides a second cubed.
-        place: standard deviation of each coordinate of a place that a sure detection shows, in sides.
+        place: standard deviation of each coordinate of a place at which a look shows an object, in sides.
         pixel: the same of the finest place that a detector tells, in pixels of its canvas.
-        size: standard deviation of the logarithm of the width and height of the box of a sure detection.
+        size: standard deviation of the logarithm of the width and height of a box.
         entering: the same after a look at an object that the border of the frame cuts, so that the next look decides.
         growth: variance by which the logarithm of the size changes in a second.
         gate: largest squared distance of a detection from its object, in standard deviations.
@@ -97,40 +94,3 @@ class TrackingModel:
         """
         clipped = scores.clip(_LEAST_SCORE, _MOST_SCORE)
         return self.offset + self.score * np.log(clipped / (1 - clipped))
-
-    def place_variance(self, sides: Floats, scores: Floats, magnification: float) -> Floats:
-        """Compute the variance of each coordinate of the places of detections.
-
-        Args:
-            sides: `(M,)`, roots of the areas of their boxes, in pixels of the frame.
-            scores: `(M,)`, from 0 to 1.
-            magnification: canvas pixels for a pixel of the frame.
-
-        Returns:
-            `(M,)`, in square pixels of the frame.
-
-        >>> model = TrackingModel(place=0.1, pixel=0)
-        >>> model.place_variance(np.full(2, 10.0), np.array([0.9, 0.2]), 1.0).round(2).tolist()
-        [1.0, 4.0]
-        """
-        return (self.place * sides) ** 2 * _faintness(scores) + (self.pixel / magnification) ** 2
-
-    def size_variance(self, scores: Floats) -> Floats:
-        """Compute the variance of the logarithm of the width and height of detections.
-
-        Args:
-            scores: `(M,)`, from 0 to 1.
-
-        Returns:
-            `(M,)`.
-
-        >>> TrackingModel(size=0.2).size_variance(np.array([0.9, 0.2])).round(2).tolist()
-        [0.04, 0.16]
-        """
-        return self.size**2 * _faintness(scores)
-
-
-def _faintness(scores: Floats) -> Floats:
-    """How many times as large the variance of a box is as that of a sure one, `(M,)`: odds against it, or 1."""
-    clipped = scores.clip(_LEAST_SCORE, 0.5)
-    return (1 - clipped) / clipped

@@ -165,7 +165,7 @@ class Tracker:
     def _noise(self, seen: Seen) -> Floats:
         """Variance of the places of detections, `(M,)`, in square pixels."""
         sides = np.exp(_log_size(seen.boxes).mean(-1))
-        return self.model.place_variance(sides, seen.scores, seen.magnification)
+        return (self.model.place * sides) ** 2 + (self.model.pixel / seen.magnification) ** 2
 
     def _least_size_variance(self, seen: Seen) -> Floats:
         """Least variance of the logarithm of an object's size after each detection, `(M,)`."""
@@ -180,7 +180,7 @@ class Tracker:
         area = np.exp(log_size.sum(-1))
         variance = tracks.kinematics.variance[:, None] + noise
         distance = _squared_distance(tracks.kinematics.place, _centres(seen.boxes)) / variance
-        size_variance = tracks.size_variance[:, None] + model.size_variance(seen.scores)
+        size_variance = tracks.size_variance[:, None] + model.size**2
         size_distance = _squared_distance(tracks.log_size, log_size) / size_variance
         by_place = -distance / 2 - np.log(2 * np.pi * variance / area)
         by_size = -size_distance / 2 - np.log(size_variance / _SIZE_SPREAD**2)
@@ -205,9 +205,8 @@ class Tracker:
         rows, columns = pairs.T
         tracks = self.tracks[rows]
         log_size = _log_size(seen.boxes[columns])
-        scores = seen.scores[columns]
-        gain = tracks.size_variance / (tracks.size_variance + self.model.size_variance(scores))
-        evidence = self.model.evidence(scores)
+        gain = tracks.size_variance / (tracks.size_variance + self.model.size**2)
+        evidence = self.model.evidence(seen.scores[columns])
         updated = replace(
             tracks,
             kinematics=tracks.kinematics.measured(_centres(seen.boxes[columns]), noise[columns]),
@@ -226,7 +225,6 @@ class Tracker:
         if not is_new.any():
             return
         boxes = seen.boxes[is_new]
-        scores = seen.scores[is_new]
         log_size = _log_size(boxes)
         count = len(boxes)
         speed = self.model.speed * np.exp(log_size.mean(-1))
@@ -236,8 +234,8 @@ class Tracker:
             kinematics=Kinematics.at(_centres(boxes), noise[is_new], speed),
             speed=speed,
             log_size=log_size,
-            size_variance=np.maximum(self.model.size_variance(scores), self._least_size_variance(seen)[is_new]),
-            shown_odds=self.model.evidence(scores),
+            size_variance=np.maximum(self.model.size**2, self._least_size_variance(seen)[is_new]),
+            shown_odds=self.model.evidence(seen.scores[is_new]),
             missed_odds=np.zeros(count),
             unseen=np.zeros(count),
             magnification=np.full(count, seen.magnification),

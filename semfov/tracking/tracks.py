@@ -15,7 +15,6 @@ from semfov.tracking.kalman import Floats, Kinematics
 
 TRAIL = 32  # frames
 _STANDING = 0.2  # share of the objects that stand still
-_NO_WAY = 1e-9  # square pixels: less is no way
 
 _Index = NDArray[np.intp] | NDArray[np.bool_] | slice
 
@@ -143,19 +142,17 @@ class Tracks:
 
     @property
     def fits(self) -> Floats:
-        r"""Probabilities that their boxes fit them as they did in the last look that showed them, `(N,)`.
+        r"""Probabilities that their boxes fit them, `(N,)`.
 
         It is one for an object that stands still, and for one that moves
 
         .. math:: 1 - \exp\bigl(-r^2 / 2 \sigma^2\bigr), \qquad r = \min(w, h) / 3
 
-        with the variance :math:`\sigma^2` of each coordinate of its way since that look, and the sides w and h of the
-        box: one that is off by a third of a side overlaps its object by one half. How well the box fitted in that look
-        is part of the evidence that it shows an object (`TrackingModel.evidence`).
+        with the variance :math:`\sigma^2` of each coordinate of the place, and the sides w and h of the box: one that
+        is off by a third of a side overlaps its object by one half.
         """
         radius = np.exp(self.log_size.min(-1)) / 3
-        variance = self.unseen**2 * self.kinematics.covariance[:, 1, 1]
-        of_moving = -np.expm1(-(radius**2) / (2 * variance.clip(min=_NO_WAY)))
+        of_moving = -np.expm1(-(radius**2) / (2 * self.kinematics.variance))
         return self.standing + (1 - self.standing) * of_moving
 
     @property

@@ -85,46 +85,6 @@ def test_an_object_that_stands_still_does_not_drift_by_the_noise_of_its_places()
     torch.testing.assert_close(tracker.tracks.boxes, seen)
 
 
-@pytest.mark.parametrize(("first", "second"), [(0.9, 0.1), (0.1, 0.9), (0.2, 0.3), (0.6, 0.9)])
-def test_a_box_is_the_mean_of_its_detections_where_faint_ones_weigh_less(first, second):
-    """By its definition: what two looks show at once, each weighted by c / (1 - c) below a score of one half."""
-    tracker = Tracker(TrackingModel(pixel=0.0))
-    tracker.see(look(box_at(100, 100), score=first))
-    tracker.see(look(box_at(104, 100, wide=44), score=second))
-    assert len(tracker.tracks) == 1
-    weights = [min(score / (1 - score), 1) for score in (first, second)]
-    width = np.exp(np.average(np.log([40, 44]), weights=weights))
-    # A place is told in sides of its own box, so that the variance of the wider box is larger by the ratio of areas.
-    centre = np.average([120, 126], weights=np.divide(weights, [40 * 60, 44 * 60]))
-    x1, y1, x2, y2 = tracker.tracks.corners[0]
-    assert x2 - x1 == pytest.approx(width)
-    assert (x1 + x2) / 2 == pytest.approx(centre)
-    assert (y1, y2) == pytest.approx((100, 160))
-
-
-def test_faint_looks_do_not_spoil_the_box_of_a_sure_one():
-    tracker = Tracker()
-    tracker.see(look(box_at(100, 100), score=0.9))
-    for _ in range(2):
-        tracker.see(look(box_at(106, 92, wide=52, high=76), score=0.1, magnification=0.5))
-    assert tracker.tracks.corners[0].tolist() == pytest.approx(box_at(100, 100), abs=3)
-
-
-@pytest.mark.parametrize("score", [0.1, 0.9])
-def test_a_box_fits_until_its_object_may_have_moved(score):
-    """By drawing velocities: the box fits an object that is less than a third of its shorter side away."""
-    model = TrackingModel(acceleration=0.0, loss=0.0)
-    tracker = Tracker(model)
-    tracker.see(look(box_at(100, 100), score=score))
-    assert tracker.tracks.fits.tolist() == [1.0]
-    assert tracker.tracks.probability[0] == pytest.approx(tracker.tracks.existence[0])
-    tracker.follow(0.2)
-    velocity = model.speed * np.sqrt(40 * 60) * np.random.default_rng(0).normal(size=(20_000, 2))
-    is_near = np.linalg.norm(0.2 * velocity, axis=-1) < 40 / 3
-    (standing,) = tracker.tracks.standing
-    assert tracker.tracks.fits[0] == pytest.approx(standing + (1 - standing) * is_near.mean(), abs=0.01)
-
-
 def test_a_probability_falls_with_time_by_the_share_that_is_lost():
     tracker = Tracker()
     tracker.see(look(box_at(100, 100)))
