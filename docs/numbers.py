@@ -29,7 +29,7 @@ from examples.look_graph import OPSET
 from semfov import FovealObservationModel
 from semfov.agents.fovea import RATE as FOVEA_RATE
 from semfov.agents.head import _CONFIRM
-from semfov.agents.window_episode import LIKELY, LISTED
+from semfov.agents.window_episode import LIKELY
 from semfov.agents.windows import RATE as WINDOW_RATE
 from semfov.belief import Verification
 from semfov.data.inputs import FRAME
@@ -82,7 +82,6 @@ CODE: dict[str, float] = {
     "score threshold of objects": SCORE_THRESHOLD,
     "faintest": FAINTEST,
     "likely": LIKELY,
-    "listed": LISTED,
     "candidates of photographs": PhotographPlaces.least,
     "window of photographs": USUAL_WINDOW[0],
     "border of photographs": _PHOTOGRAPH_BORDER,

@@ -257,7 +257,7 @@ class StreamSettings(DecisionSettings, StartSettings):
             for windows of small frames, as many as there are frames for those of large ones); 0: none.
         prior: how often the target is there: the share of the frames that hold it (None: one half); `fit` takes that of
             the searches that the models were fitted to.
-        score_threshold: probability from which on an object is listed in windows (None: 0.2, or 0.5 with rate 0); a
+        score_threshold: probability from which on an object is listed in windows (None: 0.5); a
             curve of precision over recall takes a lower one.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 

@@ -16,7 +16,7 @@ from eval.stream.identity import IdentityCounts
 from eval.stream.run import FILM, StreamConfig, StreamOutcome, StreamRun
 from eval.stream.ways import CANDIDATES
 from eval.zoom.objects import average_precision
-from semfov.agents.window_episode import LIKELY, LISTED
+from semfov.agents.window_episode import LIKELY
 from semfov.errors import check_data
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import plus_minus, table
@@ -86,8 +86,8 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         "",
         *table(precisions),
         "",
-        f"Precision / recall of the objects that are listed: of the agent from probability {LISTED} on, of others from "
-        f"score {LIKELY}.",
+        f"Precision / recall of the objects that are listed: of the agent from probability {LIKELY} on, of others from "
+        "this score.",
         "",
         *table(listed),
         "",

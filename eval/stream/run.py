@@ -14,6 +14,7 @@ from eval.stream.flights import COURSES, CourseName, Frame, film, flight, mot_fi
 from eval.stream.identity import Identities, IdentityCounts
 from eval.stream.plain import PlainRule
 from eval.stream.ways import AllSlices, Live, Oracle, RoundRobin, TrackedSlices, Way, WholeFrame
+from semfov.agents.window_episode import LIKELY
 from semfov.agents.windows import ZoomAgent
 from semfov.data.classes import class_index
 from semfov.data.scene import Annotation
@@ -184,7 +185,7 @@ class StreamRun:
                     passes[row] = way.passes
                     if judged:
                         where = {"course": course, "stream": name, "frame": number, "way": row}
-                        records.append({**where, **judged_objects(objects, frame, self.target, way.listed_from)})
+                        records.append({**where, **judged_objects(objects, frame, self.target)})
         costs = {row: Cost(passes[row], 1000 * seconds[row] / steps[row]) for row in passes}
         counts = {row: each.counts() for row, each in identities.items()}
         return StreamOutcome(course, records, costs, drift, counts)
@@ -201,17 +202,17 @@ def compare_identities(identities: Identities, objects: Objects, frame: Frame, t
     identities.step(frame.identities[mine], annotation.boxes[mine], objects.track_ids, boxes, moving)
 
 
-def judged_objects(objects: Objects, frame: Frame, target: int, listed_from: float) -> ResultRecord:
+def judged_objects(objects: Objects, frame: Frame, target: int) -> ResultRecord:
     """Compare objects with the annotated ones of a class, both cut at the borders of the frame; crowds are left out.
 
-    Those with a score from `listed_from` on are listed.
+    Those with a score of one half or more are listed, as the agent lists objects.
     """
     annotation = frame.annotation
     mine = annotation.labels == target
     truth = Annotation(annotation.boxes[mine], annotation.labels[mine], annotation.crowd[mine], annotation.size)
     right = right_boxes(replace(objects, boxes=within(objects.boxes, annotation.size)), truth)
     counts = right >= 0
-    listed = counts & (objects.scores >= listed_from)
+    listed = counts & (objects.scores >= LIKELY)
     return {
         "objects": int((~truth.crowd).sum()),
         "scores": objects.scores[counts].tolist(),

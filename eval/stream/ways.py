@@ -11,7 +11,7 @@ from torch import Tensor
 from eval.stream.bytetrack import ByteTrack
 from eval.stream.flights import Frame
 from eval.zoom.objects import suppressed
-from semfov.agents.window_episode import LIKELY, LISTED, WindowStream
+from semfov.agents.window_episode import LIKELY, WindowStream
 from semfov.agents.window_objects import seen_by
 from semfov.data.inputs import FRAME
 from semfov.detection.objects import Objects
@@ -32,13 +32,11 @@ _FADING = 24.0  # frames after which an oracle looks at a place again
 class Way(ABC):
     """Base of ways of looking at the frames of a stream for objects of a class; `passes` of the detector a frame.
 
-    `remembers` says whether what a frame shows counts later, so that all frames must be looked at. Objects are listed
-    from the score `listed_from` on.
+    `remembers` says whether what a frame shows counts later, so that all frames must be looked at.
     """
 
     remembers = True
     passes = 1
-    listed_from = LIKELY
 
     def __init__(self, eye: WindowEye, target: int) -> None:
         self.eye, self.target = eye, target
@@ -121,8 +119,6 @@ class RoundRobin(Way):
 class Live(Way):
     """The agent, for all objects of the class: those that it lists, and all candidates."""
 
-    listed_from = LISTED
-
     def __init__(self, eye: WindowEye, target: int, episode: WindowStream, *, poses: bool = False) -> None:
         super().__init__(eye, target)
         self.episode, self.poses = episode, poses
@@ -146,8 +142,6 @@ class Oracle(Way):
     that the detector misses is looked at again, too.
     """
 
-    listed_from = LISTED
-
     def __init__(self, eye: WindowEye, target: int) -> None:
         super().__init__(eye, target)
         self.camera = CameraMotion()
@@ -169,7 +163,7 @@ class Oracle(Way):
         self.number += 1
         objects = self.tracker.tracks.objects()
         objects = objects[inside_frame(objects.boxes, lattice.size)]
-        return {"oracle": objects[objects.scores >= LISTED], "oracle, all candidates": replace(objects, track_ids=None)}
+        return {"oracle": objects[objects.scores >= LIKELY], "oracle, all candidates": replace(objects, track_ids=None)}
 
     def _best_window(self, frame: Frame, lattice: Lattice) -> Window:
         """Choose the window of any level that is worth most."""

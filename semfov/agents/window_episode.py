@@ -51,7 +51,6 @@ from semfov.zoom.window_sums import Cells
 
 PASSES = 24  # default for the largest number of passes of the detector
 LIKELY = 0.5  # default for the least probability of the objects that a record counts
-LISTED = 0.2  # the same in a stream: F1 is highest there, and more is found of what moves
 NEW_OBJECTS = 0.01  # default for the least number of new objects that a look must be expected to find
 
 
@@ -283,7 +282,7 @@ class WindowSession:
             return self.task.score_threshold
         if self._certainty is None:
             return SCORE_THRESHOLD
-        return LIKELY if self.tracker is None else LISTED
+        return LIKELY
 
     def _merged(self, looks: Sequence[LookAtWindow]) -> MergedLooks:
         """Make what merges the objects of looks when they are asked for; what changes is computed now."""

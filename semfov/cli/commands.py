@@ -200,7 +200,7 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   VIDEO, FOLDER, URL   a video file, a folder of frames, or an address such as rtsp://… that OpenCV can open
   --camera N           number of a camera; Ctrl-C ends it
   --target CLASS       class to search for (default: explore)
-  --find CLASSES       classes, with commas, of which all objects are to be found (default: from probability 0.2 on)
+  --find CLASSES       classes, with commas, of which all objects are to be found
   --how KIND           auto (default: windows of any frame), fovea, or windows
   --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
   --rate R             rate at which evidence fades, per second (0: never; default: 2.5 for a fovea, 0.75 for windows)

@@ -166,7 +166,7 @@ def test_objects_of_a_frame_are_judged_as_by_hand():
     annotation = Annotation(boxes, torch.tensor([1, 1, 1]), torch.tensor([False, False, True]), (100, 100))
     found = torch.tensor([[-5.0, -5, 10, 10], [50, 50, 70, 75], [20, 20, 30, 30], [81, 81, 90, 90]])
     objects = Objects(found, torch.tensor([0.9, 0.4, 0.6, 0.8]), torch.ones(4).long(), torch.zeros(4).long())
-    record = judged_objects(objects, Frame(np.zeros((100, 100, 3), np.uint8), annotation), 1, listed_from=0.5)
+    record = judged_objects(objects, Frame(np.zeros((100, 100, 3), np.uint8), annotation), 1)
     assert record["right"] == [True, True, False]
     assert (record["objects"], record["listed"], record["listed right"]) == (2, 2, 1)
     assert listed_cell([record]) == "0.50 / 0.50"
