@@ -211,9 +211,8 @@ class Motion:
 
 def _values(tensor: Tensor) -> NDArray[np.float64]:
     """View numbers as an array: maps are so few numbers that PyTorch spends four times as long in calls."""
-    if tensor.dtype in _OF_NUMPY:
-        return np.asarray(tensor.numpy(force=True), np.float64)
-    return np.asarray(tensor.detach().cpu().double().numpy())
+    values = tensor.detach().cpu()
+    return np.asarray((values if values.dtype in _OF_NUMPY else values.double()).numpy(), np.float64)
 
 
 def _local_scales(determinants: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:

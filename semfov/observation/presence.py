@@ -156,8 +156,10 @@ class Presence(DecidingModule):
         numbers = self.place if covers else self.centre
         if numbers is None:
             return probability
-        offset, slope = numbers.to(probability)
-        return (offset + slope * log_odds_of_cells(probability)).sigmoid()
+        # In float64, so that what is rounded does not depend on the other episodes of a batch.
+        offset, slope = numbers.double()
+        log_odds = offset + slope * log_odds_of_cells(probability.double())
+        return log_odds.sigmoid().to(probability)
 
 
 def presence_of(tensors: dict[str, Tensor], thresholds: Thresholds | None) -> Presence | None:

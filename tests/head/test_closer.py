@@ -216,7 +216,9 @@ def test_a_small_object_is_looked_at_closely_and_the_record_is_stored(agent, spe
         with pytest.raises(InputError, match=r"look: expected .*, got 9"):
             method(9)
     assert torch.equal(loaded.objects.boxes, path.objects.boxes)
-    assert len(path.objects) == 1  # the closer look shows the object that the first one did
+    # The closer look shows the object that the first one did; a search that leaves it open lists none.
+    assert len(path.candidates) == 1
+    assert len(path.objects) == int(not search)
 
 
 @pytest.mark.usefixtures("closely")

@@ -371,7 +371,7 @@ def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
         last = record.belief_map(number - count)
         assert first is last is None or torch.equal(first[1], last[1])
     for number in (count, -count - 1, 0.5, None):
-        with pytest.raises(SemfovError, match=f"^number: expected a whole number from -{count} to {count - 1}, got"):
+        with pytest.raises(SemfovError, match=f"^index: expected a whole number from -{count} to {count - 1}, got"):
             record.belief_map(number)
 
 
