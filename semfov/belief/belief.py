@@ -228,9 +228,10 @@ def pick(values: Tensor, target: int | Tensor) -> Tensor:
     """
     components = values.shape[-1]
     expected = f"a class index from 0 to {components - 1}"
-    if not isinstance(target, Tensor):
+    if isinstance(target, int):
         check(0 <= target < components, "target", expected, target)
         return values[..., target]
+    target = torch.as_tensor(target)  # of a list or an array
     if values_known(target):
         inside = bool(((target >= 0) & (target < components)).all())
         check(inside, "target", expected, target.tolist())

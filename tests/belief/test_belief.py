@@ -1,5 +1,6 @@
 """Beliefs of every kind of observer: batches, indexing, mapping and fading, and looks that are joined."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -259,6 +260,14 @@ def test_a_belief_about_any_of_classes_has_no_other_classes():
 def test_a_class_index_out_of_range_is_refused(target):
     with pytest.raises(InputError, match="target: expected a class index from 0 to 4"):
         DirichletBelief(rand(2, 12, 5)).probability(torch.tensor(target))
+
+
+@pytest.mark.parametrize("form", [list, np.array, np.int64])
+def test_targets_may_be_lists_and_arrays(form):
+    belief = DirichletBelief(rand(2, 3, 4))
+    targets = 2 if form is np.int64 else [3, 1]
+    expected = belief.probability(targets if form is np.int64 else torch.tensor(targets))
+    assert torch.equal(belief.probability(form(targets)), expected)
 
 
 def test_put_replaces_the_beliefs_of_the_given_episodes():
