@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ COUNTED = (1, 3, 5, 8, 12)
 """Numbers of looks after which a belief counts in the fits of searches."""
 
 _RIDGE = 1e-3
+_LEAST_SLOPE = 0.1  # of the log odds of cells; those of shipped models are near 0.9
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def _fit_cells(searches: BeliefsOfSearches, of_class: Tensor) -> Tensor:
         of_class: `(E,)`, log odds that a search for the class has its target in the photograph.
 
     Returns:
-        Offset and slope of the log odds, `(2,)`.
+        Offset and slope of the log odds, `(2,)`; the slope is at least `_LEAST_SLOPE`.
     """
     counted = torch.tensor(searches.counted) - 1
     each = torch.full_like(searches.place[counted].double(), 1 / len(counted))  # all looks of a search are one case
@@ -125,15 +127,14 @@ def _fit_cells(searches: BeliefsOfSearches, of_class: Tensor) -> Tensor:
     answers = torch.stack([searches.holds[counted], searches.hits[counted]])
     # The chance of a hit is that of a search that goes on.
     times = torch.stack([each, each * ~searches.on_target[counted]])
-    return torch.tensor(
-        logistic_regression(
-            log_odds.flatten()[:, None],
-            answers.flatten(),
-            times=times.flatten(),
-            known=of_class.expand_as(log_odds).flatten(),
-            ridge=_RIDGE,
-        )
-    )
+    known = of_class.expand_as(log_odds).flatten()
+    regression = partial(logistic_regression, right=answers.flatten(), times=times.flatten(), ridge=_RIDGE)
+    offset, slope = regression(log_odds.flatten()[:, None], known=known)
+    if slope < _LEAST_SLOPE:
+        # A surer cell must not be less probable, nor all of them alike: few searches may say so by chance.
+        slope = _LEAST_SLOPE
+        (offset,) = regression(log_odds.new_zeros(len(known), 0), known=known + slope * log_odds.flatten())
+    return torch.tensor([offset, slope])
 
 
 @torch.no_grad()
@@ -149,9 +150,9 @@ def thresholds_of_searches(presence: Presence, searches: BeliefsOfSearches, boun
         The thresholds.
     """
     probability = presence(searches.facts.movedim(0, -1)).sigmoid()
-    cells = presence.of_cells(torch.stack([searches.place, searches.facts[0].sigmoid()], -1), covers=False)
+    cells = presence.of_cells(torch.stack([searches.place, searches.facts[0].sigmoid()], -1), "box_centre")
     place = cells[..., 0] * place_known(cells, torch.tensor([True, False]))
-    hit_chance = presence.of_cells(searches.hit_chance, covers=False)
+    hit_chance = presence.of_cells(searches.hit_chance, "box_centre")
     return choose_thresholds(bounds, probability, place, hit_chance, searches.there)
 
 

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from semfov.errors import InputError
 
-_KEY = "_extra_state"
+EXTRA_STATE = "_extra_state"
+"""Name of the settings of a module in its state."""
 
 
 class StatedModule(nn.Module):
@@ -63,7 +64,7 @@ class StatedModule(nn.Module):
         error_msgs: list[str],
     ) -> None:
         """Load after a look at the settings, which may be missing."""
-        key = prefix + _KEY
+        key = prefix + EXTRA_STATE
         # Before the tensors, so that the message names the setting and not the shapes that follow from it.
         if key in state_dict:
             self.set_extra_state(state_dict[key])
@@ -85,4 +86,4 @@ def without_settings(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Returns:
         The state without the settings of modules.
     """
-    return {name: tensor for name, tensor in state.items() if name.rpartition(".")[2] != _KEY}
+    return {name: tensor for name, tensor in state.items() if name.rpartition(".")[2] != EXTRA_STATE}

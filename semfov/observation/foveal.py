@@ -387,6 +387,11 @@ class FovealObservationModel(Pretrained):
         self.metadata |= {**record, "expected": expected, **metadata}
         return self
 
+    @property
+    def true_cells(self) -> bool:
+        """Whether searches read probabilities of cells that a fit has made true (`Presence.of_cells`)."""
+        return self.presence is not None and self.presence.centre is not None
+
     def check_compatible(
         self,
         settings: compatibility.Settings | None = None,

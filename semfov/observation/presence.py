@@ -1,10 +1,13 @@
 """Whether a picture holds a class, from the belief about its cells."""
 
+import warnings
+
 import torch
 from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_tensor
 from semfov.io.schema import Field
+from semfov.io.state import EXTRA_STATE
 from semfov.observation.thresholds import DecidingModule, Thresholds
 
 SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
@@ -132,6 +135,22 @@ class Presence(DecidingModule):
         """
         return self.offset.to(facts) + facts @ self.weight.to(facts)
 
+    def _complete_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Lose the two numbers that a state lacks, or keep them where it has no thresholds either.
+
+        Both go together: thresholds are of probabilities that these numbers made true, or of those of the belief.
+        """
+        name = f"{prefix}centre"
+        if self.centre is None or name in state or f"{prefix}offset" not in state:
+            return
+        if f"{prefix}{EXTRA_STATE}" in state:
+            self.centre = None
+            happens = "probabilities of cells are left as they are"
+        else:
+            state[name] = self.centre
+            happens = "that of the module stays"
+        warnings.warn(f"state_dict: it is of a presence without centre; {happens}", stacklevel=2)
+
     def detach(self) -> "Presence":
         """Copy the module with numbers that are constants, through which no gradient flows.
 
@@ -143,17 +162,18 @@ class Presence(DecidingModule):
         )
         return constant.requires_grad_(False)
 
-    def of_cells(self, probability: Tensor, *, covers: bool) -> Tensor:
+    def of_cells(self, probability: Tensor, footprint: str) -> Tensor:
         """Make the probabilities of cells true.
 
         Args:
             probability: `(...)`, of the class in each cell.
-            covers: whether all cells under a detection have its weight, or only that of its centre.
+            footprint: rule for the weight of a detection in each cell (`Grid.footprint`): `overlap` or `box_centre`;
+                the numbers of others are not known.
 
         Returns:
             `(...)`; as they are where the numbers are not known.
         """
-        numbers = self.place if covers else self.centre
+        numbers = {"overlap": self.place, "box_centre": self.centre}.get(footprint)
         if numbers is None:
             return probability
         # In float64, so that what is rounded does not depend on the other episodes of a batch.

@@ -210,6 +210,20 @@ def test_two_numbers_of_the_footprint_make_the_probabilities_of_cells_true(looks
     torch.testing.assert_close(after.logit(), offset + slope * before.logit(), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("footprint", ["centre", "soft"])
+def test_no_fit_knows_the_probabilities_of_cells_of_other_footprints(looks, footprint):
+    common = torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((3,), 0.5)
+    told = Presence(*common, place=torch.tensor([-0.5, 0.6]), centre=torch.tensor([1.5, 0.8]))
+    observers = [
+        SemanticSearch(model(presence=each).requires_grad_(False), footprint=footprint)
+        for each in (Presence(*common), told)
+    ]
+    plain, same = (watch(observer, looks) for observer in observers)
+    for name in ("probability", "chance"):
+        assert torch.equal(getattr(plain, name)(2), getattr(same, name)(2))
+    assert torch.equal(*(observer.unseen(looks.boxes) for observer in observers))
+
+
 def draw_search(generator, dtype=torch.float32):
     """Looks from all cells of a 5 × 4 grid at a cup; far from the fovea, cups are seen where there are none."""
     cup, cat = torch.randperm(20, generator=generator)[:2].tolist()

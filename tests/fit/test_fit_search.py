@@ -141,8 +141,8 @@ def test_the_presence_maximises_the_likelihood_given_the_shares_of_classes(looks
     assert not any(parameter.requires_grad for parameter in presence.parameters())
     # Thresholds are those of targets that are there in half of the pictures.
     odds = torch.from_numpy(best[0] + best[1] * peak + best[2] * score)
-    place, chance = (presence.of_cells(each, covers=False) for each in (searches.place, searches.hit_chance))
-    known = place >= 0.9 * presence.of_cells(searches.facts[0].sigmoid(), covers=False)
+    place, chance = (presence.of_cells(each, "box_centre") for each in (searches.place, searches.hit_chance))
+    known = place >= 0.9 * presence.of_cells(searches.facts[0].sigmoid(), "box_centre")
     expected = choose_thresholds(FitSearchConfig(), odds.sigmoid(), place * known, chance, searches.there)
     assert presence.thresholds == expected
 
@@ -170,6 +170,30 @@ def test_the_cells_that_decisions_read_are_made_true_given_the_shares_of_classes
 
     best = minimize(loss, np.zeros(2), tol=1e-12).x
     assert presence.centre.tolist() == pytest.approx(list(best), abs=1e-3)
+
+
+def test_a_surer_cell_stays_the_more_probable_one_whatever_few_searches_say():
+    """Where surer cells hold the target more rarely, the slope is the least one, and the offset its best."""
+    searches = beliefs(looks=1)
+    surer = searches.facts[0] > searches.facts[0].median()
+    searches = replace(searches, holds=~surer & searches.there, hits=~surer & searches.there)
+    presence = fit_presence(searches, SHARES, FitSearchConfig())
+    share = SHARES[searches.target - 1].double().logit().numpy()
+    peak, chance = searches.facts[0, 0].double().numpy(), searches.hit_chance[0].double().logit().numpy()
+    goes_on = ~searches.on_target[0].numpy()
+
+    def loss(offset, slope):
+        costs = [
+            np.logaddexp(0, np.where(answers, -1, 1) * (offset + slope * odds + share))
+            for odds, answers in ((peak, searches.holds[0].numpy()), (chance, searches.hits[0].numpy()))
+        ]
+        cost = costs[0].sum() + costs[1][goes_on].sum()
+        return cost + 0.5 * (np.logaddexp(0, offset) + np.logaddexp(0, -offset)) + 0.5e-6 * offset**2
+
+    free = minimize(lambda numbers: loss(*numbers) + 0.5e-3 * numbers[1] ** 2, np.zeros(2), tol=1e-12).x
+    assert free[1] < 0
+    best = minimize(lambda numbers: loss(numbers[0], 0.1), np.zeros(1), tol=1e-12).x
+    assert presence.centre.tolist() == pytest.approx([best[0], 0.1], abs=1e-3)
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -393,7 +417,7 @@ def test_the_probabilities_of_cells_are_fitted_to_what_the_cells_hold(run, model
     presence = Presence(torch.tensor(0.4), torch.tensor([0.8, 0.3]), SHARES, place=fit_places(model, run, CONFIG))
     ((facts, right),) = given
     # A fit with a free offset has the mean of its answers.
-    mean = presence.of_cells(facts[:, 0].sigmoid(), covers=True).mean().detach()
+    mean = presence.of_cells(facts[:, 0].sigmoid(), "overlap").mean().detach()
     assert float(mean) == pytest.approx(float(right.double().mean()), abs=2e-3)
     observer, cells = SemanticSearch(model, footprint="overlap"), len(run.grid(0))
     assert len(facts) % cells == 0

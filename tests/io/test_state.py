@@ -120,6 +120,33 @@ def test_a_state_of_an_earlier_version_leaves_what_it_lacks_as_it_is():
         target.load_state_dict(nothing)
 
 
+@pytest.mark.parametrize("has_thresholds", [True, False])
+def test_true_cells_go_with_the_thresholds_of_a_state(has_thresholds):
+    """A state without these two numbers, alone and in another module: its thresholds are of cells as they are."""
+    told, chosen = (
+        Presence(torch.tensor(1.0), torch.ones(2), torch.full((2,), 0.5), thresholds, centre=centre)
+        for thresholds, centre in (
+            (Thresholds(0.9, 0.039, 0.4), torch.tensor([2.0, 0.5])),
+            (Thresholds(0.8, 0.002, 0.05), None),
+        )
+    )
+    state = observation_model(presence=chosen).state_dict()
+    if not has_thresholds:  # nor had those of earlier versions
+        state = {name: value for name, value in state.items() if name != "presence._extra_state"}
+    said = "left as they are" if has_thresholds else "that of the module stays"
+    for prefix in ("", "0."):
+        model = observation_model(presence=told)
+        module = torch.nn.ModuleList([model]) if prefix else model
+        with pytest.warns(UserWarning, match=f"presence without centre; .*{said}"):
+            module.load_state_dict({prefix + name: value for name, value in state.items()})
+        if has_thresholds:
+            assert model.presence.centre is None
+            assert model.presence.thresholds == chosen.thresholds
+        else:
+            assert model.presence.centre.tolist() == [2.0, 0.5]
+            assert model.presence.thresholds == told.thresholds
+
+
 def test_a_part_that_the_module_lacks_is_refused():
     presence = Presence(torch.tensor(1.5), torch.ones(2), torch.full((2,), 0.5))
     rates = torch.full((3, 2), 0.1)

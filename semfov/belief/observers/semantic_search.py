@@ -56,7 +56,7 @@ class SearchBelief(DirichletBelief):
         visited: `(B, X·Y)` boolean, the fixated cells.
         log_score: `(B, K+1)`, sum over the looks of the logarithm of the highest score of each class.
         looks: `(B,)`, number of looks.
-        covers: whether all cells under a detection have its weight, or only that of its centre (`Presence.of_cells`).
+        footprint: rule for the weight of a detection in each cell (`Presence.of_cells`).
         calibration: by which it says whether the picture holds a class; None takes the most probable cell.
         prior: how often the target is there.
     """
@@ -65,7 +65,7 @@ class SearchBelief(DirichletBelief):
     visited: Tensor = None  # type: ignore[assignment]
     log_score: Tensor = None  # type: ignore[assignment]
     looks: Tensor = None  # type: ignore[assignment]
-    covers: bool = False
+    footprint: Footprint = "box_centre"
     calibration: Presence | None = None
     prior: Prior = field(default_factory=Prior)
 
@@ -81,7 +81,7 @@ class SearchBelief(DirichletBelief):
 
     def _true(self, probability: Tensor) -> Tensor:
         """Make the probabilities of cells true, where the fit knows how."""
-        return probability if self.calibration is None else self.calibration.of_cells(probability, covers=self.covers)
+        return probability if self.calibration is None else self.calibration.of_cells(probability, self.footprint)
 
     def presence(self, target: int | Tensor) -> Tensor:
         if self.calibration is None:
@@ -195,7 +195,7 @@ class SemanticSearch(Observer):
             visited=visited,
             log_score=beta.new_zeros(batch, self.components),
             looks=beta.new_zeros(batch),
-            covers=self.footprint == "overlap",
+            footprint=self.footprint,
             calibration=self.model.presence,
             prior=self.prior,
         )
@@ -231,7 +231,7 @@ class SemanticSearch(Observer):
         probability = odds / odds.sum()
         if self.model.presence is None:
             return probability
-        return self.model.presence.of_cells(probability, covers=self.footprint == "overlap")
+        return self.model.presence.of_cells(probability, self.footprint)
 
     def update(self, belief: Belief, look: Look) -> SearchBelief:
         """Fuse a look in each episode: given the looks alone, and for the next fixation."""
