@@ -59,10 +59,15 @@ def model_file_arguments(
     if isinstance(model, GlimpseEvidence):
         return {**arguments, "windows": model}
     if isinstance(model, Verification):
+        observer, _ = arguments["search"]
+        model.check_searching(observer.model)
         return {**arguments, "verification": model}
     if model.presence is None:  # it was not fitted to searches
         _, policy = arguments["explore"]
         return {**arguments, "explore": (SemanticMap(model), policy)}
+    verification = arguments["verification"]
+    if verification is not None:
+        verification.check_searching(model)
     return {**arguments, "search": (SemanticSearch(model), Policy("non-predictive"))}
 
 

@@ -174,7 +174,7 @@ def test_the_card_has_the_numbers_and_thresholds_of_true_cells():
     assert f"{offset:.2f} and {slope:.2f} (`presence.centre` in the file)" in card
     thresholds = model.presence.thresholds
     # The earlier thresholds were of the chain's own probabilities.
-    place, stop_below = model.presence.of_cells(torch.tensor([0.05, 0.002]), covers=False).tolist()
+    place, stop_below = model.presence.of_cells(torch.tensor([0.05, 0.002]), "box_centre").tolist()
     assert (thresholds.place, thresholds.stop_below) == pytest.approx((place, stop_below), abs=0.005)
     assert f"| {thresholds.place:.2f} | {thresholds.stop_below:.3f} |" in card
 
@@ -295,6 +295,32 @@ def test_the_file_of_one_model_takes_the_place_of_the_shipped_one(part, one_of_e
         assert parts[part].digest() == models[part].digest() != shipped[part].digest()
         for other in parts.keys() - {part}:
             assert parts[other].digest() == shipped[other].digest()
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_a_shipped_verification_was_fitted_to_the_cells_of_the_shipped_search(name):
+    """Those of NanoDet-Plus are as the belief has them."""
+    search = FovealObservationModel.from_pretrained(f"{name}-search")
+    assert search.true_cells == (name != "nanodet-plus-m-1.5x")
+    Verification.from_pretrained(name).check_searching(search)
+
+
+def test_the_file_of_a_model_of_other_probabilities_of_cells_is_refused(one_of_each, tmp_path):
+    """As earlier fits wrote them: a search without the numbers, a verification that does not name its cells."""
+    folder, _ = one_of_each
+    search = FovealObservationModel.from_pretrained(folder / "search.safetensors")
+    search.presence.centre = None
+    verification = Verification.from_pretrained(folder / "verification.safetensors")
+    del verification.metadata["true_cells"]
+    remedy = "fit again with python -m train.fit_search and python -m train.fit_verification"
+    for model, expected, got in (
+        (search, "probabilities of cells as the belief has them", "true probabilities of cells"),
+        (verification, "true probabilities of cells", "probabilities of cells as the belief has them"),
+    ):
+        model.save(tmp_path / "former.safetensors")
+        message = f"verification: expected one .* with {expected}, got one of {got}; {remedy}"
+        refused(message, ActivePerception.from_pretrained, tmp_path / "former.safetensors")
+    verification.check_searching(search)
 
 
 def _parts(agent):

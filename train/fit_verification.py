@@ -17,11 +17,13 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from semfov.errors import DataError
+from semfov.belief.verification import TRUE_CELLS
+from semfov.errors import DataError, InputError
 from semfov.fit.searches import open_photographs
 from semfov.fit.training import training_of
 from semfov.fit.verification import VerificationConfig, fit_in_folds
 from semfov.fit.verification_report import verification_report
+from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.scene_run import store_folder
@@ -49,6 +51,7 @@ def fit_verification(config: FitVerificationConfig) -> None:
     """Search the photographs, look closely at candidates, fit, evaluate in folds, and write all results."""
     eye = make_eye(config.detector, config.sensor)
     model = make_searching(config.search_model, eye)
+    _check_thresholds(config, model)
     scenes = make_scenes(config.data, eye.detector.classes)
     if len(scenes) < config.folds:
         raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(scenes)}")
@@ -57,11 +60,26 @@ def fit_verification(config: FitVerificationConfig) -> None:
     store = cell_store(folder, eye.settings(), config.columns, config.rows, components)
     photographs = open_photographs(eye, scenes, range(len(scenes)), config, store=store)
     fitted = fit_in_folds(photographs, model, config)
-    fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "search_model")}
+    fitted.model.metadata = {
+        **eye.settings(),
+        TRUE_CELLS: model.true_cells,
+        **training_of(config, scenes, "search_model"),
+    }
     path = model_path(config, eye.detector.name)
     fitted.model.save(path)
     report = verification_report(fitted, f"{len(photographs)} photographs")
     write_outputs(config, report.text, ("judged.json", json.dumps(report.figures, indent=2) + "\n"), path)
+
+
+def _check_thresholds(config: FitVerificationConfig, searching: FovealObservationModel) -> None:
+    """Refuse thresholds of true probabilities for a search without: those of the belief are smaller."""
+    usual = VerificationConfig()
+    if not searching.true_cells and (config.place == usual.place or config.stop_below == usual.stop_below):
+        raise InputError(
+            "place, stop_below: expected those of a model of searches whose probabilities of cells are not true "
+            f"(presence.centre), got {config.place:g}, {config.stop_below:g}; give --place 0.05 --stop_below 0.0005, "
+            "or a --search_model of python -m train.fit_search"
+        )
 
 
 main = command(fit_verification, FitVerificationConfig, __doc__)

@@ -8,13 +8,18 @@ import torch
 from torch import Tensor, nn
 
 from semfov.detection.detections import Detections
+from semfov.errors import InputError
 from semfov.io.pretrained import PretrainedForEye
 from semfov.io.schema import Field, Schema
+from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.observation.thresholds import THRESHOLDS, DecidingModule, Thresholds, thresholds_of, thresholds_record
 
 CLOSER_FEATURES = 7  # number of features of a closer look (`closer_features`)
 _MATCHED = 0.3  # least overlap (intersection over union) of a detection with a box at which it shows the same object
+
+TRUE_CELLS = "true_cells"
+"""Key of the metadata: whether the searches of the fit had true probabilities of cells."""
 
 _FLOOR = 1e-3
 
@@ -35,7 +40,8 @@ class Verification(DecidingModule, PretrainedForEye):
         thresholds: thresholds at which searches decide; None if none were chosen. `confirm` is the least probability
             that the target is at the examined place, for `found`. `place` is the least probability of a cell that is
             worth a closer look. `stop_below` has the same meaning as without closer looks.
-        metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was fitted for).
+        metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was fitted for), and
+            `true_cells` (`check_searching`).
 
     >>> model = Verification()  # not fitted yet
     >>> model(torch.zeros(2, 7)).shape
@@ -69,6 +75,23 @@ class Verification(DecidingModule, PretrainedForEye):
             `(..., 2)`, log odds that the target is at the place, and that the image holds it.
         """
         return self.linear(features)
+
+    def check_searching(self, searching: FovealObservationModel) -> None:
+        """Check that it was fitted to probabilities of cells such as those of a search.
+
+        Args:
+            searching: the observation model of the search.
+
+        Raises:
+            InputError: only one of both has probabilities that a fit has made true.
+        """
+        kinds = {True: "true probabilities of cells", False: "probabilities of cells as the belief has them"}
+        read = bool(self.metadata.get(TRUE_CELLS, False))  # files of earlier versions do not say so
+        if read != searching.true_cells:
+            raise InputError(
+                f"verification: expected one that was fitted to a search with {kinds[searching.true_cells]}, got one "
+                f"of {kinds[read]}; fit again with python -m train.fit_search and python -m train.fit_verification"
+            )
 
     def _record(self) -> dict[str, Any]:
         """List what a file holds beside tensors."""

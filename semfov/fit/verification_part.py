@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from semfov.belief.verification import Verification
+from semfov.belief.verification import TRUE_CELLS, Verification
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference
 from semfov.fit.part import PartFit, PartInputs, PartResult
@@ -44,7 +44,11 @@ class VerificationFit(PartFit):
         prior = Verification.from_pretrained(_SHIPPED).requires_grad_(False)
         fitted = fit_in_folds(photographs, model, config, prior, SUREST_OF_FEW)
         verification = fitted.model
-        verification.metadata = {**self.run.eye.settings(), **training_of(config, self.run.scenes)}
+        verification.metadata = {
+            **self.run.eye.settings(),
+            TRUE_CELLS: model.true_cells,
+            **training_of(config, self.run.scenes),
+        }
         gain, why = _compare(fitted)
         return PartResult(
             self.write("verification", verification, gain.better, why),

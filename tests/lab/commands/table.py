@@ -212,11 +212,14 @@ COMMANDS = {
     ),
     "train.fit_verification": Command(
         settings=(*NETWORK, *PHOTOGRAPHS, "--columns", "3", "--rows", "2", "--looks", "3", "--folds", "2",
-                  "--search_model", "HERE/search.safetensors"),
+                  "--search_model", "HERE/search.safetensors", "--place", "0.05", "--stop_below", "0.0005"),
         files=(MODEL, "judged.json", "report.md"),
         parts="cache/searches/*/*/*.safetensors",
         workers=False,
-        refused=((("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),),
+        refused=(
+            (("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),
+            (("--place", "0.4"), "give --place 0.05 --stop_below 0.0005"),
+        ),
     ),
     "eval.ivsn.fit": Command(workers=False),
     "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
