@@ -216,10 +216,7 @@ COMMANDS = {
         files=(MODEL, "judged.json", "report.md"),
         parts="cache/searches/*/*/*.safetensors",
         workers=False,
-        refused=(
-            (("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),
-            (("--place", "0.4"), "give --place 0.05 --stop_below 0.0005"),
-        ),
+        refused=((("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),),
     ),
     "eval.ivsn.fit": Command(workers=False),
     "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
