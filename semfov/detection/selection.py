@@ -140,11 +140,8 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
     Returns:
         Indices of the boxes that survive, most confident first.
     """
-    boxes = boxes.detach()
-    confidence = confidence.detach()
-    if boxes.dtype in HALVES:  # too coarse for pixels, and not there on a CPU
-        boxes = boxes.float()
-        confidence = confidence.float()
+    boxes = _in_single_precision(boxes.detach())
+    confidence = _in_single_precision(confidence.detach())
     if boxes.device.type == "cpu" and values_known(boxes, confidence, labels):
         return torch.from_numpy(remaining_rows(boxes.numpy(), confidence.numpy(), labels.numpy(), selection))
     from torchvision.ops import batched_nms, nms  # with it comes a compiler, which takes seconds to import
@@ -161,6 +158,11 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
     else:
         remaining = nms(boxes, ranked, selection.iou)
     return order[remaining[: selection.limit]]
+
+
+def _in_single_precision(numbers: Tensor) -> Tensor:
+    """Convert numbers of 16 bits, which are too coarse for pixels, and which NumPy lacks."""
+    return numbers.float() if numbers.dtype in HALVES else numbers
 
 
 def remaining_rows(

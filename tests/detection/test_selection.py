@@ -51,6 +51,8 @@ def test_half_precision_boxes_are_suppressed_in_single_precision(dtype, per_clas
     labels, selection = candidates.classes[0].argmax(-1), Selection(iou=0.02, per_class=per_class)
     keep = suppress(boxes, confidence, labels, selection)
     assert torch.equal(keep, suppress(boxes.float(), confidence.float(), labels, selection))
+    assert torch.equal(keep, suppress(boxes.float(), confidence, labels, selection))  # one of both is enough
+    assert torch.equal(keep, suppress(boxes, confidence.float(), labels, selection))
     assert 0 < len(keep) < 40
 
 
