@@ -77,9 +77,11 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
     """
     name = f"annotations {Path(path)}"
     expected = "an object with images, annotations and categories"
-    is_yolo = Path(path).suffix.lower() in (".txt", ".yaml", ".yml") or any(Path(path).glob("*.txt"))
-    check_data(not is_yolo, name, "a file in COCO's format, .json", _OF_YOLO)
-    data = read_json(path, name=name)
+    try:
+        data = read_json(path, name=name)
+    except DataError:
+        check_data(not _is_of_yolo(Path(path)), name, "a file in COCO's format, .json", _OF_YOLO)
+        raise
     is_of_label_studio = isinstance(data, list) and bool(data) and isinstance(data[0], dict) and "data" in data[0]
     check_data(not is_of_label_studio, name, expected, _OF_LABEL_STUDIO)
     check_data(isinstance(data, dict), name, expected, f"{excerpt(data)}; fetch the file again")
@@ -99,6 +101,12 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
         box = {"category_id": _plain_id(entry["category_id"]), "bbox": entry["bbox"], "iscrowd": crowd}
         objects[entry["image_id"]].append(box)
     return Annotations(images, categories, objects, sha256(path))
+
+
+def _is_of_yolo(path: Path) -> bool:
+    """Tell by its name whether what is no JSON is a file of YOLO, or the folder of its labels."""
+    is_named_so = path.suffix.lower() in (".txt", ".yaml", ".yml")
+    return (path.is_file() and is_named_so) or any(path.glob("*.txt"))
 
 
 def _images(data: Entry, name: str) -> dict[Id, Entry]:

@@ -153,6 +153,10 @@ def test_what_is_no_file_of_annotations_is_refused(tmp_path, make_coco):
         with pytest.raises(DataError, match=remedy):
             read_annotations(tmp_path / name)
     unusable("labels of YOLO", read_annotations, tmp_path)  # the folder of its labels
+    unusable(r"nosuch\.txt: no such file", read_annotations, tmp_path / "nosuch.txt")
+    whole = tmp_path / "a.txt"
+    whole.write_bytes(make_coco().read_bytes())
+    assert read_annotations(whole).images
     with pytest.raises(DataError, match=r"expected an object with images, annotations and categories, got \[\]"):
         read_annotations(make_coco(data=[]))
 
