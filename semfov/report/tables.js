@@ -8,6 +8,13 @@ function sort(head) {
   const order = (a, b) => text(a).localeCompare(text(b), "en", { numeric: true }) * (down ? -1 : 1);
   body.append(...[...body.rows].sort(order));
 }
+// A link of the overview to the address that the page already has changes no address, but is to lead there.
+document.addEventListener("click", (event) => {
+  const link = event.target.closest("#overview a");
+  if (link?.hash !== location.hash || event.ctrlKey || event.metaKey || event.shiftKey) return;
+  event.preventDefault();
+  window.dispatchEvent(new HashChangeEvent("hashchange"));
+});
 document.addEventListener("click", (event) => {
   const head = event.target.closest(".sort")?.parentElement;
   if (head) sort(head);
