@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _in_usual_order(words: Sequence[str]) -> Sequence[str]:
     """Write `semfov help NAME` as `semfov NAME --help`; without words it asks for help, too."""
-    if words[:1] == ["help"]:
+    if list(words[:1]) == ["help"]:
         words = [*words[1:2], "--help"]
     return words or ["--help"]
 

@@ -135,7 +135,7 @@ def test_wrong_use_is_refused_in_one_line_with_exit_code_2(command, tmp_path, ca
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("words", [[], ["--help"], ["help"]])
+@pytest.mark.parametrize("words", [[], ["--help"], ["help"], ("help",)])
 def test_alone_it_lists_its_commands(words, capsys):
     assert main(words) == 0
     printed = capsys.readouterr().out
