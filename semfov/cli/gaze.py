@@ -122,7 +122,8 @@ class _GazeJob:
         self.sources = picture_sources(options)
         self.several = len(self.sources) > 1
         if options.compare:
-            check(len(self.sources) == 2, "compare", "two pictures", len(self.sources))
+            remedy = "; without it the page of several pictures has the shares side by side"
+            check(len(self.sources) == 2, "compare", "two pictures", f"{len(self.sources)}{remedy}")
         self.outputs = _Outputs.of(options.out, several=self.several, compared=options.compare)
         check_apart(options.out, "out", [source.file for source in self.sources])
         self.areas = None if options.areas is None else boxes_of(options.areas)

@@ -270,6 +270,7 @@ def test_a_comparison_takes_two_pictures(run, photos):
         code, _, err = run(*pictures, "--compare")
         assert code == 1
         assert "compare: expected two pictures" in err
+        assert "without it the page of several pictures has the shares side by side" in err
 
 
 def test_a_detector_without_a_model_is_told(run, photos, monkeypatch):
