@@ -4,6 +4,7 @@ import re
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
+from operator import eq
 from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 from urllib.parse import unquote
@@ -25,7 +26,8 @@ class Truth:
         self.annotations = read_annotations(path)
         self._images: dict[str, list[Id]] = defaultdict(list)
         for image, entry in self.annotations.images.items():
-            self._images[_uploaded(_parts(entry["file_name"])[-1])].append(image)
+            for spelled in _spellings(_parts(entry["file_name"])[-1]):
+                self._images[spelled].append(image)
         self._warn_of_boxes()
 
     @property
@@ -53,7 +55,8 @@ class Truth:
         """Find the id of a picture by its name; of several of one name that whose folders agree best.
 
         Where no image is named as the picture is, names agree in any letter case, and as other systems and addresses
-        write them: `K%C3%BCche.JPG` for `Küche.jpg`. Last come the names that programs give to uploaded pictures.
+        write them: `K%C3%BCche.JPG` for `Küche.jpg`. Last come the names that programs give to uploaded pictures, on
+        one side alone.
 
         Args:
             name: path of the picture.
@@ -65,8 +68,8 @@ class Truth:
         Raises:
             DataError: no image, or several, have this name, or its size is another one.
         """
-        for spelled in (str, _plain, _uploaded):
-            images = self._named(name, spelled)
+        for agree in (eq, _agree_plainly, _agree_after_upload):
+            images = self._named(name, agree)
             if len(images) == 1:
                 break
         expected = f"one image with the file_name of {name}"
@@ -82,18 +85,19 @@ class Truth:
             )
         return image
 
-    def _named(self, name: str, spelled: Callable[[str], str]) -> list[Id]:
-        """List the images of a picture's name, those whose folders agree best, by the spelling of the parts of paths.
+    def _named(self, name: str, agree: Callable[[str, str], bool]) -> list[Id]:
+        """List the images of a picture's name, those whose folders agree best.
 
         Args:
             name: path of the picture.
-            spelled: writes a part of a path as it is compared.
+            agree: tells whether two parts of paths are the same.
         """
         parts = _parts(name)
         agreements = {}
-        for image in self._images.get(_uploaded(parts[-1]), ()):
-            image_parts = _parts(self.annotations.images[image]["file_name"])
-            agreements[image] = _common_end([*map(spelled, parts)], [*map(spelled, image_parts)])
+        for spelled in _spellings(parts[-1]):
+            for image in self._images.get(spelled, ()):
+                image_parts = _parts(self.annotations.images[image]["file_name"])
+                agreements[image] = _common_end(parts, image_parts, agree)
         best = max(agreements.values(), default=0)
         return [image for image, agreement in agreements.items() if agreement == best > 0]
 
@@ -155,11 +159,29 @@ def _uploaded(part: str) -> str:
     return re.sub(r"_(jpe?g|png|bmp|tiff?|webp)\.rf\.[0-9a-z]+\.[a-z]+$", r".\1", plain)
 
 
-def _common_end(parts: Sequence[str], others: Sequence[str]) -> int:
-    """Count the last parts that two paths have in common."""
+def _spellings(part: str) -> set[str]:
+    """Write a part of a path plainly, and without what programs add to it."""
+    return {_plain(part), _uploaded(part)}
+
+
+def _agree_plainly(part: str, other: str) -> bool:
+    """Tell whether two parts of paths are the same but for what differs between systems."""
+    return _plain(part) == _plain(other)
+
+
+def _agree_after_upload(part: str, other: str) -> bool:
+    """Tell whether a part of a path is another one, or what programs made of it.
+
+    Eight digits are also a date: `20240109-cam1.jpg` and `20240101-cam1.jpg` are two pictures.
+    """
+    return _plain(other) in _spellings(part) or _plain(part) in _spellings(other)
+
+
+def _common_end(parts: Sequence[str], others: Sequence[str], agree: Callable[[str, str], bool]) -> int:
+    """Count the last parts in which two paths agree."""
     count = 0
     for part, other in zip(reversed(parts), reversed(others), strict=False):
-        if part != other:
+        if not agree(part, other):
             break
         count += 1
     return count

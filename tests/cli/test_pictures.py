@@ -281,8 +281,16 @@ def test_pictures_have_the_names_that_programs_gave_to_what_was_uploaded(make_tr
     assert [truth.image_id(name) for name in ("photos/kitchen.jpg", "0b51f2a7-kitchen.jpg", "hall.jpg")] == [1, 1, 3]
     unusable("expected one image", truth.image_id, "1-hall.jpg")
     truth = make_truth("0b51f2a7-a.jpg", "00ff00ff-a.jpg", "a.jpg")
-    assert [truth.image_id(name) for name in ("a.jpg", "00ff00ff-a.jpg")] == [3, 2]
-    unusable("got 2 of 3", truth.image_id, "11111111-a.jpg")
+    assert [truth.image_id(name) for name in ("a.jpg", "00ff00ff-a.jpg", "11111111-a.jpg")] == [3, 2, 3]
+    truth = make_truth("0b51f2a7-a.jpg", "00ff00ff-a.jpg")
+    unusable("got 2 of 2", truth.image_id, "a.jpg")
+
+
+def test_dates_and_hashes_in_two_names_are_of_two_pictures(make_truth):
+    dates = make_truth("20240101-cam1.jpg", "0b51f2a7-20240105-cam1.jpg", "hall_jpg.rf.4a1cdeb7f3.jpg")
+    assert dates.image_id("20240105-cam1.jpg") == 2
+    for name in ("20240109-cam1.jpg", "hall_jpg.rf.00000000ab.jpg"):
+        unusable("got 0 of 3", dates.image_id, name)
 
 
 def test_an_exact_name_wins_and_no_two_pictures_take_one_image(run, photo, make_truth, tmp_path):
