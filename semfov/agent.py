@@ -213,7 +213,13 @@ class ActivePerception(nn.Module):
     @classmethod
     def _of(cls, make: Callable[..., dict[str, Any]], /, *arguments: object, **options: Any) -> Self:
         """Make an agent of the parts that a function gives from the options of a constructor, ready for use."""
-        names = [name for name in (*signature(make).parameters, *loader_options()) if name != "options"]
+        passed_on = [
+            parameter.name
+            for parameter in signature(make).parameters.values()
+            if parameter.kind not in (parameter.POSITIONAL_ONLY, parameter.VAR_KEYWORD)
+        ]
+        # The constructors have a `name` of their own.
+        names = [*passed_on, *(name for name in loader_options() if name not in ("name", "options"))]
         check_options(options, names, "the agent or of semfov.load_detector")
         return cls(**make(*arguments, **options)).eval().requires_grad_(False)
 

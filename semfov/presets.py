@@ -11,7 +11,7 @@ from semfov.belief.grid import check_cells
 from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.belief.verification import Verification
 from semfov.detection.load import DetectorLike, load_detector
-from semfov.errors import check, lookup
+from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.io.compatibility import searching_for, trained_for
@@ -25,12 +25,13 @@ PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.publi
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
 
 
-def recommended_arguments(name: str, grid: tuple[int, int], **options: Any) -> dict[str, Any]:
+def recommended_arguments(name: DetectorLike, /, grid: tuple[int, int], **options: Any) -> dict[str, Any]:
     """Make the arguments of the recommended agent, which searches and explores by learned observation models."""
     check_cells(grid)
     detector = load_detector(name, **options)
     eye = Eye(named_sensor("gradual"), detector)
-    fitted = shipped_model(FovealObservationModel, searching_for(detector.name), detector.name, name)
+    source = fspath(name) if isinstance(name, str | PathLike) else detector.name
+    fitted = shipped_model(FovealObservationModel, searching_for(detector.name), detector.name, source)
     return {
         "eye": eye,
         "search": (SemanticSearch(FovealObservationModel.from_pretrained(fitted)), Policy("non-predictive")),
@@ -46,16 +47,20 @@ def recommended_arguments(name: str, grid: tuple[int, int], **options: Any) -> d
 
 def model_file_arguments(
     path: str | PathLike[str],
+    /,
     *,
-    detector: str | PathLike[str] | None = None,
+    detector: DetectorLike | None = None,
     grid: tuple[int, int] = (10, 10),
     **options: Any,
 ) -> dict[str, Any]:
     """Make the arguments of the recommended agent with the model of a file in place of the shipped one of its kind."""
     model = open_model(path)
-    name = detector or model.metadata.get("detector", {}).get("name")
-    check(name is not None, "detector", "the detector that the model was fitted to, which its file does not name", None)
-    arguments = recommended_arguments(fspath(name), grid, **options)
+    if detector is None:
+        detector = model.metadata.get("detector", {}).get("name")
+    expected = "the detector that the model was fitted to, which its file does not name"
+    if detector is None:
+        raise InputError(f"detector: expected {expected}, got None")
+    arguments = recommended_arguments(detector, grid, **options)
     if isinstance(model, GlimpseEvidence):
         return {**arguments, "windows": model}
     if isinstance(model, Verification):
@@ -89,7 +94,7 @@ def published_model(detector: str, sensor: str, threshold: float) -> str:
 
 
 def published_arguments(
-    name: str | PathLike[str], sensor: str | None, search: str, calibrated: bool, **options: Any
+    name: str | PathLike[str], /, sensor: str | None, search: str, calibrated: bool, **options: Any
 ) -> dict[str, Any]:
     """Make the arguments of the published agent, by the name of a detector or from a folder of models."""
     lookup(search, ["predictive", "non-predictive"], "published search policy")
@@ -111,7 +116,7 @@ def published_arguments(
     return {"eye": eye, "search": (observer, policy), "explore": (observer, Policy("kl", model)), "grid": grid}
 
 
-def raw_arguments(name: DetectorLike, sensor: str, **options: Any) -> dict[str, Any]:
+def raw_arguments(name: DetectorLike, /, sensor: str, **options: Any) -> dict[str, Any]:
     """Make the arguments of the raw agent: raw scores as likelihoods, and random exploration."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)

@@ -11,8 +11,9 @@ import torch
 import semfov
 from semfov import ActivePerception, FovealObservationModel
 from semfov.belief import Verification
-from semfov.cli.agent import detector_classes, make_agent
+from semfov.cli.agent import detector_classes, make_agent, note_of_detector
 from semfov.cli.options import SearchOptions
+from semfov.errors import InputError
 from semfov.io.pretrained import shipped_model
 from semfov.observation.presence import presence_facts
 from semfov.observation.thresholds import Thresholds
@@ -348,7 +349,33 @@ def test_the_file_of_a_model_names_its_detector_and_what_else_it_may_be(one_of_e
     unusable("no such file", ActivePerception.from_pretrained, tmp_path / "missing.safetensors")
     detector = tmp_path / "mine.onnx"
     detector.touch()
-    unusable("or the .safetensors of one, got a file; .* --detector ", detector_classes, SearchOptions(models=detector))
+    given = rf"or the \.safetensors of one, got a file; a detector is given as detector='{detector}'$"
+    unusable(given, detector_classes, SearchOptions(models=detector))
+    beach = tmp_path / "beach.jpg"
+    beach.touch()
+    unusable(r"or the \.safetensors of one, got a file$", detector_classes, SearchOptions(models=beach))
+
+
+def test_the_file_of_a_model_goes_with_a_detector_that_is_loaded(one_of_each):
+    folder, models = one_of_each
+    file = folder / "search.safetensors"
+    detector = semfov.load_detector(models["search"].metadata["detector"]["name"])
+    assert ActivePerception.from_pretrained(file, detector=detector).eye.detector is detector
+    with pytest.raises(InputError, match=r"path: expected an option .* known: detector, grid") as caught:
+        ActivePerception.from_pretrained(file, path="x")
+    assert not re.search(r"known: .*\b(path|name)\b", str(caught.value))
+
+
+def test_checks_are_of_the_detector_that_the_file_of_a_model_names():
+    file = FovealObservationModel.shipped / "yolov3-tiny-search.safetensors"
+    options = SearchOptions(models=file, classes=("cup",))
+    refused("classes: expected none for yolov3-tiny, which has its own", detector_classes, options)
+    options = SearchOptions(models=file, weights=Path("a.onnx"))
+    refused("weights: expected Darknet weights for yolov3-tiny", detector_classes, options)
+    refused("head: expected none .* got yolov3-tiny", make_agent, SearchOptions(models=file, head="yolox"))
+    assert note_of_detector(SearchOptions(models=file)) == f"the detector is yolov3-tiny, to which {file} was fitted\n"
+    assert note_of_detector(SearchOptions(models=file, detector="yolov3")) == ""
+    assert note_of_detector(SearchOptions()) == ""
 
 
 @pytest.mark.parametrize("name", ["mine-search", "mine", "mine-published", "mine-published-0.1"])

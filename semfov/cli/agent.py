@@ -33,30 +33,42 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     names = detector_options(options).get("classes")
     if options.models is not None and not is_model_file(options.models):
         return Manifest.read(options.models).classes
-    classes = check_detector(_detector_of(options))
+    detector = _detector_of(options)
+    classes = check_detector(detector)
     if classes is not None and names is not None:
-        expected = f"none for {options.detector}, which has its own; `semfov find --target CLASS` looks for one of them"
+        expected = f"none for {detector}, which has its own; `semfov find --target CLASS` looks for one of them"
         raise InputError(f"classes: expected {expected}, got {', '.join(names)}")
-    _check_kind_of_weights(options)
+    _check_kind_of_weights(options.weights, detector)
     return names if classes is None else classes
 
 
-def _check_kind_of_weights(options: AgentOptions) -> None:
+def _check_kind_of_weights(weights: Path | None, detector: str) -> None:
     """Raise `InputError` for a file of ONNX as the weights of a registered detector that takes those of Darknet."""
-    weights = options.weights
-    registered = WEIGHTS.get(options.detector.lower())
+    registered = WEIGHTS.get(detector.lower())
     if registered is None or weights is None or weights.suffix != ".onnx":
         return
-    expected = f"Darknet weights for {options.detector}; an ONNX file is a detector of its own, --detector FILE"
+    expected = f"Darknet weights for {detector}; an ONNX file is a detector of its own, --detector FILE"
     check(registered.file.endswith(".onnx"), "weights", expected, weights)
 
 
 def _detector_of(options: AgentOptions) -> str:
     """Name the detector: the one that is given, or else the one that the file of a model was fitted to."""
     is_given = options.detector != AgentOptions.detector
-    if is_given or options.models is None:
+    if is_given or options.models is None or not is_model_file(options.models):
         return options.detector
     return str(open_model(options.models).metadata.get("detector", {}).get("name", options.detector))
+
+
+def note_of_detector(options: AgentOptions) -> str:
+    """Say which detector the file of a model names in place of the default; empty where it names that one.
+
+    Options do not tell whether the default detector was asked for by its name.
+
+    Args:
+        options: the options of a command.
+    """
+    detector = _detector_of(options)
+    return "" if detector == options.detector else f"the detector is {detector}, to which {options.models} was fitted\n"
 
 
 def detector_options(options: DetectorOptions) -> dict[str, Any]:
@@ -135,10 +147,11 @@ def make_agent(options: AgentOptions) -> ActivePerception:
         The agent, ready for use.
     """
     device = options.device or "cpu"
-    if options.models is None:
-        check_onnx_options(options, options.detector)
+    detector = _detector_of(options)
+    if options.models is None or is_model_file(options.models):
+        check_onnx_options(options, detector)
     agent = _load_agent(options, detector_options(options))
-    remember(options, options.detector)
+    remember(options, detector)
     if options.half:
         agent = agent.half()
         if torch.device(device).type == "cpu":

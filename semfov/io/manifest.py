@@ -132,9 +132,10 @@ _AGAIN = "run semfov fit again, or copy the folder again"
 def _read_record(path: Path) -> JsonObject:
     """Read the record of a folder, and verify its checksum, its version and its values."""
     if path.parent.is_file():
-        got = f"a file; a detector is given as detector=, on a command line as --detector {path.parent}"
+        is_detector = path.parent.suffix in (".onnx", ".cfg")
+        remedy = f"; a detector is given as detector='{path.parent}'" if is_detector else ""
         raise DataError(
-            f"{path.parent}: expected {_expected_folder(path.parent)}, or the .safetensors of one, got {got}"
+            f"{path.parent}: expected {_expected_folder(path.parent)}, or the .safetensors of one, got a file{remedy}"
         )
     if not path.exists():
         raise DataError(f"{path}: no such file; expected {_expected_folder(path.parent)}")
