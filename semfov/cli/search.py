@@ -1,11 +1,12 @@
 """Subcommands that look at pictures: search, find and explore."""
 
+import math
 import os
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import fields, replace
 from os import PathLike, fspath
@@ -15,7 +16,7 @@ from typing import Any, Literal, TextIO, get_args, get_type_hints
 from tqdm import tqdm
 
 from semfov.agent import ActivePerception
-from semfov.cli.agent import detector_classes, several_classes
+from semfov.cli.agent import detector_classes, note_of_detector, several_classes
 from semfov.cli.jobs import ExploreJob, FindJob, PictureJob, SearchJob, make_again
 from semfov.cli.options import AgentKind, ExploreOptions, FindOptions, PictureOptions, SearchOptions
 from semfov.cli.outcome import PictureOutcome
@@ -24,6 +25,7 @@ from semfov.cli.written import PictureFiles
 from semfov.data.classes import counted
 from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
 from semfov.paths.conversion import Values
+from semfov.paths.words import number_with_error
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
 
@@ -192,6 +194,7 @@ def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Val
     count = len(job.sources)
     if not job.options.pictures:
         print(f"no picture was given: looking at {job.sources[0].name}, which comes with semfov")
+    print(note_of_detector(job.options), end="")
     files = PictureFiles(job, stream)
     before = files.finished_before()
     if before:
@@ -238,7 +241,25 @@ def _found_in_all(files: PictureFiles) -> str:
         counts.update(line["class"] for line in row.get("objects", ()))
     if not counts:
         return ""
-    return f"{', '.join(counted(number, name) for name, number in counts.most_common())} found"
+    found = ", ".join(counted(number, name) for name, number in counts.most_common())
+    return "; ".join(filter(None, [f"{found} found", _expected_in_all(files.rows.values())]))
+
+
+def _expected_in_all(rows: Iterable[Values]) -> str:
+    """Say how many objects of the only class that was looked for to expect in all pictures; empty where not known.
+
+    The errors of pictures are independent: the square of that of the sum is the sum of their squares.
+    """
+    looked_at = [row for row in rows if "error" not in row]
+    targets = {name for row in looked_at for name in row["targets"]}
+    if len(targets) != 1:
+        return ""
+    (target,) = targets
+    means = [row["expected"].get(target) for row in looked_at]
+    errors = [row["expected_error"].get(target) for row in looked_at]
+    if None in means or None in errors:
+        return ""
+    return f"expect {number_with_error(sum(means), math.hypot(*errors))} in all"
 
 
 def _assumed_in_all(files: PictureFiles) -> str:

@@ -20,7 +20,7 @@ from semfov.paths.conversion import Values
 from semfov.paths.files import FARTHEST, POSITIVE, WHOLE, Format, SharedFields
 from semfov.paths.late import MadeWhenRead
 from semfov.paths.look import Box, RecordedLook, finite_or_none
-from semfov.paths.words import MomentWords, Words
+from semfov.paths.words import MomentWords, Words, number_with_error
 from semfov.tracking import Tracks
 from semfov.tracking.files import TRACK_FIELDS, track_tensors, tracks_of
 from semfov.zoom.certainty import SEVERAL, SPREAD, number_of, number_of_faint, reacts
@@ -160,11 +160,8 @@ class WindowWords(Words):
         is_said = mean >= (0.0 if are_listed else _LEAST_SAID)  # never of NaN
         if not is_said:
             return ""
-        error = variance**0.5
-        # Whole numbers would hide a small error, and read as `expect 1 cups`.
-        places = 0 if error >= 1 and max(mean, error) >= 10 else 1
         guess = "" if record._reacts_to([label]) else "at a guess "
-        return f"{guess}{mean:.{places}f} ± {error:.{places}f}"
+        return f"{guess}{number_with_error(mean, variance**0.5)}"
 
     @property
     def _ending(self) -> str:

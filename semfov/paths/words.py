@@ -14,6 +14,13 @@ _MATTERS = 0.1  # change of the probability, at one half, from which on the assu
 _CLEAR = 0.5  # probability or score from which on a place was clearly seen as the target
 
 
+def number_with_error(mean: float, error: float) -> str:
+    """Write an expected number and its standard deviation, such as `45 ± 9` or `0.8 ± 1.9`."""
+    # Whole numbers would hide a small error, and read as `expect 1 cups`.
+    places = 0 if error >= 1 and max(mean, error) >= 10 else 1
+    return f"{mean:.{places}f} ± {error:.{places}f}"
+
+
 class Words(ABC):
     """Words for a record; each kind of record has its own (`Record.words`).
 

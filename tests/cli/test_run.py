@@ -20,7 +20,7 @@ from semfov import DataError, InputError, read_image
 from semfov.cli import outcome, written
 from semfov.cli.jobs import FindJob
 from semfov.cli.options import FindOptions
-from semfov.cli.search import _assumed_in_all
+from semfov.cli.search import _assumed_in_all, _expected_in_all
 from semfov.gaze.policies import Policy
 from semfov.paths import Record
 from semfov.runs.command import run_command
@@ -318,3 +318,15 @@ def test_a_terminal_that_closes_ends_a_command_in_good_order(capsys):
         signal.signal(signal.SIGHUP, before)
     assert cleaned
     assert "give the same command again" in capsys.readouterr().err
+
+
+def test_the_sum_of_what_is_expected_has_the_error_of_independent_pictures():
+    def row(target, mean, error):
+        return {"targets": [target], "expected": {target: mean}, "expected_error": {target: error}}
+
+    skipped = {"picture": "c.jpg", "error": "not an image"}
+    two = [row("person", 12.0, 6.0), skipped, row("person", 11.0, 8.0)]
+    assert _expected_in_all(two) == "expect 23 ± 10 in all"  # 6, 8, 10
+    assert _expected_in_all([row("person", 0.5, 0.3), row("person", 0.25, 0.4)]) == "expect 0.8 ± 0.5 in all"
+    assert _expected_in_all([*two, row("person", None, None)]) == ""
+    assert _expected_in_all([*two, row("cup", 1.0, 1.0)]) == ""
