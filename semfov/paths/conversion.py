@@ -42,7 +42,7 @@ _PLACE = ("x", "y", "x1", "y1", "x2", "y2")
 COLUMNS = ("object", "class", "score", "confirmed", *_PLACE, "look")
 """Columns of the table of objects."""
 
-DECISION_COLUMNS = ("target", "outcome", "probability", "assumed", "place_probability", *_PLACE, "passes")
+DECISION_COLUMNS = ("target", "outcome", "probability", "score", "assumed", "place_probability", *_PLACE, "passes")
 """Values of `to_dict` that stand in a table of searches, a line for each picture."""
 
 
@@ -136,7 +136,8 @@ class Conversion(Outcome, OtherWords):
         Returns:
             Values by name. Point and box of a search are those of the found target, or of the best place of one that
             leaves it open, as `outcome` tells; `place_probability` is that the target is there, and `probability` that
-            it is anywhere in the picture. None without a place, and for numbers and errors that are not claimed.
+            it is anywhere in the picture. Where none was learned, both are None, and `score` has the number by which
+            it was decided. None without a place, and for numbers and errors that are not claimed.
         """
         width, height = self.size
         return {
@@ -160,13 +161,15 @@ class Conversion(Outcome, OtherWords):
         decision = self.decision
         if decision is None:
             return {}
+        is_probability = self.words.decided_by == "probability"
         return {
             "outcome": decision.outcome,
-            "probability": digits(decision.probability),
+            "probability": digits(decision.probability) if is_probability else None,
+            "score": None if is_probability else digits(decision.probability),
             "confirm": digits(decision.confirm),
             "prior": self.prior,
             "assumed": None if self.assumed is None else round(self.assumed, 6),
-            "place_probability": digits(self.place_probability),
+            "place_probability": digits(self.place_probability) if is_probability else None,
             **self._decided_place(decision),
         }
 

@@ -142,7 +142,11 @@ class ScanpathWords(Words):
     @property
     def decided_by(self) -> str:
         """What the number of the decision is: a `probability`, or a `belief` without thresholds."""
-        return "belief" if self.record.ending == "detection" else "probability"
+        record = self.record
+        if record.ending == "detection":
+            return "belief"
+        is_known = record.assumed is not None or len(record.closer) > 0 or record.ending == "decision"
+        return "probability" if is_known else "belief"
 
     def describe(self) -> str:
         """Describe the outcome of the episode in one line."""
@@ -165,9 +169,10 @@ class ScanpathWords(Words):
 
     def _certainty(self, decision: Decision) -> str:
         """Say how sure the decision is."""
-        if self.record.ending == "detection":
+        if self.decided_by == "belief":
             # Beliefs without thresholds are no probabilities in the plain sense.
-            return f"by a detection at the gaze; its belief gives {decision.probability:.2f}"
+            by = "by a detection at the gaze; " if self.record.ending == "detection" else ""
+            return f"{by}its belief gives {decision.probability:.2f}"
         place = "" if decision.place is None else f", {decision.place:.2f} at this place"
         return f"probability {decision.probability:.2f}{place}"
 

@@ -411,6 +411,8 @@ def test_the_first_look_was_not_chosen_by_a_value(make):
     [
         (scanpath(), "probability"),
         (replace(scanpath(), ending="detection"), "belief"),
+        (replace(scanpath(), closer=(), ending="shifts", assumed=None), "belief"),
+        (replace(scanpath(), closer=(), ending="shifts", assumed=0.5), "probability"),
         (zoom_path(), "probability"),
         (replace(zoom_path(), closer=(), ending="detection"), "score"),
         (replace(zoom_path(), closer=(), ending="passes"), "score"),
@@ -420,6 +422,12 @@ def test_the_first_look_was_not_chosen_by_a_value(make):
 )
 def test_a_record_tells_what_the_number_of_its_decision_is(record, word):
     assert record.words.decided_by == word
+    if record.decision is not None:
+        values = record.to_dict()
+        number = values["probability" if word == "probability" else "score"]
+        assert number == pytest.approx(record.decision.probability, rel=1e-3)
+        assert values["score" if word == "probability" else "probability"] is None
+        assert word == "probability" or values["place_probability"] is None
 
 
 @pytest.mark.parametrize("make", [zoom_path, head_path])
