@@ -28,9 +28,9 @@ from torch import Tensor
 
 from benchmarks.tables import table
 from eval.bootstrap import Bootstrap
-from eval.zoom.objects import average_precision
+from eval.zoom.objects import SEMFOV, average_precision
 from eval.zoom.orders import adaptive_slices, in_order, quad_tree, sparse
-from eval.zoom.run import SEMFOV, ZoomConfig, ZoomRun
+from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.agents.windows import ZoomAgent
 from semfov.data.images import to_bytes
 from semfov.detection.objects import FAINTEST, Objects
