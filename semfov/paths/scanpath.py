@@ -145,8 +145,10 @@ class ScanpathWords(Words):
         record = self.record
         if record.ending == "detection":
             return "belief"
-        is_known = record.assumed is not None or len(record.closer) > 0 or record.ending == "decision"
-        return "probability" if is_known else "belief"
+        # Only what was learned has a threshold, a closer look, or a share of the pictures that it assumes.
+        has_threshold = record.decision is not None and record.decision.confirm is not None
+        is_learned = has_threshold or len(record.closer) > 0 or record.assumed is not None
+        return "probability" if is_learned else "belief"
 
     def describe(self) -> str:
         """Describe the outcome of the episode in one line."""
