@@ -1,6 +1,7 @@
 """Whether a picture holds a class, from the belief about its cells."""
 
 import warnings
+from copy import deepcopy
 
 import torch
 from torch import Tensor, nn
@@ -157,10 +158,7 @@ class Presence(DecidingModule):
         Returns:
             The copy.
         """
-        constant = Presence(
-            self.offset, self.weight, self.shares, self.thresholds, place=self.place, centre=self.centre
-        )
-        return constant.requires_grad_(False)
+        return deepcopy(self).requires_grad_(False)
 
     def of_cells(self, probability: Tensor, footprint: str) -> Tensor:
         """Make the probabilities of cells true.
