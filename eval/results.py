@@ -26,7 +26,7 @@ from eval.decide.run import DecideConfig
 from eval.explore import explore
 from eval.explore.run import ExploreConfig
 from eval.page.curves import OBJECTS
-from eval.page.experiments import AT_THRESHOLDS, CENTRAL, STUDIES, ResultsConfig, experiments
+from eval.page.experiments import AT_THRESHOLDS, SENSITIVITY, ResultsConfig, experiments
 from eval.page.figures import PAGE_FIGURES, THRESHOLD_FIGURE, draw_figures
 from eval.page.findings import findings
 from eval.page.origin import END, PLACE, missing, origin
@@ -36,11 +36,10 @@ from eval.page.tables import (
     beside_paper,
     by_samples,
     markdown_table,
-    paired,
     photographs,
     published,
     readings,
-    study_table,
+    sensitivity,
 )
 from eval.page.thresholds import by_threshold, verdicts, words_of_verdicts
 from eval.search import search
@@ -48,7 +47,6 @@ from eval.search.run import SearchConfig
 from semfov.errors import DataError, lookup
 from semfov.io.files import write_text
 from semfov.runs.command import command
-from semfov.runs.presets import label
 from semfov.runs.workers import shared_processes
 
 
@@ -110,13 +108,11 @@ def _fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
 
 
 def _page_table(line: str, runs: Runs) -> _PageTable:
-    """Write the table that a comment names: of several experiments, of a study, or of one experiment."""
-    if line in STUDIES:
-        return _PageTable(tuple(f"{line} {label}" for label in STUDIES[line].settings), partial(study_table, line))
+    """Write the table that a comment names: of several experiments, or of one experiment."""
     if line in _WHOLE:
         return _WHOLE[line]
     name, _, kind = line.partition(" ")
-    lookup(name, [*runs, *STUDIES, *_WHOLE], "experiment")
+    lookup(name, [*runs, *_WHOLE], "experiment")
     make = _TABLES[lookup(kind, _TABLES, "table")]
     return _PageTable((name,), lambda runs: make(runs[name].out))
 
@@ -131,6 +127,7 @@ _WHOLE = {
     "thresholds": _PageTable(AT_THRESHOLDS, by_threshold),
     "photographs": _PageTable(_SEARCHES[:1], photographs),
     "readings": _PageTable(_SEARCHES[:1], readings),
+    "sensitivity": _PageTable(tuple(f"sensitivity {setting}" for setting in SENSITIVITY), sensitivity),
 }
 """Tables of the pages that are not of a single experiment."""
 
@@ -152,15 +149,9 @@ _TABLES: dict[str, Callable[[Path], list[str]]] = {
     "search": partial(markdown_table, "summary.md", 0, columns=_SEARCHED),
     "explore": partial(markdown_table, "summary.md", 0, columns=_EXPLORED),
     "explore-objects": partial(markdown_table, "summary.md", 1, columns=_EXPLORED),
-    "explore-cells": partial(markdown_table, "summary.md", 2, columns=_EXPLORED),
     "agreement": agreement,
-    "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
-    "paired-by-hand": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 15, 30)),
     "presence": partial(markdown_table, "decisions.md", 0),
     "decisions": partial(markdown_table, "decisions.md", 1),
-    "differences": partial(markdown_table, "decisions.md", 2),
-    "landings": partial(markdown_table, "decisions.md", 3),
-    "by-looks": partial(markdown_table, "beliefs.md", 0, columns=_BELIEVED),
     "by-distance": partial(markdown_table, "beliefs.md", 1, columns=_BELIEVED),
     "samples-search": partial(by_samples, shifts=(1, 5, 15, 30)),
     "samples-explore": partial(by_samples, shifts=(1, 2, 5, 10, 20)),

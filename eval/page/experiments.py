@@ -113,7 +113,7 @@ Experiment = ComparedConfig | DecideConfig | CalibrationConfig | ThresholdLooksC
 
 _Changes = dict[str, dict[str, object]]
 
-_SENSITIVITY: dict[str, _Changes] = {
+SENSITIVITY: dict[str, _Changes] = {
     "as published": {},
     "OpenCV's pyramid": {"sensor": {"convention": "opencv"}},
     "growth 2": {"sensor": {"growth": 2.0}},
@@ -132,45 +132,10 @@ _SENSITIVITY: dict[str, _Changes] = {
     "tempering 0.25": {"belief": {"tempering": 0.25}},
     "closest look": {"belief": {"memory": "closest"}},
 }
-"""Variations of non-predictive search with raw scores; each changes one setting."""
+"""Variations of a search on photographs of the fit set; each changes one setting."""
 
-_SENSORS: dict[str, _Changes] = {
-    f"fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
-    for sigma in (50, 100, 200)
-    for growth in (1, 2)
-}
-"""Variations of the sensor."""
-
-_WEIGHTS: dict[str, _Changes] = {
-    f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0, 3.0)
-}
-"""Variations of the weight of a saliency map as a prior."""
-
-_VIEWS: dict[str, _Changes] = {
-    "foveated view, as published": {"saliency": {"view": "foveated"}},
-    "whole photograph, once": {"saliency": {"view": "picture"}},
-}
-"""Variations of the input of the saliency models."""
-
-
-@dataclass(frozen=True)
-class _Study:
-    """Runs on photographs of the fit set with different settings; a table row is a setting and a policy."""
-
-    settings: dict[str, _Changes]
-    policies: tuple[str | PolicyConfig, ...]
-    explores: bool = False
-    shifts: tuple[int, ...] = (1, 5, 15, 30)
-    model: str | None = None
-
-
-STUDIES = {
-    "sensitivity": _Study(_SENSITIVITY, ("non-predictive-raw",)),
-    "sensor": _Study(_SENSORS, ("random", "non-predictive-raw", CENTRAL)),
-    "explore-sensor": _Study(_SENSORS, ("random-raw", "recommended"), True, (0, 1, 2, 3, 4, 10, 20)),
-    "saliency": _Study(_VIEWS, ("random", "vocus2", "itti-koch")),
-    "weights": _Study(_WEIGHTS, _GUIDED[:1], model="published"),
-}
+SENSITIVITY_POLICY = "non-predictive-raw"
+"""Policy of the study of settings."""
 
 
 @dataclass(frozen=True)
@@ -181,14 +146,14 @@ class ResultsConfig(Settings):
         root: folder of the photographs of COCO val2017.
         annotations: their annotation file, in the COCO instances format.
         ids: text file with the ids of the photographs on which results are measured.
-        fit_root: folder of the photographs on which the models were fitted, for the studies of settings (None: no
-            studies).
+        fit_root: folder of the photographs on which the models were fitted, for the study of settings (None: no
+            study).
         fit_annotations: their annotation file, in the COCO instances format.
         yolox: ONNX file of YOLOX-nano (None: the published file).
         limit: use only this many photographs, the first ones, for a trial.
         few: number of photographs, the first ones, for the experiments at every score threshold and for those with an
             expectation over drawn looks, of which there are many or which take long.
-        study: number of photographs for the studies of settings, which compute new looks for every setting of sensor
+        study: number of photographs for the study of settings, which computes new looks for every setting of sensor
             and detector.
         only: names of the experiments to run (None: all); for the others the pages show the results of earlier runs,
             if there are any.
@@ -224,7 +189,7 @@ def experiments(config: ResultsConfig) -> dict[str, Experiment]:
     """Return the experiments of the page, by name."""
     runs = dict(_measured(config))
     if config.fit_root is not None:
-        runs |= dict(_studies(config))
+        runs |= dict(_sensitivity(config))
     folder = str.maketrans({" ": "-", ",": None, "'": None})
     return {name: replace(run, out=config.out / name.translate(folder)) for name, run in runs.items()}
 
@@ -296,17 +261,16 @@ def _thresholds(name: str, settings: DetectorConfig, common: dict[str, Any]) -> 
         yield at_threshold("explore", threshold, name), tour
 
 
-def _studies(config: ResultsConfig) -> Iterator[tuple[str, ComparedConfig]]:
-    """Experiments on photographs of the fit set, on which settings are chosen."""
-    data = DataConfig(root=config.fit_root, annotations=config.fit_annotations, limit=config.study)
-    nano = detector("nano", config)
-    work = {"cache": config.cache, "workers": config.workers, "scheduler": config.scheduler}
-    few: dict[str, Any] = {"data": data, "detector": nano, **work}
-    few["sensor"] = SensorConfig(name="published")
-    for title, study in STUDIES.items():
-        base = ExploreConfig(**few) if study.explores else SearchConfig(**few)
-        if study.model is not None:
-            base = replace(base, belief=BeliefConfig(model=f"{nano.name}-{study.model}"))
-        for label, changes in study.settings.items():
-            sections = {section: replace(getattr(base, section), **values) for section, values in changes.items()}
-            yield f"{title} {label}", replace(base, **sections, policies=study.policies)
+def _sensitivity(config: ResultsConfig) -> Iterator[tuple[str, ComparedConfig]]:
+    """Yield searches on photographs of the fit set, each with one setting changed."""
+    base = SearchConfig(
+        data=DataConfig(root=config.fit_root, annotations=config.fit_annotations, limit=config.study),
+        detector=detector("nano", config),
+        sensor=SensorConfig(name="published"),
+        cache=config.cache,
+        workers=config.workers,
+        scheduler=config.scheduler,
+    )
+    for setting, changes in SENSITIVITY.items():
+        sections = {section: replace(getattr(base, section), **values) for section, values in changes.items()}
+        yield f"sensitivity {setting}", replace(base, **sections, policies=(SENSITIVITY_POLICY,))

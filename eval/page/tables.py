@@ -8,16 +8,17 @@ import numpy as np
 
 from eval.chance import random_search
 from eval.page import paper
-from eval.page.curves import averaged, behind, paired_difference, points, policies_of, records_of, spans
-from eval.page.experiments import DETECTORS, FOVEAE, STUDIES, Experiment
-from semfov.errors import DataError
-from semfov.runs.presets import label as name_of
+from eval.page.curves import averaged, paired_difference, points, policies_of, records_of
+from eval.page.experiments import DETECTORS, FOVEAE, SENSITIVITY, SENSITIVITY_POLICY, Experiment
 from semfov.runs.tables import percent, table
 
 Runs = dict[str, Experiment]
 
 _LARGER = 11
 """Number of target cells with which random gaze finds about as much as the paper measured."""
+
+_SENSITIVITY_SHIFTS = (1, 5, 15, 30)
+"""Gaze shifts after which the study of settings is shown."""
 
 
 def published(kind: str) -> dict[str, str]:
@@ -74,19 +75,13 @@ def readings(runs: Runs) -> list[str]:
     return table([*rows, [title, *(f"{100 * larger[n]:.1f}" for n in paper.TABLE_SHIFTS)]])
 
 
-def study_table(title: str, runs: Runs) -> list[str]:
-    """Write a row for each setting and policy: curves over all targets, or the published measure for explorations."""
-    study = STUDIES[title]
-    several = len(study.policies) > 1
-    shifts = [str(n) if study.explores else f"CP@{n}" for n in study.shifts]
-    rows = [["setting", *(["policy"] if several else []), *shifts]]
-    for label in study.settings:
-        folder = runs[f"{title} {label}"].out
-        for choice in study.policies:
-            policy = name_of(choice, "exploration" if study.explores else "search")
-            head = [label, *([policy] if several else [])]
-            curve = averaged(records_of(folder, policy), max(study.shifts))
-            rows.append([*head, *(percent(curve.mean[n], curve.over_images[n]) for n in study.shifts)])
+def sensitivity(runs: Runs) -> list[str]:
+    """Write a row for each setting of the study of settings: curves over all targets."""
+    rows = [["setting", *(f"CP@{n}" for n in _SENSITIVITY_SHIFTS)]]
+    for setting in SENSITIVITY:
+        records = records_of(runs[f"sensitivity {setting}"].out, SENSITIVITY_POLICY)
+        curve = averaged(records, max(_SENSITIVITY_SHIFTS))
+        rows.append([setting, *(percent(curve.mean[n], curve.over_images[n]) for n in _SENSITIVITY_SHIFTS)])
     return table(rows)
 
 
@@ -106,20 +101,6 @@ def _with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
     heads, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)
     places = [0, *(heads.index(column) for column in columns)]
     return table([[row[place] for place in places] for row in (heads, *rows)])
-
-
-def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right") -> list[str]:
-    """Table of the differences of policies from a baseline, paired over images, in percentage points."""
-    names = policies_of(folder)
-    if baseline not in names:
-        raise DataError(f"{folder}: expected records of the policy {baseline!r}, found none; run the experiment again")
-    rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind at"]]
-    for policy in names:
-        if policy == baseline:
-            continue
-        mean, error = paired_difference(folder, policy, baseline, max(shifts), field)
-        rows.append([policy, *points(mean, error, shifts), spans(behind(mean, error)) or "no shift"])
-    return table(rows)
 
 
 def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> list[str]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from eval.page.curves import points
 from eval.page.experiments import DETECTORS, SCORE_THRESHOLDS, at_threshold
-from eval.page.findings import COUNTED, EXPLORE, SEARCH, TESTED, VERDICTS, Answer, Finding, Measure, legend
+from eval.page.findings import COUNTED, TESTED, VERDICTS, Answer, Finding, Measure, legend
 from eval.page.tables import Runs
 from semfov.metrics.episodes import FloatArray
 from semfov.runs.tables import table
@@ -60,10 +60,9 @@ class Contrast:
 CONTRASTS = tuple(
     Contrast(text.format(measure.text), finding, measure, shifts)
     for text, finding, shifts in (
-        ("search, {}: calibrated − raw", TESTED[0], SEARCH),
-        ("exploration, {}: KL − random, calibrated", TESTED[7], (1, 5, 10, 20)),
-        ("exploration, {}: KL − random, raw", TESTED[8], (1, 5, 10, 20)),
-        ("exploration by KL, {}: calibrated − raw", TESTED[9], EXPLORE),
+        ("search, {}: calibrated − raw", TESTED[0], (5, 30)),
+        ("exploration, {}: KL − random, calibrated", TESTED[7], (1, 10)),
+        ("exploration by KL, {}: calibrated − raw", TESTED[9], (1, 15)),
     )
     for measure in COUNTED[finding.kind]
 )
