@@ -204,34 +204,46 @@ def detector(name: str, config: ResultsConfig) -> DetectorConfig:
 
 
 def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
-    """Experiments on the photographs on which results are measured; the experiments of the paper come first."""
-    data = DataConfig(root=config.root, annotations=config.annotations, ids=config.ids, limit=config.limit)
+    """Yield the experiments on the photographs on which results are measured; those of the paper come first."""
     for name in DETECTORS:
         settings = detector(name, config)
-        work = {"cache": config.cache, "workers": config.workers, "scheduler": config.scheduler}
-        common: dict[str, Any] = {"data": data, "detector": settings, **work}
+        common, few = _common(settings, config)
         seek, tour = partial(SearchConfig, **common), partial(ExploreConfig, **common)
         for fovea in FOVEAE:
             sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
             yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=_PUBLISHED)
             yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=_PUBLISHED_EXPLORATION)
-        few = {**common, "data": replace(data, limit=min(config.few, config.limit or config.few))}
         yield from _thresholds(name, settings, few)
-        sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
-        yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=_PROPOSED)
-        if name == "nano":
-            # One start: an expectation takes ten times as long as the published decision.
-            options: dict[str, Any] = {**few, "sensor": sensor, "belief": belief}
-            yield "expected-search", SearchConfig(**options, protocol=ProtocolConfig(1), policies=_EXPECTED)
-            once = ProtocolConfig(1, shifts=20)
-            yield "expected-explore", ExploreConfig(**options, protocol=once, policies=_EXPECTED_EXPLORATION)
-        yield f"beyond-search-{name}", seek(policies=_BEYOND)
-        yield f"decide-{name}", DecideConfig(**common)
-        every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
-        yield f"beliefs-{name}", CalibrationConfig(**every)
-        yield f"beyond-explore-{name}", tour(policies=_BEYOND_EXPLORATION)
-        belief = BeliefConfig(model=f"{settings.name}-sharp")
-        yield f"beyond-explore-published-{name}", tour(policies=_BEYOND_EXPLORATION, sensor=sensor, belief=belief)
+    yield from _beyond(config)
+
+
+def _common(settings: DetectorConfig, config: ResultsConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what experiments with a detector share, and the same with few photographs."""
+    data = DataConfig(root=config.root, annotations=config.annotations, ids=config.ids, limit=config.limit)
+    work = {"cache": config.cache, "workers": config.workers, "scheduler": config.scheduler}
+    common: dict[str, Any] = {"data": data, "detector": settings, **work}
+    return common, {**common, "data": replace(data, limit=min(config.few, config.limit or config.few))}
+
+
+def _beyond(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
+    """Yield the experiments beyond the paper, with YOLOX-nano."""
+    settings = detector("nano", config)
+    common, few = _common(settings, config)
+    seek, tour = partial(SearchConfig, **common), partial(ExploreConfig, **common)
+    sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
+    yield "proposed-nano", seek(sensor=sensor, belief=belief, policies=_PROPOSED)
+    # One start: an expectation takes ten times as long as the published decision.
+    options: dict[str, Any] = {**few, "sensor": sensor, "belief": belief}
+    yield "expected-search", SearchConfig(**options, protocol=ProtocolConfig(1), policies=_EXPECTED)
+    once = ProtocolConfig(1, shifts=20)
+    yield "expected-explore", ExploreConfig(**options, protocol=once, policies=_EXPECTED_EXPLORATION)
+    yield "beyond-search-nano", seek(policies=_BEYOND)
+    yield "decide-nano", DecideConfig(**common)
+    every = {**common, "data": replace(common["data"], min_instances=0, max_target_area=None)}
+    yield "beliefs-nano", CalibrationConfig(**every)
+    yield "beyond-explore-nano", tour(policies=_BEYOND_EXPLORATION)
+    belief = BeliefConfig(model=f"{settings.name}-sharp")
+    yield "beyond-explore-published-nano", tour(policies=_BEYOND_EXPLORATION, sensor=sensor, belief=belief)
 
 
 def at_threshold(kind: str, threshold: float, name: str) -> str:

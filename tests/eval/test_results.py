@@ -83,7 +83,7 @@ def runs(tmp_path):
 def searched(runs):
     rng = np.random.default_rng(0)
     records = searches(("random", "clever"), lambda *_: int(rng.integers(-1, 12)))
-    write_records(runs["beyond-search-tiny"].out, records)
+    write_records(runs["beyond-search-nano"].out, records)
     return runs, records
 
 
@@ -120,10 +120,10 @@ def test_tables_of_runs_are_renewed_and_the_rest_of_the_page_stays(searched):
     page = "before\n{}\nbetween\n{}\nafter\n"
     others = [place("explore-published-nano explore -- 7654321, 2026-11-01, 300 photographs"), place("sensitivity")]
     other = "\n".join([*others, place("findings")])
-    text, kept = _fill_page(page.format(place("beyond-search-tiny search"), other), runs)
+    text, kept = _fill_page(page.format(place("beyond-search-nano search"), other), runs)
     shown = ["| policy | CP@1 | CP@5 | CP@15 | CP@30 |", "|--------|------|------|-------|-------|"]
     table = "\n".join([*shown, "| random | 1    | 2    | 4     | 5     |"])
-    renewed = place("beyond-search-tiny search -- 1a2b3c4, 2026-11-23, 6 photographs", table)
+    renewed = place("beyond-search-nano search -- 1a2b3c4, 2026-11-23, 6 photographs", table)
     assert text == page.format(renewed, other)
     assert kept == ["explore-published-nano explore", "sensitivity", "findings"]
     assert _fill_page(text, runs) == (text, kept)
@@ -150,19 +150,19 @@ def test_the_origin_of_a_table_names_every_commit_day_and_number_of_photographs(
 
 
 def test_unknown_tables_are_refused(runs):
-    refused("did you mean 'beyond-search-tiny'", _fill_page, place("beyond-search-tin search"), runs)
-    refused("table", _fill_page, place("beyond-search-tiny third"), runs)
+    refused("did you mean 'beyond-search-nano'", _fill_page, place("beyond-search-nan search"), runs)
+    refused("table", _fill_page, place("beyond-search-nano third"), runs)
 
 
 def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
     """Tables are chosen by their number in the file, without the prose around them."""
     heads = "| looks | cells | belief | NLL | ECE | mean probability | share that hold it |"
-    for name, file in (("decide-tiny", "decisions.md"), ("beliefs-nano", "beliefs.md")):
+    for name, file in (("decide-nano", "decisions.md"), ("beliefs-nano", "beliefs.md")):
         write_manifest(runs[name].out)
         parts = [f"Some words.\n\n{heads}\n|---|\n| {number} |{' x |' * 6}\n" for number in range(4)]
         (runs[name].out / file).write_text("\n".join(parts))
     for number, kind in enumerate(("presence", "decisions")):
-        assert lines_of(f"decide-tiny {kind}", runs) == [heads, "|---|", f"| {number} | x | x | x | x | x | x |"]
+        assert lines_of(f"decide-nano {kind}", runs) == [heads, "|---|", f"| {number} | x | x | x | x | x | x |"]
     rows = [cells_of(row) for row in lines_of("beliefs-nano by-distance", runs)]
     assert rows[0] == ["looks", "belief", "NLL", "ECE", "mean probability", "share that hold it"]
     assert rows[2] == ["1", *"xxxxx"]
@@ -194,7 +194,7 @@ def test_one_command_writes_both_pages_and_says_which_tables_it_renewed(searched
     runs, _ = searched
     pages = [tmp_path / f"{name}.md" for name in ("results", "tables")]
     for page in pages:
-        page.write_text(f"{page}\n{place('paper')}\n{place('beyond-search-tiny search')}\n")
+        page.write_text(f"{page}\n{place('paper')}\n{place('beyond-search-nano search')}\n")
     config = ResultsConfig(
         root=tmp_path,
         annotations=tmp_path / "a.json",
@@ -205,12 +205,12 @@ def test_one_command_writes_both_pages_and_says_which_tables_it_renewed(searched
         out=tmp_path / "out",
     )
     results(config)
-    rows = "\n".join(lines_of("beyond-search-tiny search", runs))
-    table = place("beyond-search-tiny search -- 1a2b3c4, 2026-11-23, 6 photographs", rows)
+    rows = "\n".join(lines_of("beyond-search-nano search", runs))
+    table = place("beyond-search-nano search -- 1a2b3c4, 2026-11-23, 6 photographs", rows)
     for page in pages:
         assert page.read_text() == f"{page}\n{place('paper')}\n{table}\n"
     told = capsys.readouterr().out
-    assert "renewed: beyond-search-tiny search, beyond-search-tiny search\n" in told
+    assert "renewed: beyond-search-nano search, beyond-search-nano search\n" in told
     assert "have not run: paper, paper, prediction_and_calibration.png, search_baselines.png" in told
     pages[1].unlink()
     unusable(r"tables\.md cannot be read", results, config)
@@ -218,7 +218,7 @@ def test_one_command_writes_both_pages_and_says_which_tables_it_renewed(searched
 
 def test_differences_are_paired_over_images(searched):
     runs, records = searched
-    mean, error = paired_difference(runs["beyond-search-tiny"].out, "clever", "random", 5)
+    mean, error = paired_difference(runs["beyond-search-nano"].out, "clever", "random", 5)
     differences = []
     for scene in range(6):
         rate = {
