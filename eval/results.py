@@ -19,7 +19,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration.evaluation import CalibrationConfig, judge_beliefs
 from eval.comparison.thresholds import ThresholdLooksConfig, look_at_thresholds
 from eval.decide import search_and_decide
 from eval.decide.run import DecideConfig
@@ -133,14 +132,12 @@ _WHOLE = {
 
 _SEARCHED = [f"CP@{n}" for n in (1, 5, 15, 30)]
 _EXPLORED = [str(n) for n in (0, 1, 5, 10, 20)]
-_BELIEVED = ["belief", "NLL", "ECE", "mean probability", "share that hold it"]
 """Columns of the tables of runs that the pages show."""
 
 _HANDLERS: dict[type, Callable[[Any], None]] = {
     SearchConfig: partial(search, pictures=False),
     ExploreConfig: partial(explore, pictures=False),
     DecideConfig: search_and_decide,
-    CalibrationConfig: judge_beliefs,
     ThresholdLooksConfig: look_at_thresholds,
 }
 """Functions that run an experiment, by the class of its settings."""
@@ -152,7 +149,6 @@ _TABLES: dict[str, Callable[[Path], list[str]]] = {
     "agreement": agreement,
     "presence": partial(markdown_table, "decisions.md", 0),
     "decisions": partial(markdown_table, "decisions.md", 1),
-    "by-distance": partial(markdown_table, "beliefs.md", 1, columns=_BELIEVED),
     "samples-search": partial(by_samples, shifts=(1, 5, 15, 30)),
     "samples-explore": partial(by_samples, shifts=(1, 2, 5, 10, 20)),
     "samples-objects": partial(by_samples, shifts=(1, 2, 5, 10, 20), field=OBJECTS),

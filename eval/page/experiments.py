@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from eval.calibration.evaluation import CalibrationConfig
 from eval.comparison.settings import ComparedConfig
 from eval.comparison.thresholds import ThresholdLooksConfig
 from eval.decide.run import DecideConfig
@@ -108,7 +107,7 @@ _EXPECTED_EXPLORATION = tuple(
 )
 """The same two kinds of explorations."""
 
-Experiment = ComparedConfig | DecideConfig | CalibrationConfig | ThresholdLooksConfig
+Experiment = ComparedConfig | DecideConfig | ThresholdLooksConfig
 """Settings of an experiment of the page."""
 
 _Changes = dict[str, dict[str, object]]
@@ -239,8 +238,6 @@ def _beyond(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
     yield "expected-explore", ExploreConfig(**options, protocol=once, policies=_EXPECTED_EXPLORATION)
     yield "beyond-search-nano", seek(policies=_BEYOND)
     yield "decide-nano", DecideConfig(**common)
-    every = {**common, "data": replace(common["data"], min_instances=0, max_target_area=None)}
-    yield "beliefs-nano", CalibrationConfig(**every)
     yield "beyond-explore-nano", tour(policies=_BEYOND_EXPLORATION)
     belief = BeliefConfig(model=f"{settings.name}-sharp")
     yield "beyond-explore-published-nano", tour(policies=_BEYOND_EXPLORATION, sensor=sensor, belief=belief)

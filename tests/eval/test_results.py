@@ -154,18 +154,15 @@ def test_unknown_tables_are_refused(runs):
     refused("table", _fill_page, place("beyond-search-nano third"), runs)
 
 
-def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
+def test_tables_of_decisions_are_taken_from_their_file(runs):
     """Tables are chosen by their number in the file, without the prose around them."""
-    heads = "| looks | cells | belief | NLL | ECE | mean probability | share that hold it |"
-    for name, file in (("decide-nano", "decisions.md"), ("beliefs-nano", "beliefs.md")):
-        write_manifest(runs[name].out)
-        parts = [f"Some words.\n\n{heads}\n|---|\n| {number} |{' x |' * 6}\n" for number in range(4)]
-        (runs[name].out / file).write_text("\n".join(parts))
+    heads = "| looks | hit rate | false-alarm rate | undecided | place right | expected | IoU |"
+    out = runs["decide-nano"].out
+    write_manifest(out)
+    parts = [f"Some words.\n\n{heads}\n|---|\n| {number} |{' x |' * 6}\n" for number in range(4)]
+    (out / "decisions.md").write_text("\n".join(parts))
     for number, kind in enumerate(("presence", "decisions")):
         assert lines_of(f"decide-nano {kind}", runs) == [heads, "|---|", f"| {number} | x | x | x | x | x | x |"]
-    rows = [cells_of(row) for row in lines_of("beliefs-nano by-distance", runs)]
-    assert rows[0] == ["looks", "belief", "NLL", "ECE", "mean probability", "share that hold it"]
-    assert rows[2] == ["1", *"xxxxx"]
 
 
 @pytest.mark.parametrize("page", ["results", "tables"])
