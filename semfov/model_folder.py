@@ -241,17 +241,11 @@ class ModelFolder:
         }
 
     def _search_observer(self) -> Observer:
-        """Make the observer of searches: by the model fitted for them, or scores as they were better when fitted."""
-        components = len(self.manifest.classes) + 1
+        """Make the observer of searches: by the model fitted for them, or raw scores where these were better."""
         searching = self._models.get("search")
         if isinstance(searching, FovealObservationModel):
             return SemanticSearch(searching)
-        if not self.used("tempering"):
-            return Semantic(components)
-        settings = self.manifest.parts["tempering"].settings
-        model = self._models.get("observation") if settings["scores"] == "calibrated" else None
-        assert model is None or isinstance(model, FovealObservationModel)
-        return Semantic(components, model, footprint=settings["footprint"], tempering=settings["exponent"])
+        return Semantic(len(self.manifest.classes) + 1)
 
     def _exploration(self, eye: Eye) -> tuple[Observer, Policy]:
         """Make the observer and the policy of explorations: the semantic map, or random looks without a model."""

@@ -75,14 +75,7 @@ def _recommended_policy(folder: ModelFolder, config: ComparedConfig) -> str | Po
     """Return the policy that the agent of a folder uses."""
     if config.task == "exploration":
         return PolicyConfig("closer-look", "learned") if folder.file("observation") else "random-raw"
-    if folder.used("search"):
-        return AGENT
-    if not folder.used("tempering"):
-        return "non-predictive-raw"
-    settings = folder.manifest.parts["tempering"].settings
-    return PolicyConfig(
-        "non-predictive", settings["scores"], tempering=settings["exponent"], footprint=settings["footprint"]
-    )
+    return AGENT if folder.used("search") else "non-predictive-raw"
 
 
 def _needs(choice: str | PolicyConfig, config: ComparedConfig) -> list[str]:

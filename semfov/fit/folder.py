@@ -14,7 +14,6 @@ from semfov.fit.observation import ObservationFit
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.search_part import SearchFit
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.tempering import TemperingFit
 from semfov.fit.verification_part import VerificationFit
 from semfov.fit.windows_part import WindowsFit
 from semfov.io.files import sha256, write_text
@@ -26,7 +25,6 @@ from semfov.runs.setup import detector_options
 
 FITS: dict[str, type[PartFit]] = {
     "observation": ObservationFit,
-    "tempering": TemperingFit,
     "search": SearchFit,
     "verification": VerificationFit,
     "windows": WindowsFit,

@@ -10,7 +10,6 @@ from semfov.runs.tables import table
 
 _TITLES = {
     "observation": "Observation model (scores of detections)",
-    "tempering": "Tempering",
     "search": "Search model (searches)",
     "verification": "Verification (closer looks)",
     "windows": "Evidence by magnification (large pictures)",

@@ -15,8 +15,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import torch
 
-from semfov.belief.grid import Footprint
-from semfov.belief.observers import Semantic
 from semfov.fit.looking import Looking
 from semfov.fit.samples import Samples
 from semfov.fit.settings import FitConfig, FitDetectorConfig
@@ -24,14 +22,10 @@ from semfov.io.files import sha256
 from semfov.io.manifest import Part
 from semfov.io.pretrained import Pretrained
 from semfov.model_folder import KINDS
-from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import generator_for
 
 _Config = TypeVar("_Config", bound=FitConfig)
-
-FOOTPRINT: Footprint = "box_centre"
-"""Which cells a detection updates where scores are fused with an exponent of their own."""
 
 _FEW = 8  # detectors with fewer classes also learn from photographs that contain none of them
 _MANY = 100  # with at least this many photographs, one in five is held out
@@ -92,20 +86,6 @@ class PartInputs:
         """Return the model of a part, or None if the part has no model or the agent should not use it."""
         part = self.results[name].part
         return KINDS[name].from_pretrained(self.config.out / part.file) if part.used and part.file else None
-
-    @property
-    def semantic(self) -> Semantic:
-        """The belief that fuses scores with the best exponent."""
-        part = self.results["tempering"].part
-        if not part.used:
-            return Semantic(self.components)
-        return self.fusing(part.settings["scores"], part.settings["exponent"])
-
-    def fusing(self, scores: str, exponent: float) -> Semantic:
-        """Return the belief that fuses `raw` or `calibrated` scores with an exponent."""
-        model = self.model("observation") if scores == "calibrated" else None
-        assert model is None or isinstance(model, FovealObservationModel)
-        return Semantic(self.components, model, footprint=FOOTPRINT, tempering=exponent)
 
     @cached_property
     def samples(self) -> Samples:

@@ -1,24 +1,19 @@
 """The part of a model folder that guides searches: an observation model fitted to them, compared with raw scores."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.data.scene import legal_targets
-from semfov.decision import OUTCOMES, confirms, decide
-from semfov.episode import Step, StoredLooks
+from semfov.episode import StoredLooks
 from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, curves_figure, curves_table, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.presence import thresholds_of_searches
-from semfov.fit.protocols import choose_searches, episodes_of, run_episodes, search_steps
+from semfov.fit.protocols import episodes_of, run_episodes
 from semfov.fit.search import FitSearchConfig, fit_search, search_photographs, search_report
 from semfov.fit.thresholds import SUREST, SUREST_OF_FEW
 from semfov.gaze.policies import Policy
@@ -28,29 +23,12 @@ from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.runs.seeds import noise_for
-from semfov.runs.tables import mean_or_dash, share
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
 
 _ABSENT = 1000  # thresholds are chosen on about this many searches for absent classes
 _MOST_ABSENT = 20  # and at most so many of them in a photograph
 _FEW_ALARMS = 10  # with fewer expected false alarms, one of them would push the threshold up
-_RAW_CONFIRM = 0.5  # score from which on agents without fitted models find the target in the fixated cell
-
-
-class _Rule(Protocol):
-    """What decides which searches for a target end with a step."""
-
-    def __call__(self, step: Step, target: int, grid: Grid) -> Tensor:
-        """Return the numbers of their outcomes, 0 for those that go on."""
-
-
-class _Decision(NamedTuple):
-    """The decision of a search: whether the class is there, the outcome, and the number of looks until then."""
-
-    present: bool
-    outcome: str
-    looks: int
 
 
 class SearchFit(PartFit):
@@ -70,31 +48,24 @@ class SearchFit(PartFit):
             "looking at cells": 0.1 * photographs,
             "searching for more": 0.2 * len(inputs.held_out),
             "comparing": judged,
-            "deciding": judged,
         }
 
     def fit(self) -> PartResult:
-        """Fit, and compare searches and their decisions with those of raw scores."""
+        """Fit, and compare searches with those of raw scores."""
         # Held-out photographs choose the thresholds, and judge.
         fitted = fit_search(self._start(), self.settings, self.run, hold_out=True)
         model = fitted.model
         presence = model.presence
         assert presence is not None
-        presence.thresholds = thresholds = self._thresholds(model, presence)
+        presence.thresholds = self._thresholds(model, presence)
         strategies = self._strategies(model)
         curves = self._curves(strategies)
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
         gain, why = self._compare(curves)
-        rules: dict[str, _Rule] = {
-            "fitted": partial(_decide_by_belief, thresholds=thresholds),
-            "raw": _decide_by_score,
-        }
-        decisions = self._decisions({name: (strategies[name], rule) for name, rule in rules.items()})
         report = "\n".join(
             [
                 self._report_on_curves(curves),
-                _report_on_decisions(decisions, thresholds),
                 search_report(fitted.judged, presence, fitted.trained, fitted.held_out),
             ]
         )
@@ -120,11 +91,10 @@ class SearchFit(PartFit):
         return thresholds_of_searches(presence, searches, bounds)
 
     def _strategies(self, model: FovealObservationModel) -> dict[str, Strategy]:
-        """Make the strategies that are compared: with the fitted model, with raw scores, and with tempered ones."""
+        """Make the strategies that are compared: with the fitted model, and with raw scores."""
         strategies = {
             "fitted": Strategy(SemanticSearch(model), Policy("non-predictive")),
             "raw": Strategy(Semantic(self.inputs.components), Policy("non-predictive")),
-            "fused": Strategy(self.inputs.semantic, Policy("non-predictive")),
         }
         for strategy in strategies.values():
             strategy.eval().requires_grad_(False)
@@ -167,77 +137,12 @@ class SearchFit(PartFit):
             f"{100 * raw.mean():.1f} % with raw scores; {gain.in_words('points gained', 100)}"
         )
 
-    def _decisions(self, ways: Mapping[str, tuple[Strategy, _Rule]]) -> dict[str, list[_Decision]]:
-        """Search held-out photographs for present and absent classes, each with its strategy and rule."""
-        run = self.run
-        config = self.settings
-        decisions: dict[str, list[_Decision]] = {name: [] for name in ways}
-        for index in track(self.inputs.judged, "deciding", "scene"):
-            grid = run.grid(index)
-            searches = choose_searches(
-                run.scenes, index, grid, self.inputs.protocol, config.classes, config.max_target_area, config.classes
-            )
-            if not searches:
-                continue
-            labels = run.scenes.annotation(index).labels
-            detections = run.detections(index)
-            for search in searches:
-                looks = StoredLooks(detections, grid, torch.tensor([search.target]))
-                present = bool((labels == search.target).any())
-                for name, (strategy, rule) in ways.items():
-                    ends = partial(rule, target=search.target, grid=grid)
-                    with torch.inference_mode():
-                        steps = search_steps(looks, strategy, search.target, search.start, search.noise, ends)
-                        outcome = OUTCOMES[int(ends(steps[-1]))]
-                    decisions[name].append(_Decision(present, outcome, len(steps)))
-        return decisions
-
     def _report_on_curves(self, curves: Mapping[str, FloatArray]) -> str:
         """Write the section about the searches."""
         protocol = self.inputs.protocol
         shifts = (1, self.inputs.compared_at, protocol.shifts)
         return section(
             f"Targets found after n gaze shifts, in %, on {len(curves['raw'])} held-out photographs with "
-            f"{protocol.starts} starting points for each target. `raw` fuses the raw scores; `fused` uses the "
-            "exponent chosen under Tempering.",
+            f"{protocol.starts} starting points for each target. `raw` fuses the raw scores.",
             curves_table(["belief", *(f"CP@{n}" for n in shifts)], curves, shifts),
         )
-
-
-def _decide_by_belief(step: Step, target: int, grid: Grid, *, thresholds: Thresholds) -> Tensor:
-    """Decide by the belief of the fitted model."""
-    return decide(step, target, thresholds)
-
-
-def _decide_by_score(step: Step, target: int, grid: Grid) -> Tensor:
-    """Decide as agents without fitted models do."""
-    return confirms(step.detections, grid, step.cell, target, _RAW_CONFIRM).long()
-
-
-def _report_on_decisions(decisions: Mapping[str, Sequence[_Decision]], thresholds: Thresholds) -> str:
-    """Write the section about the decisions."""
-    rows = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
-    for name, of_belief in decisions.items():
-        rows.append(
-            [
-                name,
-                _share_found(of_belief, present=True),
-                _share_found(of_belief, present=False),
-                share(sum(decision.outcome == "undecided" for decision in of_belief), len(of_belief)),
-                mean_or_dash([decision.looks for decision in of_belief]),
-            ]
-        )
-    return section(
-        f"Decisions of {len(decisions['fitted'])} searches for present and for absent classes. A target "
-        f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
-        f"cell has a probability of {thresholds.stop_below:.2f} or more. These thresholds were chosen on the "
-        "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "
-        "search gives up.",
-        rows,
-    )
-
-
-def _share_found(decisions: Sequence[_Decision], *, present: bool) -> str:
-    """Format the share of the searches for present or for absent classes that find their target."""
-    found = [decision.outcome == "found" for decision in decisions if decision.present == present]
-    return share(sum(found), len(found))

@@ -19,10 +19,10 @@ FILE = "manifest.json"
 _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
-PARTS = ("observation", "tempering", "search", "verification", "windows")
+PARTS = ("observation", "search", "verification", "windows")
 """Parts that a folder may hold, in the order in which they are fitted."""
 
-_FORMER = {"map": "map", "evidence": "evidence for targets"}
+_FORMER = {"map": "map", "evidence": "evidence for targets", "tempering": "exponent of scores"}
 """Parts of folders of earlier versions by name, in words."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))

@@ -90,17 +90,17 @@ def test_the_folder_describes_its_models(home):
     assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
     assert manifest.sensor["sigma"] == 60
     assert manifest.sensor["growth"] == 1
-    assert list(manifest.parts) == ["observation", "tempering", "search", "verification", "windows"]
+    assert list(manifest.parts) == ["observation", "search", "verification", "windows"]
     assert manifest.training["photographs"] == 20
     assert manifest.training["held_out"] == 5
     for name, part in manifest.parts.items():
         assert "held-out photographs" in part.why, (name, part.why)
-        assert (part.file is None) == (name in ("tempering", "windows"))
+        assert (part.file is None) == (name == "windows")
     thresholds = FovealObservationModel.from_pretrained(home / "models/search.safetensors").presence.thresholds
     assert 0.49 < thresholds.confirm <= 0.9  # few searches to choose it from
     text = (home / "models/report.md").read_text()
-    assert f"counts as found from a probability of {thresholds.confirm:.2f} on" in text
-    assert f"gives up when no cell has a probability of {thresholds.stop_below:.2f} or more" in text
+    assert f"counts as found if the probability of its presence is at least {thresholds.confirm:.3f}" in text
+    assert f"gives up if no other cell has a probability of at least {thresholds.stop_below:.3f}" in text
     assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
     verification = Verification.from_pretrained(home / "models/verification.safetensors")
     assert 0.5 <= verification.thresholds.confirm <= 0.9
@@ -168,7 +168,6 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
 
 FITS = {
     "observation": "observation.fit_published",
-    "tempering": "tempering.hit_rates",
     "search": "search_part.fit_search",
     "verification": "verification_part.fit_in_folds",
     "windows": "windows_part._fit_mosaics",
