@@ -26,13 +26,14 @@ from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation
 from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, cell_of, conclude, confirms, decide
 from semfov.detection.detections import Detections, highest_score
-from semfov.episode import Looks, Step, StoredLooks
+from semfov.episode import Looks, Step, StoredLooks, rollout
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye
 from semfov.fit.looking import CellLooks
-from semfov.fit.protocols import DrawnSearch, choose_searches, search_steps
+from semfov.fit.protocols import DrawnSearch, choose_searches
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.gaze.acquisition.base import Task
+from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Policy
 from semfov.io.ranges import Range, Share
 from semfov.model_folder import ModelFolder
@@ -267,7 +268,7 @@ class DecisionRun(ComparedLooking):
                 strategy = Strategy(changed.observer, compared.policy)
                 verifier = self._verifier(remembered, grid, target, prior) if name in self.verified else None
                 with torch.inference_mode():
-                    steps = search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
+                    steps = _search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
                     last, path = steps[-1], torch.cat([step.cell for step in steps])
                     if verifier is not None:
                         decision = verifier.conclude()
@@ -404,3 +405,28 @@ def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
         means = [sum(column) / len(column) for column in zip(*(pair for pair, _ in group), strict=True)]
         cells += [str(len(group)), " → ".join(f"{value:.3f}" for value in means) or "-"]
     return cells
+
+
+def _search_steps(
+    looks: Looks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
+) -> list[Step]:
+    """Run one search until it decides or all looks are spent.
+
+    Args:
+        looks: the looks at the picture.
+        strategy: the observer, and the policy that chooses fixations.
+        target: class 1..K.
+        start: `(1,)`, cell of the first fixation.
+        noise: `(1, N, X·Y)`, by which ties are broken; N is the largest number of looks.
+        rule: decides after a step: the number of the outcome `(1,)`, 0 to go on.
+
+    Returns:
+        The steps.
+    """
+
+    def ends(step: Step) -> Tensor:
+        return rule(step) > 0
+
+    policy = strategy.policy(target, looks.grid)
+    choice = Greedy(drawn_from(noise))
+    return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))

@@ -12,17 +12,13 @@ from torch import Tensor
 
 from eval.comparison.looking import ComparedLooking
 from eval.comparison.settings import ComparedConfig
+from eval.explore.episodes import counts_of, run_explorations
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
 from semfov.episode import StoredLooks
 from semfov.episode.stopwatch import Stopwatch
-from semfov.fit.protocols import (
-    Exploration,
-    counts_of,
-    explorations_of,
-    run_explorations,
-)
+from semfov.fit.protocols import Exploration, explorations_of
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig

@@ -1,6 +1,6 @@
 """The protocols of searches and explorations: the episodes of a scene, and their results."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,9 +10,8 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer, Semantic
 from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Step, StoredLooks, rollout
+from semfov.episode import StoredLooks, rollout
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.metrics.episodes import right_cells
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import generator_for, noise_for
 from semfov.strategy import Strategy
@@ -288,31 +287,6 @@ def _observation(strategy: Strategy, looks: StoredLooks, seeking: Tensor) -> tup
     return Semantic(1), StoredLooks(nothing, looks.grid)
 
 
-def search_steps(
-    looks: Looks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
-) -> list[Step]:
-    """Run one search until it decides or all looks are spent.
-
-    Args:
-        looks: the looks at the picture.
-        strategy: the observer, and the policy that chooses fixations.
-        target: class 1..K.
-        start: `(1,)`, cell of the first fixation.
-        noise: `(1, N, X·Y)`, by which ties are broken; N is the largest number of looks.
-        rule: decides after a step: the number of the outcome `(1,)`, 0 to go on.
-
-    Returns:
-        The steps.
-    """
-
-    def ends(step: Step) -> Tensor:
-        return rule(step) > 0
-
-    policy = strategy.policy(target, looks.grid)
-    choice = Greedy(drawn_from(noise))
-    return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))
-
-
 class Exploration(NamedTuple):
     """One exploration of a scene.
 
@@ -342,74 +316,3 @@ def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolCo
     generator = generator_for("start", protocol.seed, scenes.ids[index])
     starts = _in_rounds(cells, protocol.starts, generator).tolist()
     return [Exploration(index, number, start) for number, start in enumerate(starts)]
-
-
-_Progress = tuple[list[int], dict[str, list[int]]]
-"""Result of an exploration: the fixated cells in order, and numbers of right cells after each shift, by name."""
-
-
-def run_explorations(
-    episodes: Sequence[Exploration],
-    strategy: Strategy,
-    looks: StoredLooks,
-    answers: Tensor,
-    noise: Tensor,
-    *,
-    shifts: int,
-    batch: int,
-) -> list[_Progress]:
-    """Run explorations of one scene until their gaze shifts are spent or no cell is left.
-
-    Args:
-        episodes: B explorations.
-        strategy: the observer, and the policy that chooses fixations.
-        looks: the looks from every cell.
-        answers: `(X·Y, K+1)` boolean, the classes that each cell holds.
-        noise: `(B, shifts+1, X·Y)`, by which ties are broken.
-        shifts: largest number of gaze shifts.
-        batch: number of explorations that run side by side.
-
-    Returns:
-        For each exploration the fixated cells, and the numbers of right cells after each shift (`counts_of`).
-    """
-    starts = torch.tensor([episode.start for episode in episodes])
-    progress: list[_Progress] = []
-    for start, noise_of_batch in zip(starts.split(batch), noise.split(batch), strict=True):
-        visits = []
-        counts = []
-        steps = rollout(
-            looks,
-            strategy.observer,
-            lambda _, cell: strategy.acquisition(None, looks.grid, cell),
-            start,
-            Greedy(drawn_from(noise_of_batch)),
-            most=shifts + 1,
-        )
-        for step in steps:
-            visits.append(step.cell)
-            counts.append(counts_of(step.belief.class_probabilities(), answers))
-        # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
-        counts += [counts[-1]] * (shifts + 1 - len(counts))
-        by_name = {name: torch.stack([after[name] for after in counts], 1).tolist() for name in counts[0]}
-        for row, cells in enumerate(torch.stack(visits, 1).tolist()):
-            progress.append((cells, {name: numbers[row] for name, numbers in by_name.items()}))
-    return progress
-
-
-def counts_of(probabilities: Tensor, answers: Tensor) -> dict[str, Tensor]:
-    """Count the right cells of maps.
-
-    Args:
-        probabilities: `(B, X·Y, K+1)`, of background and classes.
-        answers: `(X·Y, K+1)` boolean, the classes that each cell holds; background never.
-
-    Returns:
-        Numbers `(B,)` of cells with objects that are right (`right`), that would be without background as an answer
-        (`right_without_background`), and of all cells that are right (`right_everywhere`).
-    """
-    everywhere = torch.cat([~answers.any(-1, keepdim=True), answers[:, 1:]], -1)
-    return {
-        "right": right_cells(probabilities, answers).sum(-1),
-        "right_without_background": right_cells(probabilities[..., 1:], answers[:, 1:]).sum(-1),
-        "right_everywhere": right_cells(probabilities, everywhere).sum(-1),
-    }

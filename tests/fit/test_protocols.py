@@ -9,11 +9,12 @@ import torch
 
 from eval.chance import random_search
 from eval.comparison.looking import Candidate
+from eval.explore.episodes import run_explorations
 from semfov import Detections, FovealObservationModel, Grid, fusion, policies
 from semfov.belief.observers.semantic import SemanticLook
 from semfov.data import Annotation
 from semfov.episode import StoredLooks
-from semfov.fit.protocols import episodes_of, explorations_of, run_episodes, run_explorations
+from semfov.fit.protocols import episodes_of, explorations_of, run_episodes
 from semfov.metrics.episodes import answers_of, cumulative_performance
 from semfov.runs.config import ProtocolConfig
 from semfov.runs.seeds import noise_for

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from eval.explore.episodes import counts_of
 from eval.explore.run import FUSED, PAINTED, _sharp_maps
 from semfov import Detections, Grid
-from semfov.fit.protocols import counts_of
 from tests.small import kaplan
 
 GRID = Grid(5, 4, (100, 60))
