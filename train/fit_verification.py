@@ -9,7 +9,8 @@ looks the places that seem to hold the target are looked at closely: a window ar
 input. Two logistic regressions learn from these closer looks whether the target is at the place, and whether it is in
 the photograph. Then the searches are repeated, each with a model that was fitted to other photographs, to evaluate the
 decisions and to choose their threshold. The folder `out` gets the model (`<name>.safetensors`) and the report. All
-looks are stored, photograph by photograph, in the folder `cache`: the same command continues an interrupted fit.
+looks are stored, photograph by photograph, in the folder `cache`, where `train.fit_search` finds them, too: the same
+command continues an interrupted fit.
 """
 
 import json
@@ -19,16 +20,16 @@ from pathlib import Path
 
 from semfov.belief.verification import TRUE_CELLS
 from semfov.errors import DataError, InputError
+from semfov.fit.looking import Looking
 from semfov.fit.searches import open_photographs
+from semfov.fit.settings import VerificationConfig
 from semfov.fit.training import training_of
-from semfov.fit.verification import VerificationConfig, fit_in_folds
+from semfov.fit.verification import fit_in_folds
 from semfov.fit.verification_report import verification_report
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
-from semfov.runs.scene_run import store_folder
-from semfov.runs.setup import make_eye, make_scenes, make_searching
-from semfov.runs.store import cell_store
+from semfov.runs.setup import make_searching
 from train.outputs import model_path, write_outputs
 
 
@@ -49,23 +50,20 @@ class FitVerificationConfig(VerificationConfig):
 
 def fit_verification(config: FitVerificationConfig) -> None:
     """Search the photographs, look closely at candidates, fit, evaluate in folds, and write all results."""
-    eye = make_eye(config.detector, config.sensor)
-    model = make_searching(config.search_model, eye)
+    run = Looking(config)
+    model = make_searching(config.search_model, run.eye)
     _check_thresholds(config, model)
-    scenes = make_scenes(config.data, eye.detector.classes)
-    if len(scenes) < config.folds:
-        raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(scenes)}")
-    components = len(eye.detector.classes) + 1
-    folder = store_folder(config.cache) / "searches"
-    store = cell_store(folder, eye.settings(), config.columns, config.rows, components)
-    photographs = open_photographs(eye, scenes, range(len(scenes)), config, store=store)
+    count = len(run.scenes)
+    if count < config.folds:
+        raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {count}")
+    photographs = open_photographs(run, range(count), config)
     fitted = fit_in_folds(photographs, model, config)
     fitted.model.metadata = {
-        **eye.settings(),
+        **run.eye.settings(),
         TRUE_CELLS: model.true_cells,
-        **training_of(config, scenes, "search_model"),
+        **training_of(config, run.scenes, "search_model"),
     }
-    path = model_path(config, eye.detector.name)
+    path = model_path(config, run.eye.detector.name)
     fitted.model.save(path)
     report = verification_report(fitted, f"{len(photographs)} photographs")
     write_outputs(config, report.text, ("judged.json", json.dumps(report.figures, indent=2) + "\n"), path)

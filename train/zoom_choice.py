@@ -1,4 +1,4 @@
-"""Choose `foresight`, a setting of the choice of windows, on mosaics of held-out photographs."""
+"""Judge a survey, and choose its `foresight`, on mosaics of held-out photographs."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -8,10 +8,12 @@ import torch
 from semfov.data.mosaics import Mosaics
 from semfov.fit.window_looking import found_in
 from semfov.fit.windows import MosaicFit
+from semfov.fit.windows_evidence import ZoomExample
 from semfov.runs.progress import track
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.looks import WindowLook, WindowLooks
+from semfov.zoom.survey import Survey
 
 _FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
 
@@ -69,3 +71,28 @@ def _mean_recall(model: GlimpseEvidence, opened: Sequence[WindowLooks], mosaics:
             # When no window is left, the number of found objects stays the same for the remaining passes.
             found += count
     return found / max(passes * objects, 1)
+
+
+@torch.no_grad()
+def judge_survey(survey: Survey, examples: Sequence[ZoomExample], where: str = "") -> dict[str, float]:
+    """Average the losses on mosaics that were held out, by the overview and by closer looks.
+
+    Args:
+        survey: predicts the numbers of objects of any class.
+        examples: the mosaics.
+        where: what is added to the names of the measures.
+
+    Returns:
+        The measures by name.
+    """
+    name = "objects of any class, mean negative log likelihood"
+    of_overviews = []
+    of_closer_looks = []
+    for example in examples:
+        overview, *closer = example.losses(survey, None, example.closer)
+        of_overviews.append(overview)
+        of_closer_looks += closer
+    figures = {f"{name}, overview{where}": float(torch.stack(of_overviews).mean())}
+    if of_closer_looks:
+        figures[f"{name}, closer looks{where}"] = float(torch.stack(of_closer_looks).mean())
+    return figures

@@ -1,21 +1,27 @@
 """Pictures of many kinds, composed of photographs, to fit evidence by magnification on."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Scenes
-from semfov.fit.windows import MosaicFit, crowded
+from semfov.fit.windows import MosaicFit, RefitPart, crowded, measure_table
+from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.ranges import Count
+from semfov.runs.tables import table
+from semfov.zoom.evidence import GlimpseEvidence
 from train.scattered import Scattered
-
-RefitPart = Literal["decision", "survey", "verification", "certainty", "spread", "photograph"]
+from train.zoom_choice import choose_foresight, judge_survey
 
 PictureKind = Literal["few", "many", "one class", "photographs", "objects"]
 """Mosaics of 3 × 3 photographs; of 12 × 12 of half the size; of 8 × 6 that share a class; photographs, and single
 objects of few classes, scattered over one ground."""
+
+_JUDGED = ("judged", "judged far", "judged crowded")
+"""Mosaics of held-out photographs on which foresight is chosen."""
 
 PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)
 
@@ -34,8 +40,8 @@ class FitZoomConfig(FitMosaicsConfig):
         refit: parts of that model to fit again: `decision`, the decisions of searches, `verification`, the
             probabilities after closer looks at places that seem to hold the target, `survey`, the number of objects of
             any class that closer looks find, `certainty`, the probability that an object is there, with the spread of
-            expected numbers, `spread`, that alone, and `photograph`, the evidence for photographs. The verification
-            has to follow new decisions; without it they are made without closer looks.
+            expected numbers, and `photograph`, the evidence for photographs. The verification has to follow new
+            decisions; without it they are made without closer looks.
     """
 
     judged_far: Count = 4
@@ -62,6 +68,27 @@ class PicturesFit(MosaicFit):
             self.pictures[f"judged {kind}"] = _compose_pictures(
                 kind, self.held_out, config.judged_each, config.seed + 20, config.tile
             )
+
+    def looked(self, parts: Collection[RefitPart], anew: bool) -> list[str]:
+        """List also the held-out mosaics that judge a survey."""
+        kinds = super().looked(parts, anew)
+        return [*kinds, "judged crowded"] if "survey" in parts else kinds
+
+    def fit_survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
+        """Fit a survey, evaluate it, and choose the foresight of explorations; returns lines of Markdown."""
+        super().fit_survey(model, examples)
+        measures = judge_survey(model.survey, examples["judged"])
+        measures |= judge_survey(model.survey, examples["judged crowded"], ", crowded")
+        self.figures |= measures
+        tried = choose_foresight(model, self, _JUDGED)
+        return [
+            *measure_table(measures),
+            "",
+            f"Foresight chosen for finding all objects: {model.survey.foresight:g}.",
+            "",
+            *table(tried),
+            "",
+        ]
 
 
 def _compose_pictures(kind: PictureKind, scenes: Scenes, count: int, seed: int, tile: int = 480) -> Scenes:

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import FloatArray, standard_error
 from semfov.runs.tables import percent, plus_minus, table
 
@@ -69,13 +68,11 @@ def curves_table(head: list[str], curves: Mapping[str, FloatArray], numbers: Seq
     return [head, *([name, *(mean_percent(curve[:, n]) for n in numbers)] for name, curve in curves.items())]
 
 
-def curves_figure(curves: Mapping[str, FloatArray], task: Task) -> Any:
-    """Plot the means of curves `(P, shifts+1)` over photographs, with their standard errors."""
+def curves_figure(curves: Mapping[str, FloatArray]) -> Any:
+    """Plot the means of curves of searches `(P, shifts+1)` over photographs, with their standard errors."""
     from semfov.viz import plot_curves
 
     means = {name: curve.mean(0) for name, curve in curves.items()}
     errors = {name: standard_error(curve) for name, curve in curves.items()}
     title = f"Held-out photographs ({len(curves['raw'])})"
-    if task == "search":
-        return plot_curves(means, errors, label="targets found (%)", title=title, most=102)
-    return plot_curves(means, errors, label="cells with the right class (%)", title=title, most=None)
+    return plot_curves(means, errors, label="targets found (%)", title=title, most=102)

@@ -15,6 +15,7 @@ def logistic_regression(
     times: Tensor | None = None,
     known: Tensor | None = None,
     ridge: float = 1.0,
+    prior: tuple[Tensor, Tensor] | None = None,
     steps: int = 30,
 ) -> list[float]:
     """Fit a logistic regression by penalised maximum likelihood, with Newton's method.
@@ -25,6 +26,7 @@ def logistic_regression(
         times: `(n,)`, how often each case counts; None: once.
         known: `(n,)`, log odds of each case that are given, and to which the fitted ones are added; None: 0.
         ridge: strength with which the weights are held near 0.
+        prior: centre and precision of a normal prior of offset and weights, each `(m + 1,)`, in place of `ridge`.
         steps: largest number of steps.
 
     Returns:
@@ -35,19 +37,24 @@ def logistic_regression(
     inputs = torch.cat([torch.ones(len(inputs), 1, dtype=torch.float64), inputs], -1)
     answers = torch.cat([right.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
     weight = torch.ones(len(inputs), dtype=torch.float64)
-    weight[-2:] = 0.5
+    weight[-2:] = 0.5 if prior is None else 0.0
     if times is not None:
         weight[:-2] = times
     given = torch.zeros_like(weight)
     if known is not None:
         given[:-2] = known
-    prior = torch.full((inputs.shape[-1],), ridge, dtype=torch.float64)
-    prior[0] = _OF_OFFSET
-    coefficients = torch.zeros_like(prior)
+    if prior is None:
+        centre = torch.zeros(inputs.shape[-1], dtype=torch.float64)
+        precision = torch.full_like(centre, ridge)
+        precision[0] = _OF_OFFSET
+    else:
+        # Cases that the facts separate must not push the coefficients to infinity.
+        centre, precision = prior[0], prior[1].clamp(min=_OF_OFFSET)
+    coefficients = centre.clone()
     for _ in range(steps):
         chance = (given + inputs @ coefficients).sigmoid()
-        gradient = inputs.T @ (weight * (answers - chance)) - prior * coefficients
-        curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + prior.diag()
+        gradient = inputs.T @ (weight * (answers - chance)) - precision * (coefficients - centre)
+        curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + precision.diag()
         step = torch.linalg.solve(curvature, gradient).clamp(-_LONGEST_STEP, _LONGEST_STEP)
         coefficients = coefficients + step
         if float(step.abs().max()) < _CONVERGED:

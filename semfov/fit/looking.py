@@ -92,14 +92,14 @@ class Looking(SceneRun):
         looks.save()
         return detections
 
-    def looks(self, index: int) -> RememberedLooks[int, Detections]:
-        """Open a scene for looks from some of its cells, or read them from the store; `save` keeps them.
+    def looks(self, index: int) -> RememberedLooks[int | tuple[float, ...], Detections]:
+        """Open a scene for looks from some of its cells or closely at boxes, or read them from the store.
 
         Args:
             index: number of the scene.
 
         Returns:
-            A function from a cell to the detections, a batch of one.
+            A function from a cell, or from a box, to the detections, a batch of one; its `save` keeps the looks.
         """
         keeps_none = isinstance(self.config, LookingConfig) and not self.config.store
         return RememberedLooks(

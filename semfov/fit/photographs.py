@@ -10,11 +10,12 @@ from torch import Tensor
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
+from semfov.errors import DataError
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.protocols import choose_classes, numbers_drawn
 from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import VerificationInFolds, choose_confirm, examine, fit_to_closer_looks, verify
-from semfov.fit.verification_report import verification_report
+from semfov.fit.verification import fit_verification
+from semfov.fit.verification_report import NO_PLACES, verification_report
 from semfov.fit.windows_certainty import Exploration, fit_spread, left_out
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks
@@ -301,14 +302,11 @@ def _fit_closer_looks(
     evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: FitMosaicsConfig, prior: Verification | None
 ) -> str:
     """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
-    closer_looks = examine(searches, _FOLDS)
-    if closer_looks is None:
-        return "None, since there are no places that hold the target, or none that do not.\n"
-    folds = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(_FOLDS)]
-    decisions = list(verify(searches, folds, Thresholds(1.0, config.stop_below, config.stop_below), None))
-    confirm = choose_confirm(decisions, _FALSE_ALARMS, config.surest)
-    fitted = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
-    fitted.thresholds = Thresholds(confirm, config.stop_below, config.stop_below)
-    evidence.verification = fitted
+    limits = Thresholds(1.0, config.stop_below, config.stop_below)
+    try:
+        fitted = fit_verification(searches, searches, _FOLDS, limits, _FALSE_ALARMS, config.surest, prior)
+    except DataError:
+        return NO_PLACES
+    evidence.verification = fitted.model
     pictures = f"{len({search.picture for search in searches})} photographs"
-    return verification_report(VerificationInFolds(fitted, folds, closer_looks, decisions), pictures).text
+    return verification_report(fitted, pictures).text

@@ -21,12 +21,12 @@ from semfov.fit.presence import COUNTED, BeliefsOfSearches, fit_presence, judge_
 from semfov.fit.protocols import choose_searches, numbers_drawn
 from semfov.fit.settings import FitOnCellsConfig
 from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
-from semfov.fit.training import Fit, split, training_of
+from semfov.fit.training import split, training_of
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.ranges import Count, Positive, Range, Share, Whole
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.presence import Presence, log_odds_of_cells
+from semfov.observation.presence import log_odds_of_cells
 from semfov.runs.config import DataConfig, ProtocolConfig
 from semfov.runs.progress import track
 from semfov.runs.setup import make_scenes
@@ -70,9 +70,56 @@ class FitSearchConfig(FitOnCellsConfig):
     out: Path = Path("runs/fit_search")
 
 
+class FittedSearch(NamedTuple):
+    """A model fitted for searches, and its evaluation.
+
+    Attributes:
+        model: the fitted model.
+        judged: measures on held-out searches, a row for each number of looks (`judge_presence`).
+        trained: number of searches that the evaluated presence was fitted to.
+        held_out: number of searches that it was evaluated on.
+    """
+
+    model: FovealObservationModel
+    judged: list[dict[str, float]]
+    trained: int
+    held_out: int
+
+    @property
+    def report(self) -> str:
+        """The evaluation, the presence of the model and its thresholds, in Markdown."""
+        presence = self.model.presence
+        assert presence is not None
+        thresholds = presence.thresholds
+        assert thresholds is not None
+        cell, score = presence.weight.tolist()
+        rows = [["looks", "gaze on target, %", "area under ROC", "ECE", "NLL"]]
+        for row in self.judged:
+            figures = (f"{row[name]:.3f}" for name in ("area", "ece", "nll"))
+            rows.append([str(int(row["looks"])), f"{100 * row['found']:.1f}", *figures])
+        return "\n".join(
+            [
+                f"Fitted to {self.trained} searches for present and for absent classes, and evaluated on "
+                f"{self.held_out} searches of held-out photographs. The table shows how often the gaze has reached the "
+                "target; how well the probability of presence tells present from absent classes; its expected "
+                "calibration error (ECE), and its negative log likelihood (NLL).",
+                "",
+                *table(rows),
+                "",
+                f"Presence: logit P = {float(presence.offset):.2f} + {cell:.2f} logit of the most "
+                f"probable cell + {score:.2f} mean ln of the highest scores.",
+                "",
+                "Thresholds: the target counts as found if the probability of its presence is at least "
+                f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search "
+                f"gives up if no other cell has a probability of at least {thresholds.stop_below:.3f}.",
+                "",
+            ]
+        )
+
+
 def fit_search(
     start: FovealObservationModel, config: FitSearchConfig, run: Looking, *, hold_out: bool = False
-) -> Fit[FovealObservationModel]:
+) -> FittedSearch:
     """Fit odds of a miss, presence and thresholds to photographs, and evaluate them on held-out ones.
 
     Args:
@@ -103,9 +150,7 @@ def fit_search(
     # Of searches for as many absent classes as present ones, which have their target in half of all cases.
     model.presence.shares.copy_(shares_drawn(drawn, config, None))
     model.metadata |= {**run.eye.settings(), **training_of(config, run.scenes, "model", "drawn")}
-    trained = int((~held_out).sum())
-    tested = int(held_out.sum())
-    return Fit(model, judged, trained, tested, search_report(judged, model.presence, trained, tested))
+    return FittedSearch(model, judged, int((~held_out).sum()), int(held_out.sum()))
 
 
 def check_start(start: FovealObservationModel, config: FitSearchConfig) -> None:
@@ -304,42 +349,3 @@ def _facts(step: Step, targets: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
     holds = goal.gather(-1, cells.argmax(-1, keepdim=True))[:, 0]
     hits = goal.gather(-1, best[:, None])[:, 0] & ~visited.all(-1)
     return belief.facts(targets).mT, place, hit_chance, holds, hits, (visited & goal).any(-1)
-
-
-def search_report(judged: Sequence[dict[str, float]], presence: Presence, trained: int, held_out: int) -> str:
-    """Report the evaluation, the presence and its thresholds as Markdown.
-
-    Args:
-        judged: measures on held-out searches (`judge_presence`).
-        presence: the presence of the model.
-        trained: number of searches that the evaluated one was fitted to.
-        held_out: number of searches that it was evaluated on.
-
-    Returns:
-        The report.
-    """
-    thresholds = presence.thresholds
-    assert thresholds is not None
-    cell, score = presence.weight.tolist()
-    rows = [["looks", "gaze on target, %", "area under ROC", "ECE", "NLL"]]
-    for row in judged:
-        figures = (f"{row[name]:.3f}" for name in ("area", "ece", "nll"))
-        rows.append([str(int(row["looks"])), f"{100 * row['found']:.1f}", *figures])
-    return "\n".join(
-        [
-            f"Fitted to {trained} searches for present and for absent classes, and evaluated on {held_out} searches of "
-            "held-out photographs. The table shows how often the gaze has reached the target; how well the probability "
-            "of presence tells present from absent classes; its expected calibration error (ECE), and its negative log "
-            "likelihood (NLL).",
-            "",
-            *table(rows),
-            "",
-            f"Presence: logit P = {float(presence.offset):.2f} + {cell:.2f} logit of the most "
-            f"probable cell + {score:.2f} mean ln of the highest scores.",
-            "",
-            f"Thresholds: the target counts as found if the probability of its presence is at least "
-            f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search gives up "
-            f"if no other cell has a probability of at least {thresholds.stop_below:.3f}.",
-            "",
-        ]
-    )

@@ -14,7 +14,7 @@ from semfov.fit.detector_report import Difference, curves_figure, curves_table, 
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.presence import thresholds_of_searches
 from semfov.fit.protocols import episodes_of, run_episodes
-from semfov.fit.search import FitSearchConfig, fit_search, search_photographs, search_report
+from semfov.fit.search import FitSearchConfig, fit_search, search_photographs
 from semfov.fit.thresholds import SUREST, SUREST_OF_FEW
 from semfov.gaze.policies import Policy
 from semfov.metrics.episodes import FloatArray, cumulative_performance
@@ -63,13 +63,8 @@ class SearchFit(PartFit):
         if not len(curves["raw"]):
             raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
         gain, why = self._compare(curves)
-        report = "\n".join(
-            [
-                self._report_on_curves(curves),
-                search_report(fitted.judged, presence, fitted.trained, fitted.held_out),
-            ]
-        )
-        save_figure(curves_figure(curves, "search"), self.config.out / "search.png")
+        report = "\n".join([self._report_on_curves(curves), fitted.report])
+        save_figure(curves_figure(curves), self.config.out / "search.png")
         return PartResult(self.write("search", model, gain.better, why), report, ["search.png"])
 
     def _start(self) -> FovealObservationModel:

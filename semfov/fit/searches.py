@@ -2,31 +2,28 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import ClassVar, Generic, NamedTuple, Protocol
+from typing import ClassVar, Generic, NamedTuple
 
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import SemanticSearch
-from semfov.data.scene import Scenes
-from semfov.decision import MOST_CLOSER, OUTCOMES, CandidateCells, CandidatePlaces, cell_of, conclude, decide
+from semfov.decision import FOUND, MOST_CLOSER, CandidateCells, CandidatePlaces, cell_of, conclude, decide
 from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
-from semfov.eye import Eye
-from semfov.fit.looking import CellLooks
+from semfov.fit.looking import CellLooks, Looking
 from semfov.fit.protocols import DrawnSearch, choose_classes, choose_searches
+from semfov.fit.settings import VerificationConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import ProtocolConfig
-from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
-from semfov.runs.store import DetectionStore, RememberedLooks
+from semfov.runs.store import RememberedLooks
 
 
 class SearchEnd(NamedTuple):
@@ -82,98 +79,38 @@ class TargetSearch(ABC, Generic[LookType]):
     def right(self, box: Tensor) -> bool:
         """Tell whether the target is at a box `(4,)`."""
 
-    def outcome(self, index: int, thresholds: Thresholds) -> int:
-        """Decide after a look by the belief alone: the outcome's number in `OUTCOMES`, 0 to go on."""
-        return 0
-
-    def found_right(self, index: int) -> bool:
-        """Tell whether the target is at the place that a search finds after a look by the belief alone."""
-        raise NotImplementedError(f"{type(self).__name__} finds no place without closer looks")
-
-    def unverified_end(self, thresholds: Thresholds | None) -> SearchEnd:
-        """Decide along the looks without closer looks; nothing is found without thresholds."""
-        if thresholds is not None:
-            for index in range(len(self)):
-                outcome = self.outcome(index, thresholds)
-                if OUTCOMES[outcome] == "found":
-                    return SearchEnd(self.found_right(index), index + 1)
-                if outcome:
-                    return SearchEnd(None, index + 1)
-        return SearchEnd(None, len(self))
+    def unverified(self) -> SearchEnd | None:
+        """Return the end of the search without closer looks, where the belief alone can decide; None elsewhere."""
+        return None
 
 
-class SearchedPhotograph:
-    """A photograph with the classes to search for, and all looks at it so far, by cell and by box."""
+class SearchedPhotograph(NamedTuple):
+    """A photograph with the classes to search for, and all looks at it so far.
 
-    def __init__(
-        self,
-        eye: Eye,
-        scenes: Scenes,
-        index: int,
-        number: int,
-        grid: Grid,
-        targets: tuple[DrawnSearch, ...],
-        store: DetectionStore | None = None,
-    ) -> None:
-        self.eye = eye
-        self.scenes = scenes
-        self.index = index
-        self.number = number
-        self.grid = grid
-        self.targets = targets
-        self.looks: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
-            self._open, store, lambda: scenes.digest(index)
-        )
+    Attributes:
+        index: number of the photograph in its set.
+        number: number among those that are searched.
+        grid: the cells.
+        targets: the searches.
+        looks: looks by cell and by box.
+    """
 
-    def _open(self) -> Callable[[int | tuple[float, ...]], Detections]:
-        return photograph_looks(self.eye, lambda: self.scenes[self.index].image[None], self.grid)
-
-
-class DrawingSettings(Protocol):
-    """Settings by which classes to search for are drawn, as those of a `VerificationConfig`."""
-
-    @property
-    def columns(self) -> int:
-        """Columns of the grid."""
-
-    @property
-    def rows(self) -> int:
-        """Rows of the grid."""
-
-    @property
-    def classes(self) -> int:
-        """Largest number of present classes in each photograph."""
-
-    @property
-    def absent(self) -> int | None:
-        """Largest number of absent classes; None: as many as present ones."""
-
-    @property
-    def max_target_area(self) -> float:
-        """Share of the image from which on a class is too large to be searched for."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of the draw."""
+    index: int
+    number: int
+    grid: Grid
+    targets: tuple[DrawnSearch, ...]
+    looks: RememberedLooks[int | tuple[float, ...], Detections]
 
 
 def open_photographs(
-    eye: Eye,
-    scenes: Scenes,
-    chosen: Sequence[int],
-    config: DrawingSettings,
-    *,
-    store: DetectionStore | None = None,
-    spare: int = 0,
+    run: Looking, chosen: Sequence[int], config: VerificationConfig, *, spare: int = 0
 ) -> list[SearchedPhotograph]:
     """Draw classes to search for in photographs.
 
     Args:
-        eye: looks at the photographs.
-        scenes: the photographs.
+        run: the photographs and their stored looks.
         chosen: numbers of those to search.
         config: how classes are drawn.
-        store: keeps the looks on disk (None: they stay in memory).
         spare: number of further absent classes in each photograph, which serve only to choose thresholds.
 
     Returns:
@@ -181,9 +118,10 @@ def open_photographs(
     """
     photographs: list[SearchedPhotograph] = []
     protocol = ProtocolConfig(seed=config.seed)
+    scenes = run.scenes
     for index in chosen:
         annotation = scenes.annotation(index)
-        grid = Grid(config.columns, config.rows, annotation.size)
+        grid = run.grid(index)
         targets = choose_classes(
             scenes, index, annotation, config.classes, config.max_target_area, config.seed, config.absent
         )
@@ -194,7 +132,7 @@ def open_photographs(
         # The same draw with a larger number begins with the same classes.
         searches = choose_searches(scenes, index, grid, protocol, config.classes, config.max_target_area, absent)
         drawn = tuple(search._replace(spare=place >= len(targets)) for place, search in enumerate(searches))
-        photographs.append(SearchedPhotograph(eye, scenes, index, len(photographs), grid, drawn, store))
+        photographs.append(SearchedPhotograph(index, len(photographs), grid, drawn, run.looks(index)))
     return photographs
 
 
@@ -213,6 +151,7 @@ class _PhotographSearch(TargetSearch[Step]):
         self.photograph = photograph
         self.search = search
         self.observer = SemanticSearch(model).with_prior("fit", search.target)
+        self.thresholds = None if model.presence is None else model.presence.thresholds
         self.most_looks = looks
 
     @cached_property
@@ -241,15 +180,19 @@ class _PhotographSearch(TargetSearch[Step]):
         """Tell whether an object of the class overlaps the cell of a box `(4,)`."""
         return bool(self.search.goal[cell_of(box, self.photograph.grid)])
 
-    def outcome(self, index: int, thresholds: Thresholds) -> int:
-        return int(decide(self.steps[index], self.target, thresholds))
-
-    def found_right(self, index: int) -> bool:
-        """Tell whether an object overlaps the cell of the decision."""
-        looks = [step.detections for step in self.steps[: index + 1]]
-        found = OUTCOMES.index("found")
-        decision = conclude(found, self.steps[index].belief, looks, self.photograph.grid, self.target)
-        return bool(self.search.goal[decision.cell])
+    def unverified(self) -> SearchEnd | None:
+        """Decide by the thresholds of the model; the place is right if an object overlaps the cell of the decision."""
+        if self.thresholds is None:
+            return None
+        for index, step in enumerate(self.steps):
+            outcome = int(decide(step, self.target, self.thresholds))
+            if outcome == FOUND:
+                looks = [earlier.detections for earlier in self.steps[: index + 1]]
+                decision = conclude(outcome, step.belief, looks, self.photograph.grid, self.target)
+                return SearchEnd(bool(self.search.goal[decision.cell]), index + 1)
+            if outcome:
+                return SearchEnd(None, index + 1)
+        return SearchEnd(None, len(self))
 
 
 def photograph_searches(

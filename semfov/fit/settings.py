@@ -6,7 +6,7 @@ from typing import Annotated
 
 from semfov.errors import InputError
 from semfov.fit.gaze_model import GazeModelFit
-from semfov.io.ranges import Count, Positive, Range, Seed, Side, SingleName, Whole
+from semfov.io.ranges import Count, Positive, Range, Seed, Share, Side, SingleName, Whole
 from semfov.runs.config import DataConfig, DetectorConfig, EyeConfig
 
 
@@ -42,6 +42,31 @@ class FitOnCellsConfig(FitConfig):
     def cells(self) -> tuple[int, int]:
         """Columns and rows of the grid."""
         return self.columns, self.rows
+
+
+@dataclass(frozen=True)
+class VerificationConfig(FitOnCellsConfig):
+    """Fit the verification of targets.
+
+    Args:
+        classes: maximum number of present classes to search for in each photograph.
+        absent: maximum number of absent classes to search for (None: as many as present ones).
+        max_target_area: classes that cover a larger share of the image are not searched for.
+        looks: number of looks in a search.
+        place: least probability of a cell that is worth a closer look.
+        stop_below: least probability of a cell that is worth a fixation.
+        false_alarms: maximum share of absent targets that may be reported as found; it determines `confirm`.
+        folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
+    """
+
+    classes: Count = 2
+    absent: Count | None = None
+    max_target_area: Positive = 0.2
+    looks: Annotated[int, Range(2, 10_000)] = 12
+    place: Share = 0.4
+    stop_below: Share = 0.03
+    false_alarms: Share = 0.01
+    folds: Annotated[int, Range(2, 1000)] = 5
 
 
 @dataclass(frozen=True)

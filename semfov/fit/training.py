@@ -2,19 +2,16 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import closing
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
-from semfov.io.pretrained import Pretrained
 from semfov.runs.config import WHERE
 from semfov.runs.progress import task_bar
 from semfov.runs.settings import Settings
-
-_Model = TypeVar("_Model", bound=Pretrained)
 
 
 def training_of(config: Settings, scenes: Scenes, *besides: str) -> dict[str, Any]:
@@ -31,24 +28,6 @@ def training_of(config: Settings, scenes: Scenes, *besides: str) -> dict[str, An
     left_out = {*WHERE, "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in config.plain().items() if name not in left_out}
     return {"data": scenes.fingerprint, "training": settings}
-
-
-class Fit(NamedTuple, Generic[_Model]):
-    """The result of a fit.
-
-    Attributes:
-        model: the fitted model.
-        judged: measures on held-out photographs, a row for each number of looks.
-        trained: number of examples that it was fitted to.
-        held_out: number of examples that were held out.
-        report: the evaluation, in Markdown.
-    """
-
-    model: _Model
-    judged: list[dict[str, float]]
-    trained: int
-    held_out: int
-    report: str
 
 
 def split(scene: Tensor, holdout: int) -> Tensor:

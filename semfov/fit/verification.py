@@ -2,22 +2,19 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.belief.prior import with_prior
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import FOUND, Verifier, final_outcome, found_at_once
 from semfov.decision.candidates import LookType
 from semfov.errors import DataError
+from semfov.fit.logistic import logistic_regression
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, TargetSearch, photograph_searches
-from semfov.fit.settings import FitOnCellsConfig
-from semfov.io.ranges import Count, Positive, Range, Share
-from semfov.observation.descent import Lbfgs
+from semfov.fit.settings import VerificationConfig
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.thresholds import Thresholds
 
@@ -28,31 +25,6 @@ _STRENGTH = 10.0
 _PLACES = 3  # places examined after some looks
 _LEAST_CHANCE = 0.01  # least probability of these places
 _RIDGE = 1e-4
-
-
-@dataclass(frozen=True)
-class VerificationConfig(FitOnCellsConfig):
-    """Fit the verification of targets.
-
-    Args:
-        classes: maximum number of present classes to search for in each photograph.
-        absent: maximum number of absent classes to search for (None: as many as present ones).
-        max_target_area: classes that cover a larger share of the image are not searched for.
-        looks: number of looks in a search.
-        place: least probability of a cell that is worth a closer look.
-        stop_below: least probability of a cell that is worth a fixation.
-        false_alarms: maximum share of absent targets that may be reported as found; it determines `confirm`.
-        folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
-    """
-
-    classes: Count = 2
-    absent: Count | None = None
-    max_target_area: Positive = 0.2
-    looks: Annotated[int, Range(2, 10_000)] = 12
-    place: Share = 0.4
-    stop_below: Share = 0.03
-    false_alarms: Share = 0.01
-    folds: Annotated[int, Range(2, 1000)] = 5
 
 
 class VerifiedSearch(NamedTuple):
@@ -66,7 +38,7 @@ class VerifiedSearch(NamedTuple):
         ends: number of looks up to each closer look, itself included; empty where no place ends a search.
         presence: probability that the picture holds the target, at the end.
         looks: number of all looks.
-        unverified: end of the search without closer looks.
+        unverified: end of the search without closer looks; None where the belief alone does not decide.
     """
 
     picture: int
@@ -76,7 +48,7 @@ class VerifiedSearch(NamedTuple):
     ends: tuple[int, ...]
     presence: float
     looks: int
-    unverified: SearchEnd
+    unverified: SearchEnd | None
 
     def found(self, confirm: float) -> SearchEnd:
         """Return the end of the search at a threshold."""
@@ -132,7 +104,7 @@ def fit_in_folds(
     prior: Verification | None = None,
     surest: float = _LEVELS[-1],
 ) -> VerificationInFolds:
-    """Fit the model and those of folds to closer looks, search again in the folds, and choose `confirm` on that.
+    """Fit a verification to searches of photographs by a fovea (`fit_verification`).
 
     Args:
         photographs: photographs with the classes to search for.
@@ -145,28 +117,79 @@ def fit_in_folds(
         The model, with thresholds, and what its report is made of.
 
     Raises:
-        DataError: all places that were examined hold the target, or none does.
+        DataError: the closer looks are of one kind.
     """
+    # The searches are made twice: all of them with their looks would not stay in memory.
     first = photograph_searches(photographs, searching, config.looks, "looking")
-    closer_looks = examine(first, config.folds)
-    if closer_looks is None:
-        raise DataError("data: expected places that hold the target and places that do not, got only one kind")
+    again = photograph_searches(photographs, searching, config.looks, "verifying")
+    limits = Thresholds(1.0, config.stop_below, config.place)
+    return fit_verification(first, again, config.folds, limits, config.false_alarms, surest, prior)
+
+
+def fit_verification(
+    first: Iterable[TargetSearch[LookType]],
+    again: Iterable[TargetSearch[LookType]],
+    folds: int,
+    limits: Thresholds,
+    false_alarms: float,
+    surest: float,
+    prior: Verification | None = None,
+) -> VerificationInFolds:
+    """Fit the model and those of folds to closer looks, decide searches in the folds, and choose `confirm` on that.
+
+    Args:
+        first: searches in which closer looks are made to fit to.
+        again: the same searches, to be decided.
+        folds: number of parts of the pictures.
+        limits: `stop_below` and `place` of the model, with `confirm` 1.
+        false_alarms: largest share of the absent targets that may be found.
+        surest: upper limit of `confirm`.
+        prior: centre of the prior of the parameters (None: a weak one around 0).
+
+    Returns:
+        The model, with thresholds, and what its report is made of.
+
+    Raises:
+        DataError: the closer looks are of one kind.
+    """
+    closer_looks = examine(first, folds)
     if closer_looks.present.all() or not closer_looks.present.any():
         raise DataError("data: expected closer looks in photographs that hold the target and in others, got one kind")
-    folds = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(config.folds)]
+    models = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(folds)]
     model = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
-    again = photograph_searches(photographs, searching, config.looks, "verifying")
-    # No place is sure, so that a search makes all its closer looks, and any threshold can be applied to it afterwards.
-    limits = Thresholds(1.0, config.stop_below, config.place)
-    thresholds = None if searching.presence is None else searching.presence.thresholds
-    searches = list(verify(again, folds, limits, thresholds))
-    confirm = choose_confirm(searches, config.false_alarms, surest)
-    model.thresholds = Thresholds(confirm, config.stop_below, config.place)
-    return VerificationInFolds(model, folds, closer_looks, searches)
+    return with_thresholds(model, models, closer_looks, again, limits, false_alarms, surest)
+
+
+def with_thresholds(
+    model: Verification,
+    folds: list[Verification],
+    closer_looks: CloserLooks,
+    searches: Iterable[TargetSearch[LookType]],
+    limits: Thresholds,
+    false_alarms: float,
+    surest: float,
+) -> VerificationInFolds:
+    """Decide searches by models that were not fitted to them, and choose `confirm` of a model on that.
+
+    Args:
+        model: gets the thresholds.
+        folds: models by fold of the pictures.
+        closer_looks: those that the models are evaluated on.
+        searches: the searches.
+        limits: `stop_below` and `place` of the model, with `confirm` 1.
+        false_alarms: largest share of the absent targets that may be found.
+        surest: upper limit of `confirm`.
+
+    Returns:
+        The model, and what its report is made of.
+    """
+    decided = list(verify(searches, folds, limits))
+    model.thresholds = limits.changed(confirm=choose_confirm(decided, false_alarms, surest))
+    return VerificationInFolds(model, folds, closer_looks, decided)
 
 
 @torch.inference_mode()
-def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> CloserLooks | None:
+def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> CloserLooks:
     """Look closely at the most evident places of every search.
 
     Args:
@@ -174,7 +197,10 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
         folds: number of folds of the pictures.
 
     Returns:
-        The closer looks; None if no place is right, or none is wrong.
+        The closer looks.
+
+    Raises:
+        DataError: no place is right, or none is wrong.
     """
     features: list[Tensor] = []
     right: list[bool] = []
@@ -192,7 +218,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
             fold.append(search.picture % folds)
             known.append(with_prior(0.0, prior.share, prior.fitted))
     if len({*right}) < 2:
-        return None
+        raise DataError("data: expected places that hold the target and places that do not, got only one kind")
     answers = torch.tensor(right), torch.tensor(present)
     return CloserLooks(torch.stack(features), *answers, torch.tensor(fold), torch.tensor(known))
 
@@ -218,26 +244,23 @@ def verify(
     searches: Iterable[TargetSearch[LookType]],
     folds: Sequence[Verification],
     limits: Thresholds,
-    thresholds: Thresholds | None,
 ) -> Iterator[VerifiedSearch]:
     """Make all closer looks of searches, with the model that was not fitted to their picture.
 
     Args:
         searches: searches for a class.
         folds: models by fold.
-        limits: which places are worth a closer look, and when no look is; with `confirm` 1 all closer looks are made.
-        thresholds: those of the belief, which decide searches without closer looks (None: these find nothing).
+        limits: which places are worth a closer look, and when no look is; with `confirm` 1 all closer looks are made,
+            so that any threshold can be applied to the search afterwards.
 
     Yields:
         Each search with all its closer looks.
     """
     for search in searches:
-        yield _verify_search(search, folds[search.picture % len(folds)], limits, thresholds)
+        yield _verify_search(search, folds[search.picture % len(folds)], limits)
 
 
-def _verify_search(
-    search: TargetSearch[LookType], model: Verification, limits: Thresholds, thresholds: Thresholds | None
-) -> VerifiedSearch:
+def _verify_search(search: TargetSearch[LookType], model: Verification, limits: Thresholds) -> VerifiedSearch:
     """Make all closer looks of a search, and decide it without them."""
     places = search.candidates()
     verifier = Verifier(model, places, search.close_up, limits, search.most)
@@ -262,7 +285,7 @@ def _verify_search(
         ends=() if places.exhaustive else tuple(ends),
         presence=verifier.conclude(room=0).probability,
         looks=looks,
-        unverified=search.unverified_end(thresholds),
+        unverified=search.unverified(),
     )
 
 
@@ -283,39 +306,6 @@ def choose_confirm(searches: Sequence[VerifiedSearch], false_alarms: float, sure
         if alarms <= false_alarms * len(absent):
             return min(confirm, surest)
     return surest
-
-
-class _Penalty(NamedTuple):
-    """Squared distance of the parameters of both regressions from a centre, with its strengths.
-
-    Attributes:
-        weight: `(2, 7)`, centre of the weights of standardised features.
-        bias: `(2,)`, centre of the offsets.
-        of_weights: strength for the weights.
-        of_biases: strength for the offsets.
-    """
-
-    weight: Tensor
-    bias: Tensor
-    of_weights: float
-    of_biases: float
-
-    @classmethod
-    def of(cls, prior: Verification | None, mean: Tensor, scale: Tensor, count: int) -> "_Penalty":
-        """Make the penalty for `count` closer looks, whose features have this mean and scale `(7,)`."""
-        if prior is None:
-            weight = torch.zeros(2, CLOSER_FEATURES, dtype=torch.float64)
-            bias = torch.zeros(2, dtype=torch.float64)
-            return cls(weight, bias, _RIDGE, 0.0)
-        weight = prior.linear.weight.detach().double()
-        bias = prior.linear.bias.detach().double() + weight @ mean
-        strength = _STRENGTH / count
-        return cls(weight * scale, bias, strength, strength)
-
-    def add_to(self, loss: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Return a loss with the penalty of parameters `(2, 7)` and `(2,)`."""
-        loss = loss + self.of_weights * (weight - self.weight).square().sum()
-        return loss + self.of_biases * (bias - self.bias).square().sum()
 
 
 def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
@@ -343,29 +333,24 @@ def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verifi
     known = closer_looks.known[chosen].double()
     if len(features) < 2:
         raise DataError(f"data: expected closer looks in all folds but one, got {len(features)}; give more photographs")
-    answers = torch.stack([closer_looks.right, closer_looks.present], -1)[chosen].double()
     mean = features.mean(0)
     scale = features.std(0).clamp(min=1e-6)  # of a feature that is always the same
     standardised = (features - mean) / scale
-    penalty = _Penalty.of(prior, mean, scale, len(features))
-    weight = penalty.weight.clone().requires_grad_(True)
-    bias = penalty.bias.clone().requires_grad_(True)
-    optimiser = Lbfgs([weight, bias], max_iter=200, line_search_fn="strong_wolfe")
-
-    def loss() -> Tensor:
-        optimiser.zero_grad()
-        log_odds = standardised @ weight.mT + bias + known[:, None]
-        likelihood = F.binary_cross_entropy_with_logits(log_odds, answers, reduction="none").mean(0).sum()
-        value = penalty.add_to(likelihood, weight, bias)
-        value.backward()
-        return value
-
-    optimiser.step(loss)
     model = Verification()
-    with torch.no_grad():
+    for row, answers in enumerate((closer_looks.right, closer_looks.present)):
+        centre = torch.zeros(CLOSER_FEATURES + 1, dtype=torch.float64)
+        precision = torch.full_like(centre, 2 * _RIDGE * len(features))
+        precision[0] = 0.0
+        if prior is not None:
+            weight = prior.linear.weight[row].detach().double()
+            centre = torch.cat([(prior.linear.bias[row].detach().double() + weight @ mean)[None], weight * scale])
+            precision = torch.full_like(centre, 2 * _STRENGTH)
+        offset, *weights = logistic_regression(standardised, answers[chosen], known=known, prior=(centre, precision))
         # The model reads features as they are.
-        model.linear.weight.copy_(weight / scale)
-        model.linear.bias.copy_(bias - (weight / scale) @ mean)
+        of_feature = torch.tensor(weights, dtype=torch.float64) / scale
+        with torch.no_grad():
+            model.linear.weight[row] = of_feature
+            model.linear.bias[row] = offset - of_feature @ mean
     return model.eval().requires_grad_(False)
 
 

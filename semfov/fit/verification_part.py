@@ -10,9 +10,10 @@ from semfov.errors import DataError
 from semfov.fit.detector_report import Difference
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, open_photographs
+from semfov.fit.settings import VerificationConfig
 from semfov.fit.thresholds import SUREST_OF_FEW
 from semfov.fit.training import training_of
-from semfov.fit.verification import VerificationConfig, VerificationInFolds, VerifiedSearch, fit_in_folds
+from semfov.fit.verification import VerificationInFolds, VerifiedSearch, fit_in_folds
 from semfov.fit.verification_report import verification_report
 from semfov.metrics.episodes import FloatArray
 from semfov.observation.foveal import FovealObservationModel
@@ -65,7 +66,7 @@ class VerificationFit(PartFit):
         judged = self.inputs.judged
         # A threshold with few false alarms needs many searches without the target.
         spare = min(_MOST_ABSENT, _ABSENT // len(judged))
-        photographs = open_photographs(run.eye, run.scenes, judged, self.settings, spare=spare, store=run.store)
+        photographs = open_photographs(run, judged, self.settings, spare=spare)
         if len(photographs) < 2:
             raise DataError(
                 "data: expected at least 2 held-out photographs with a class to search for, got "
@@ -89,7 +90,7 @@ def _compare(fitted: VerificationInFolds) -> tuple[Difference, str]:
     confirm = fitted.model.thresholds.confirm
     searches = fitted.searches
     after = _scores(searches, [search.found(confirm) for search in searches])
-    before = _scores(searches, [search.unverified for search in searches])
+    before = _scores(searches, [search.unverified for search in searches if search.unverified is not None])
     gain = Difference.of(after, before)
     return gain, (
         f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "

@@ -15,6 +15,9 @@ from semfov.runs.tables import mean_or_dash, share, table
 
 _THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)  # values of the threshold `confirm` in the table, besides the chosen one
 
+NO_PLACES = "None, since there are no places that hold the target, or none that do not.\n"
+"""The report where no verification can be fitted."""
+
 IN_FOLDS = "Each photograph is evaluated with a model fitted to other folds."
 """How a verification is evaluated that is fitted in folds."""
 
@@ -50,8 +53,8 @@ def verification_report(fitted: VerificationInFolds, pictures: str, how: str = I
             "",
             *table(chances),
             "",
-            "Decisions in %, and mean numbers of looks, closer ones included. Without closer looks, the thresholds of "
-            f"the belief decide. Area under the ROC of the final probability: {_figure(area)}.",
+            "Decisions in %, and mean numbers of looks, closer ones included. Area under the ROC of the final "
+            f"probability: {_figure(area)}.",
             "",
             *table(_decisions(fitted)),
             "",
@@ -93,7 +96,10 @@ def _decisions(fitted: VerificationInFolds) -> list[list[str]]:
     searches = fitted.searches
     present = [search.present for search in searches]
     head = ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
-    rows = [head, ["no closer looks", *_rates(present, [search.unverified for search in searches])]]
+    rows = [head]
+    unverified = [search.unverified for search in searches if search.unverified is not None]
+    if unverified:
+        rows.append(["no closer looks", *_rates(present, unverified)])
     for confirm in sorted({*_THRESHOLDS, chosen}):
         mark = " (chosen)" if confirm == chosen else ""
         ends = [search.found(confirm) for search in searches]

@@ -2,8 +2,9 @@
 
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
+from typing import Literal, get_args
 
 import torch
 
@@ -11,21 +12,35 @@ from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import ChosenScenes, Scenes
 from semfov.errors import check
+from semfov.fit.photographs import fit_photographs
 from semfov.fit.training import training_of
-from semfov.fit.windows_certainty import certainty_again
-from semfov.fit.windows_decisions import WindowSearches, fit_closer_looks, fit_judge, judge_searches
-from semfov.fit.windows_evidence import SurveyExample, ZoomExample, fit_rates, fit_survey
+from semfov.fit.windows_certainty import fit_certainty
+from semfov.fit.windows_decisions import (
+    MosaicSearch,
+    WindowSearches,
+    fit_closer_looks,
+    fit_judge,
+    judge_searches,
+    search_pictures,
+)
+from semfov.fit.windows_evidence import ZoomExample, fit_rates, fit_survey, judge_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.scene_run import store_folder
-from semfov.runs.setup import make_detector, split_photographs
+from semfov.runs.setup import make_detector, make_scenes, split_photographs
+from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker, run_tasks
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import half_steps
 from semfov.zoom.survey import Survey
+
+RefitPart = Literal["survey", "decision", "verification", "certainty", "photograph"]
+"""Parts of evidence that may be fitted again: numbers of objects of any class, decisions of searches, probabilities
+after closer looks, the probability that an object is there with the spread of expected numbers, and the evidence for
+photographs."""
 
 _CROWDED = 1 / 3  # share of the photographs that the crowded mosaics show, those with the most objects
 
@@ -55,6 +70,11 @@ def _look(fit: "MosaicFit", task: tuple[str, int]) -> bytes:
 class MosaicFit:
     """A fit of evidence part by part, with the mosaics, and the store of the looks at them.
 
+    Each part uses those before it (`fit`):
+
+        looks ─► numbers of objects of a class ─► of any class ─► decisions ─► closer looks ─► certainty
+                 (and, of photographs as they are, the evidence for photographs)
+
     Attributes:
         config: the settings.
         eye: looks at windows.
@@ -63,6 +83,7 @@ class MosaicFit:
         mosaics: mosaics by the name of their kind.
         pictures: these and pictures of other kinds.
         store: keeps the looks on disk.
+        figures: measures on held-out pictures by name.
     """
 
     kinds: tuple[str, ...] = ()
@@ -85,6 +106,7 @@ class MosaicFit:
         }
         self.pictures: dict[str, Scenes] = {**self.mosaics}
         self.store = WindowLookStore(store_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+        self.figures: dict[str, float] = {}
 
     def mosaic(self, scenes: Scenes, columns: int, rows: int, count: int, number: int) -> Mosaics:
         """Make mosaics of photographs.
@@ -106,6 +128,52 @@ class MosaicFit:
         """Open the stored looks at each picture of a kind."""
         pictures = self.pictures[kind]
         return [StoredWindowLooks(self.eye, pictures, index, self.store) for index in range(len(pictures))]
+
+    def fit(
+        self,
+        parts: Collection[RefitPart] = get_args(RefitPart),
+        model: GlimpseEvidence | None = None,
+        priors: tuple[Verification | None, Verification | None] = (None, None),
+    ) -> tuple[GlimpseEvidence, list[str]]:
+        """Fit evidence, or parts of it again.
+
+        Args:
+            parts: the parts to fit, beside the numbers of objects of a class where there is no model.
+            model: evidence that was fitted before; it is changed.
+            priors: centres of the priors of the verification in mosaics and in photographs.
+
+        Returns:
+            The evidence, and lines of Markdown.
+        """
+        examples = self.look(self.looked(parts, model is None))
+        lines: list[str] = []
+        if model is None:
+            model = self.fit_prediction(examples)
+            measured = judge_windows(model, examples["judged"])
+            self.figures |= measured
+            lines += [f"Evaluation on {len(examples['judged'])} mosaics of held-out photographs:", ""]
+            lines += [*measure_table(measured), ""]
+        if "survey" in parts:
+            lines += self.fit_survey(model, examples)
+        searched = self.search(model) if {*parts} & {"decision", "verification"} else {}
+        if "decision" in parts:
+            lines += self.fit_decisions(model, searched)
+        if "verification" in parts:
+            check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", "one without")
+            lines += self.fit_verification(model, searched, priors[0])
+        if "certainty" in parts:
+            lines += self.fit_certainty(model)
+        if "photograph" in parts and self.config.photographs:
+            scenes = make_scenes(self.config.data, self.eye.detector.classes)
+            lines += ["Photographs:", "", fit_photographs(model, scenes, self.eye, self.config, priors[1])]
+        return model, lines
+
+    def looked(self, parts: Collection[RefitPart], anew: bool) -> list[str]:
+        """List the kinds of pictures that must be looked at to fit some parts, or all anew."""
+        kinds = ["near", "far", "judged"] if anew or "survey" in parts else []
+        if "survey" in parts:
+            kinds.append("crowded")
+        return [*kinds, *self.kinds] if anew else kinds
 
     def look(self, kinds: Sequence[str]) -> dict[str, list[ZoomExample]]:
         """Look at all pictures of some kinds, on the processors of the settings.
@@ -159,28 +227,39 @@ class MosaicFit:
         fit_rates(model, training, self.config.steps)
         return model.eval().requires_grad_(False)
 
-    def fit_survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> None:
-        """Fit the numbers of objects of any class that closer looks find; examples by kind."""
+    def fit_survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
+        """Fit the numbers of objects of any class that closer looks find; returns lines of Markdown."""
         self._seed()
         # A new one, since a fit may be repeated with a model that has one.
         survey = Survey(model.classes, foresight=model.survey.foresight)
-        training = [SurveyExample.of(example) for kind in ("near", "far", "crowded") for example in examples[kind]]
+        training = [example for kind in ("near", "far", "crowded") for example in examples[kind]]
         fit_survey(survey, training, self.config.survey_steps)
         model.survey = survey.eval().requires_grad_(False)
+        return []
 
-    def fit_decisions(self, model: GlimpseEvidence) -> list[str]:
-        """Fit the decisions of searches: the probability of presence, and the thresholds; returns lines of Markdown."""
+    def search(self, model: GlimpseEvidence) -> dict[str, list[MosaicSearch]]:
+        """Search pictures to fit decisions on (`searched`), and pictures to choose thresholds on (`judged`)."""
         prepare_worker()
-        torch.manual_seed(self.config.seed)
-        searches = {
-            use: WindowSearches.join(
-                WindowSearches.of(model, self.pictures[kind], self.opened(kind), self.config, f"searching, {kind}")
+        return {
+            use: [
+                search
                 for kind in kinds
-            )
+                for search in search_pictures(
+                    model, self.pictures[kind], self.opened(kind), self.config, f"searching, {kind}"
+                )
+            ]
             for use, kinds in self._searched().items()
         }
+
+    def fit_decisions(self, model: GlimpseEvidence, searched: Mapping[str, Sequence[MosaicSearch]]) -> list[str]:
+        """Fit the decisions of searches: the probability of presence, and the thresholds; returns lines of Markdown."""
+        torch.manual_seed(self.config.seed)
+        searches = {use: WindowSearches.of(of_use, self.config.passes) for use, of_use in searched.items()}
         fit_judge(model, searches["searched"], self.config.judging)
         rows = judge_searches(model, searches["judged"], self.config)
+        # A verification belongs to the probability that it was fitted with.
+        model.verification = None
+        model.metadata.pop("verification", None)
         assert model.thresholds is not None
         return [
             f"The probability that a picture contains the target was fitted on {len(searches['searched'].there)} "
@@ -194,35 +273,42 @@ class MosaicFit:
             "",
         ]
 
-    def fit_verification(self, model: GlimpseEvidence, prior: Verification | None = None) -> list[str]:
+    def fit_verification(
+        self,
+        model: GlimpseEvidence,
+        searched: Mapping[str, Sequence[MosaicSearch]],
+        prior: Verification | None = None,
+    ) -> list[str]:
         """Fit the probabilities after closer looks; returns lines of Markdown.
 
         Args:
             model: the evidence, with fitted decisions.
+            searched: the searches by which the decisions were fitted.
             prior: centre of the prior of the parameters.
         """
-        prepare_worker()
-        pictures = {
-            use: [(self.pictures[kind], self.opened(kind)) for kind in kinds] for use, kinds in self._searched().items()
-        }
-        return ["Closer looks:", "", fit_closer_looks(model, pictures, self.config, prior)]
+        report = fit_closer_looks(model, searched["searched"], searched["judged"], self.config, prior)
+        for searches in searched.values():
+            for search in searches:
+                search.source.save()
+        return ["Closer looks:", "", report]
 
     def fit_certainty(self, model: GlimpseEvidence) -> list[str]:
         """Fit the probability that an object is there, and the spread of expected numbers; returns lines."""
         prepare_worker()
-        fitted, judged = self.explored_pictures()
-        return certainty_again(model, fitted, judged, passes=self.config.passes)
-
-    def explored_pictures(self) -> list[dict[str, tuple[Scenes, list[StoredWindowLooks]]]]:
-        """Open the pictures to fit the certainty on, and those to evaluate it on, by kind, with their looks."""
         searched = self._searched()
         counts = self.config.some_explored
-        return [
+        fitted, judged = (
             {kind: (self.pictures[kind], self.opened(kind)[: counts.get(kind)]) for kind in dict.fromkeys(kinds)}
             for kinds in ((*searched["searched"], *counts), searched["judged"])
-        ]
+        )
+        return fit_certainty(model, fitted, judged, passes=self.config.passes)
 
     def _searched(self) -> dict[str, tuple[str, ...]]:
         """List the kinds of pictures to fit decisions on, and to choose thresholds on."""
         of_held_out = (f"judged {kind}" for kind in self.kinds)
         return {"searched": ("searched", *self.kinds), "judged": ("judged", *of_held_out)}
+
+
+def measure_table(figures: Mapping[str, float]) -> list[str]:
+    """Make a table of measures by name, in lines of Markdown."""
+    return table([["measure", "value"], *([name, f"{value:.4f}"] for name, value in figures.items())])

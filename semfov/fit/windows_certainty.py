@@ -316,29 +316,7 @@ def fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> tuple[float, list
     ]
 
 
-def spread_again(model: GlimpseEvidence, explored: Mapping[str, Sequence[Exploration]], passes: int) -> list[str]:
-    """Fit the spread of a model's certainty.
-
-    Args:
-        model: evidence by magnification, with a certainty.
-        explored: explorations by kind.
-        passes: number of looks that users may make.
-
-    Returns:
-        Lines of Markdown; none where no number is claimed.
-    """
-    assert model.certainty is not None
-    numbers = left_out(explored, partial(_fit_certainty, passes=passes))
-    if not numbers:
-        return []
-    spread, lines = fit_spread(numbers)
-    model.certainty = replace(model.certainty, spread=spread)
-    return lines
-
-
-def certainty_again(
-    model: GlimpseEvidence, fitted: PicturesByKind, judged: PicturesByKind, *, passes: int
-) -> list[str]:
+def fit_certainty(model: GlimpseEvidence, fitted: PicturesByKind, judged: PicturesByKind, *, passes: int) -> list[str]:
     """Fit the certainty of a model on some kinds of pictures, and evaluate it on others.
 
     Args:
@@ -355,7 +333,11 @@ def certainty_again(
     held_out = [exploration for group in explorations_of_kinds(model, judged, passes).values() for exploration in group]
     certainty = _fit_certainty(training, passes)
     model.certainty = certainty
-    report_on_spread = spread_again(model, by_kind, passes)
+    report_on_spread: list[str] = []
+    numbers = left_out(by_kind, partial(_fit_certainty, passes=passes))
+    if numbers:
+        spread, report_on_spread = fit_spread(numbers)
+        model.certainty = replace(certainty, spread=spread)
     facts, right = _judged(held_out, passes)
     chances = certainty.probability(facts)
     is_listed = chances >= 0.5

@@ -1,6 +1,6 @@
 """Fit the decisions of searches in large pictures: the probability of presence, its thresholds, and closer looks."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -10,14 +10,15 @@ from torch.nn import functional as F
 
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
-from semfov.decision import SAME, settle
+from semfov.decision import SAME
 from semfov.detection.detections import Detections
+from semfov.errors import DataError
 from semfov.fit.protocols import choose_classes
 from semfov.fit.searches import TargetSearch
 from semfov.fit.thresholds import Bounds, choose_thresholds
 from semfov.fit.training import descend
-from semfov.fit.verification import VerificationInFolds, choose_confirm, examine, fit_to_closer_looks, verify
-from semfov.fit.verification_report import verification_report
+from semfov.fit.verification import examine, fit_to_closer_looks, with_thresholds
+from semfov.fit.verification_report import NO_PLACES, verification_report
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
@@ -26,66 +27,104 @@ from semfov.observation.matching import box_iou
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.runs.tables import table
-from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.closer import CandidateBoxes, SearchLook, look_closely
 from semfov.zoom.decision import SearchFacts
-from semfov.zoom.episode import WindowStep, look_for
+from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.looks import WindowLook
 
 _JUDGED = (1, 4, 8, 16)  # numbers of looks after which the probability of presence is evaluated
 
-PicturesByKind = Sequence[tuple[Scenes, Sequence[StoredWindowLooks]]]
-"""Pictures of several kinds, with the looks at each picture."""
-
-
-class _PictureSearch(NamedTuple):
-    """A search of a picture without decisions.
-
-    Attributes:
-        picture: number of the picture.
-        annotation: its objects.
-        target: class 1..K.
-        steps: its looks, each with the facts about the search after it; these change with the next look.
-    """
-
-    picture: int
-    annotation: Annotation
-    target: int
-    steps: Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]
-
-
-@torch.inference_mode()
-def _search_pictures(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredWindowLooks], config: FitMosaicsConfig, title: str
-) -> Iterator[_PictureSearch]:
-    """Search every picture for some present classes and for as many absent ones, without decisions."""
-    for index, looks in enumerate(track(opened, title, "picture")):
-        annotation = pictures.annotation(index)
-        for target in choose_classes(pictures, index, annotation, config.sought, 1.0, config.seed):
-            steps = islice(look_for(looks, model, target), config.passes)
-            yield _PictureSearch(index, annotation, target, _with_facts(steps))
-        looks.save()
-
-
-def _with_facts(
-    steps: Iterable[WindowStep[ZoomBelief]],
-) -> Iterator[tuple[WindowStep[ZoomBelief], SearchFacts]]:
-    """Go through the looks of a search, each with the facts about the search after it."""
-    facts: SearchFacts | None = None
-    for step in steps:
-        facts = facts or SearchFacts(step.belief)
-        facts.add(step.look)
-        yield step, facts
-
 
 class _Known(NamedTuple):
-    """What is known after a look of a search; the fields are those of `WindowSearches`."""
+    """A look of a search, and what is known after it; the other fields are those of `WindowSearches`."""
 
+    look: WindowLook
     best: float
     case: Tensor
     detected: bool
     hit_chance: float
+
+
+class MosaicSearch(TargetSearch[SearchLook]):
+    """A search of a large picture, without decisions and without closer looks.
+
+    Attributes:
+        model: evidence by magnification, which chooses the looks; its `judge` may be fitted to them afterwards.
+        source: the looks at the picture.
+        objects: `(M, 4)`, annotated boxes of the class.
+        known: the looks, and what is known after each.
+    """
+
+    after = (1, 3, 5, 8, 12, 16, 24)
+
+    def __init__(
+        self,
+        model: GlimpseEvidence,
+        source: StoredWindowLooks,
+        picture: int,
+        annotation: Annotation,
+        target: int,
+        passes: int,
+    ) -> None:
+        self.model = model
+        self.source = source
+        self.picture = picture
+        self.target = target
+        self.objects = annotation.boxes[annotation.labels == target]
+        self.present = len(self.objects) > 0
+        self.passes = passes
+        self.known: list[_Known] = []
+        facts: SearchFacts | None = None
+        for step in islice(look_for(source, model, target), passes):
+            facts = facts or SearchFacts(step.belief)
+            facts.add(step.look)
+            case = facts.case(step.next_value)
+            self.known.append(_Known(step.look, facts.best, case, facts.detected, step.next_value))
+
+    def __len__(self) -> int:
+        return len(self.known)
+
+    def look(self, index: int, number: int) -> SearchLook:
+        after = self.known[index]
+        presence = self.model.anywhere(torch.tensor(after.best), after.case).sigmoid()
+        return SearchLook(after.look.detections, number, float(presence), after.best, after.hit_chance)
+
+    def candidates(self) -> CandidateBoxes:
+        assert self.model.thresholds is not None
+        return CandidateBoxes(self.target, self.model.thresholds.confirm)
+
+    def close_up(self, box: Tensor) -> Detections:
+        return look_closely(self.source, box).detections
+
+    def right(self, box: Tensor) -> bool:
+        """Tell whether a box `(4,)` is that of an annotated object of the class."""
+        return self.present and float(box_iou(box[None], self.objects).max()) >= SAME
+
+
+@torch.inference_mode()
+def search_pictures(
+    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredWindowLooks], config: FitMosaicsConfig, title: str
+) -> list[MosaicSearch]:
+    """Search every picture for some present classes and for as many absent ones.
+
+    Args:
+        model: evidence by magnification.
+        pictures: the pictures.
+        opened: the looks at each of them.
+        config: numbers of classes and looks, and seed.
+        title: title of the progress bar.
+
+    Returns:
+        The searches.
+    """
+    searches: list[MosaicSearch] = []
+    for index, looks in enumerate(track(opened, title, "picture")):
+        annotation = pictures.annotation(index)
+        targets = choose_classes(pictures, index, annotation, config.sought, 1.0, config.seed)
+        searches += [MosaicSearch(model, looks, index, annotation, target, config.passes) for target in targets]
+        looks.save()
+    return searches
 
 
 class WindowSearches(NamedTuple):
@@ -106,38 +145,22 @@ class WindowSearches(NamedTuple):
     there: Tensor
 
     @classmethod
-    @torch.inference_mode()
-    def of(
-        cls,
-        model: GlimpseEvidence,
-        pictures: Scenes,
-        opened: Sequence[StoredWindowLooks],
-        config: FitMosaicsConfig,
-        title: str,
-    ) -> "WindowSearches":
-        """Search every picture for some present classes and for as many absent ones, without decisions."""
+    def of(cls, searches: Sequence[MosaicSearch], looks: int) -> "WindowSearches":
+        """Put searches side by side, each padded to the same number of looks."""
         rows: list[tuple[Tensor, ...]] = []
-        for search in _search_pictures(model, pictures, opened, config, title):
-            known = [
-                _Known(facts.best, facts.case(step.next_value), facts.detected, step.next_value)
-                for step, facts in search.steps
-            ]
-            known += [known[-1]._replace(hit_chance=0.0)] * (config.passes - len(known))
+        for search in searches:
+            known = [*search.known]
+            known += [known[-1]._replace(hit_chance=0.0)] * (looks - len(known))
             rows.append(
                 (
                     torch.tensor([after.best for after in known]),
                     torch.stack([after.case for after in known]),
                     torch.tensor([after.detected for after in known]),
                     torch.tensor([after.hit_chance for after in known]),
-                    torch.tensor(bool((search.annotation.labels == search.target).any())),
+                    torch.tensor(search.present),
                 )
             )
         return cls(*(torch.stack(column) for column in zip(*rows, strict=True)))
-
-    @classmethod
-    def join(cls, several: Iterable["WindowSearches"]) -> "WindowSearches":
-        """Concatenate searches of the same number of looks."""
-        return cls(*(torch.cat(column) for column in zip(*several, strict=True)))
 
 
 def fit_judge(model: GlimpseEvidence, searches: WindowSearches, steps: int, batch: int = 4096) -> None:
@@ -193,130 +216,41 @@ def judge_searches(model: GlimpseEvidence, searches: WindowSearches, bounds: Bou
     return table(rows)
 
 
-class _MosaicSearch(TargetSearch[SearchLook]):
-    """A search of a mosaic, without closer looks.
-
-    Attributes:
-        looks: the looks at the picture.
-        objects: `(M, 4)`, annotated boxes of the class.
-        least: probability from which on a candidate is likely enough for a closer look.
-        steps: what is known after each look.
-        window_looks: the looks themselves.
-        boxes: `(4,)`, box of the highest score after each look; None where no detection shows the target.
-    """
-
-    after = (1, 3, 5, 8, 12, 16, 24)
-
-    def __init__(self, search: _PictureSearch, looks: StoredWindowLooks, passes: int, least: float) -> None:
-        self.picture = search.picture
-        self.target = search.target
-        self.objects = search.annotation.boxes[search.annotation.labels == search.target]
-        self.present = len(self.objects) > 0
-        self.passes = passes
-        self.looks = looks
-        self.least = least
-        self.steps: list[SearchLook] = []
-        self.window_looks: list[WindowLook] = []
-        self.boxes: list[Tensor | None] = []
-        for number, (step, facts) in enumerate(search.steps, 1):
-            presence = facts.presence(step.next_value)
-            self.steps.append(SearchLook(step.look.detections, number, presence, facts.best, step.next_value))
-            self.window_looks.append(step.look)
-            self.boxes.append(facts.box if facts.detected else None)
-
-    def __len__(self) -> int:
-        return len(self.steps)
-
-    def look(self, index: int, number: int) -> SearchLook:
-        return self.steps[index]._replace(next_index=number)
-
-    def candidates(self) -> CandidateBoxes:
-        return CandidateBoxes(self.target, self.least)
-
-    def close_up(self, box: Tensor) -> Detections:
-        return look_closely(self.looks, box).detections
-
-    def right(self, box: Tensor) -> bool:
-        """Tell whether a box `(4,)` is that of an annotated object of the class."""
-        return self.present and float(box_iou(box[None], self.objects).max()) >= SAME
-
-    def outcome(self, index: int, thresholds: Thresholds) -> int:
-        after = self.steps[index]
-        detected = self.boxes[index] is not None
-        presence, known, hit_chance = (torch.tensor([value]) for value in (after.presence, detected, after.hit_chance))
-        return int(settle(presence, known, hit_chance, thresholds))
-
-    def found_right(self, index: int) -> bool:
-        """Tell whether the box with the highest score is that of an object."""
-        box = self.boxes[index]
-        assert box is not None
-        return self.right(box)
-
-
-@torch.inference_mode()
-def _mosaic_searches(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredWindowLooks], config: FitMosaicsConfig, title: str
-) -> Iterator[_MosaicSearch]:
-    """Search every picture, without closer looks."""
-    assert model.thresholds is not None
-    for search in _search_pictures(model, pictures, opened, config, title):
-        yield _MosaicSearch(search, opened[search.picture], config.passes, model.thresholds.confirm)
-
-
 def fit_closer_looks(
     model: GlimpseEvidence,
-    pictures: Mapping[str, PicturesByKind],
+    searched: Sequence[MosaicSearch],
+    judged: Sequence[MosaicSearch],
     config: FitMosaicsConfig,
     prior: Verification | None = None,
 ) -> str:
-    """Fit the verification on some pictures, choose its threshold on held-out ones, and add it to the model.
+    """Fit the verification on some searches, choose its threshold on held-out ones, and add it to the model.
 
     Args:
         model: evidence by magnification, with thresholds.
-        pictures: those to fit on (`searched`), and those of held-out photographs (`judged`).
-        config: settings of searches, and bounds of the threshold.
+        searched: searches to fit on.
+        judged: searches of pictures of held-out photographs.
+        config: bounds of the threshold.
         prior: centre of the prior of the parameters (None: a weak one around 0).
 
     Returns:
         The report in Markdown. Without places of both kinds, the model has no verification.
     """
-    searched = _all_searches(model, pictures["searched"], config, "looking closely")
-    judged = _all_searches(model, pictures["judged"], config, "looking closely at held-out pictures")
-    training = examine(searched)
-    held_out = examine(judged)
-    _save_looks(pictures)
     # From here on the model decides as without closer looks, until it has the new verification.
     model.verification = None
-    if training is None or held_out is None:
-        return "None, since there are no places that hold the target, or none that do not.\n"
     assert model.thresholds is not None
-    stop_below = model.thresholds.stop_below
+    limits = Thresholds(1.0, model.thresholds.stop_below, config.place)
+    searches = track([*searched, *judged], "looking closely", "search")
+    try:
+        training = examine(islice(searches, len(searched)))
+        held_out = examine(searches)
+    except DataError:
+        return NO_PLACES
     fitted = fit_to_closer_looks(training, training.fold == 0, prior)
-    decisions = list(verify(judged, [fitted], Thresholds(1.0, stop_below, config.place), model.thresholds))
-    confirm = choose_confirm(decisions, config.false_alarms, config.surest)
-    fitted.thresholds = Thresholds(confirm, stop_below, config.place)
+    in_folds = with_thresholds(fitted, [fitted], held_out, judged, limits, config.false_alarms, config.surest)
     model.verification = fitted
-    _save_looks(pictures)
     report = verification_report(
-        VerificationInFolds(fitted, [fitted], held_out, decisions),
-        f"{sum(len(opened) for _, opened in pictures['judged'])} pictures of held-out photographs",
+        in_folds,
+        f"{len({id(search.source) for search in judged})} pictures of held-out photographs",
         f"The model was fitted to {len(training.fold)} closer looks at pictures of other photographs.",
     )
     return report.text
-
-
-def _all_searches(
-    model: GlimpseEvidence, pictures: PicturesByKind, config: FitMosaicsConfig, title: str
-) -> list[_MosaicSearch]:
-    searches: list[_MosaicSearch] = []
-    for scenes, opened in pictures:
-        searches += _mosaic_searches(model, scenes, opened, config, title)
-    return searches
-
-
-def _save_looks(pictures: Mapping[str, PicturesByKind]) -> None:
-    """Store new looks at all pictures."""
-    for of_use in pictures.values():
-        for _, opened in of_use:
-            for looks in opened:
-                looks.save()

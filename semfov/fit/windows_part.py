@@ -10,17 +10,14 @@ import torch
 from semfov.data.mosaics import Mosaics
 from semfov.fit.detector_report import Difference, curves_table, mean_percent, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
-from semfov.fit.photographs import fit_photographs
 from semfov.fit.verification import mean_of
 from semfov.fit.window_looking import found_in
 from semfov.fit.windows import MosaicFit
-from semfov.fit.windows_evidence import judge_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.episodes import FloatArray
 from semfov.runs.config import SensorConfig
 from semfov.runs.looks import one_thread
-from semfov.runs.setup import make_scenes
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.looks import WindowLook
@@ -118,8 +115,7 @@ def _tasks(config: FitMosaicsConfig) -> dict[str, float]:
         "learning the survey": 0.4 * config.survey_steps,
         **{f"searching, {kind}": 4 * count for kind, count in searched.items()},
         "fitting decisions": 0.01 * config.judging,
-        "looking closely": 4 * config.searched,
-        "looking closely at held-out pictures": 4 * config.judged,
+        "looking closely": 4 * (config.searched + config.judged),
         "looking at photographs": 25 * _LOOK * config.photographs,
         **{f"exploring, {kind}": 2 * count for kind, count in explored.items()},
     }
@@ -150,23 +146,13 @@ def _report_on_curves(curves: Mapping[str, FloatArray], mosaics: Mosaics) -> str
 
 
 def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
-    """Look at the mosaics, and fit the evidence, its decisions, closer looks and expected numbers."""
-    examples = fit.look(("near", "far", "crowded", "judged"))
-    # Each step uses the parts before it.
-    model = fit.fit_prediction(examples)
-    fit.fit_survey(model, examples)
-    report, _ = judge_windows(model, examples["judged"])
-    lines = [report, *fit.fit_decisions(model)]
+    """Fit all parts; of few photographs, those of closer looks stay near the models shipped for other detectors."""
     shipped = [
         GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
     ]
-    # Few photographs: the fits of closer looks stay near the mean of the models shipped for other detectors.
     of_windows = [other.verification for other in shipped if other.verification is not None]
-    lines += fit.fit_verification(model, mean_of(of_windows))
-    lines += fit.fit_certainty(model)
     of_photographs = [other.photograph.verification for other in shipped if other.photograph is not None]
-    scenes = make_scenes(fit.config.data, fit.eye.detector.classes)
-    lines += ["Photographs:", "", fit_photographs(model, scenes, fit.eye, fit.config, mean_of(of_photographs))]
+    model, lines = fit.fit(priors=(mean_of(of_windows), mean_of(of_photographs)))
     return model, "\n".join(lines)
 
 

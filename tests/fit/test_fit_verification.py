@@ -13,16 +13,16 @@ from scipy.optimize import minimize
 from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, FovealObservationModel, Foveation
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic, SemanticSearch
+from semfov.fit.looking import Looking
 from semfov.fit.searches import SearchEnd, _PhotographSearch, open_photographs, photograph_searches
+from semfov.fit.settings import VerificationConfig
 from semfov.fit.verification import (
     _LEVELS,
     _STRENGTH,
     CloserLooks,
-    VerificationConfig,
     VerifiedSearch,
     choose_confirm,
     examine,
-    fit_in_folds,
     fit_to_closer_looks,
     mean_of,
     verify,
@@ -122,7 +122,7 @@ def verified_in(seen, models, searching, config):
     """The searches of photographs with all their closer looks."""
     limits = Thresholds(1.0, config.stop_below, config.place)
     searches = photograph_searches(seen, searching, config.looks, "verifying")
-    return verify(searches, models, limits, searching.presence.thresholds)
+    return verify(searches, models, limits)
 
 
 def searched(present, places, ends, presence, looks):
@@ -165,6 +165,14 @@ def test_the_threshold_is_the_least_with_few_enough_false_alarms(places, share):
 SOUGHT = VerificationConfig(columns=4, rows=3, max_target_area=1.0)
 
 
+class Opened(Looking):
+    """Embedded scenes that are looked at in 4 × 3 cells."""
+
+    def __init__(self, eye, scenes, store):
+        self.config, self.cells, self.eye, self.scenes = SOUGHT, (4, 3), eye, scenes
+        self.store = None if store is None else cell_store(store, eye.settings(), 4, 3, len(CLASSES) + 1)
+
+
 def opened(detector, store=None):
     """Three embedded scenes with classes to search for, and a model that searches them."""
     eye = Eye(Foveation(9.0), detector, reference=64.0).requires_grad_(False)
@@ -176,8 +184,8 @@ def opened(detector, store=None):
     searching = FovealObservationModel.identity(
         CLASSES, [0.2, 0.5], miss_odds=odds, refutation=0.9, presence=presence
     ).requires_grad_(False)
-    kept = None if store is None else cell_store(store, eye.settings(), 4, 3, len(CLASSES) + 1)
-    return open_photographs(eye, scenes, [0, 1, 2], SOUGHT, store=kept), searching
+    run = Opened(eye, scenes, store)
+    return open_photographs(run, [0, 1, 2], SOUGHT), searching, run
 
 
 @pytest.fixture
@@ -186,17 +194,15 @@ def seen():
 
 
 def test_looks_from_a_store_equal_those_of_the_eye(tmp_path):
-    live, searching = opened(Limited())
-    eye, scenes = live[0].eye, live[0].scenes
-    store = cell_store(tmp_path, eye.settings(), 4, 3, len(CLASSES) + 1)
+    live, searching, run = opened(Limited())
+    eye, scenes = run.eye, run.scenes
+    stored = Opened(eye, scenes, tmp_path)
     for each in live:
         image, digest = partial(lambda index: scenes[index].image[None], each.index), partial(scenes.digest, each.index)
-        look_everywhere(eye, image, each.grid, store, digest)
+        look_everywhere(eye, image, each.grid, stored.store, digest)
     seen = steps_of(live, searching)
     eye.detector.most = eye.detector.passes  # no further look
-    for one, other in zip(
-        seen, steps_of(open_photographs(eye, scenes, [0, 1, 2], SOUGHT, store=store), searching), strict=True
-    ):
+    for one, other in zip(seen, steps_of(open_photographs(stored, [0, 1, 2], SOUGHT), searching), strict=True):
         torch.testing.assert_close(one.belief.probability(1), other.belief.probability(1))
 
 
@@ -207,9 +213,9 @@ def steps_of(photographs, searching):
 
 
 def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
-    live, searching = seen
+    _, searching, run = seen
     sought = SimpleNamespace(**{**vars(SOUGHT), "classes": 1, "absent": 0})
-    few, many = (open_photographs(live[0].eye, live[0].scenes, [0, 1, 2], sought, spare=n) for n in (0, 1))
+    few, many = (open_photographs(run, [0, 1, 2], sought, spare=n) for n in (0, 1))
     config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
     for one, other in zip(few, many, strict=True):
         assert [each.target for each in other.targets if not each.spare] == [each.target for each in one.targets]
@@ -224,17 +230,17 @@ def test_further_absent_classes_serve_only_to_choose_thresholds(seen):
 @pytest.mark.parametrize("confirm", [0.5, 0.7])
 def test_searches_end_as_those_of_an_agent(seen, confirm):
     """The agent looks by itself and with other code, with closer looks and without."""
-    found, searching = seen
+    found, searching, run = seen
     searching.presence.thresholds = Thresholds(0.55, 0.3, 0.3)
     model = shipped()
     config = VerificationConfig(columns=4, rows=3, looks=6, folds=2, stop_below=0.1, place=0.1)
     model.thresholds = Thresholds(confirm, config.stop_below, config.place)
     search, explore = (SemanticSearch(searching), Policy("non-predictive")), (Semantic(4), Policy("random"))
-    agent = ActivePerception(found[0].eye, search, explore, verification=model, grid=(4, 3)).eval()
+    agent = ActivePerception(run.eye, search, explore, verification=model, grid=(4, 3)).eval()
     searches = iter(verified_in(found, [model, model], searching, config))
     ends = []
     for photograph in found:
-        image = photograph.scenes[photograph.index].image
+        image = run.scenes[photograph.index].image
         for sought in photograph.targets:
             verified, options = next(searches), {"start": int(sought.start), "shifts": config.looks - 1, "prior": "fit"}
             scanpath = agent.search(image, sought.target, how="fovea", **options)
@@ -253,8 +259,9 @@ def test_searches_end_as_those_of_an_agent(seen, confirm):
 
 
 def test_classes_are_present_and_absent_as_the_goal_says(seen):
-    for photograph in seen[0]:
-        annotation = photograph.scenes.annotation(photograph.index)
+    photographs, _, run = seen
+    for photograph in photographs:
+        annotation = run.scenes.annotation(photograph.index)
         for sought in photograph.targets:
             assert sought.present == (sought.target in annotation.labels.tolist())
             for cell in range(len(photograph.grid)):
@@ -266,7 +273,7 @@ def test_classes_are_present_and_absent_as_the_goal_says(seen):
 
 
 def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
-    found, searching = seen
+    found, searching, _ = seen
     config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
     known = examined_in(found, searching, config)
     assert known.features.shape == (len(known.right), 7)
@@ -284,7 +291,7 @@ def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
         assert len(each.places) == len(each.ends) <= 2
         assert list(each.ends) == sorted(each.ends)
         assert each.looks >= max(each.ends, default=1)
-    unusable("got only one kind", fit_in_folds, [], searching, config)
+    unusable("got only one kind", examine, [])
 
 
 class Limited(Blobs):
@@ -304,7 +311,7 @@ class Limited(Blobs):
 def all_of(detector, store):
     """Examine and verify the embedded scenes."""
     config = VerificationConfig(columns=4, rows=3, looks=3, folds=2)
-    found, searching = opened(detector, store)
+    found, searching, _ = opened(detector, store)
     known = examined_in(found, searching, config)
     return known, list(
         verified_in(found, [fit_to_closer_looks(known, known.fold != fold) for fold in (0, 1)], searching, config)

@@ -22,7 +22,7 @@ from semfov.fit.photographs import _explored, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification import verify
 from semfov.fit.window_looking import found_in
-from semfov.fit.windows_decisions import _mosaic_searches, fit_closer_looks
+from semfov.fit.windows_decisions import fit_closer_looks, search_pictures
 from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
 from semfov.fit.windows_settings import FitMosaicsConfig
@@ -80,9 +80,9 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     assert changed
     assert all(name.startswith("survey.") for name in changed)
     assert other.metadata["survey"]["seed"] == config.seed
-    fit_zoom(replace(config, evidence=path, refit=("spread",), out=tmp_path / "spread"))
-    other = GlimpseEvidence.from_pretrained(tmp_path / "spread" / "bright.safetensors")
-    assert replace(other.certainty, spread=model.certainty.spread) == model.certainty
+    fit_zoom(replace(config, evidence=path, refit=("certainty",), out=tmp_path / "certainty"))
+    other = GlimpseEvidence.from_pretrained(tmp_path / "certainty" / "bright.safetensors")
+    assert other.certainty == model.certainty
     assert all(torch.equal(before[name], tensor) for name, tensor in other.state_dict().items())
     # A fit with the same seed gives the same model.
     fit_zoom(config)
@@ -113,14 +113,15 @@ def test_examples_do_not_depend_on_the_store(tmp_path):
     source.save()
     eye.detector.propose = None  # any new look would fail
     same = ZoomExample.of(mosaics, 0, StoredWindowLooks(eye, mosaics, 0, store))
-    assert torch.equal(same.labels, example.labels)
-    for one, other in zip(example.looks, same.looks, strict=True):
-        assert one.window == other.window
-        assert torch.equal(one.found, other.found)
-        assert (one.gist is None) == (other.gist is None)
-        if one.gist is not None:
-            assert torch.equal(other.gist.scores, one.gist.scores)
-            assert torch.equal(other.gist.found, one.gist.found)
+    assert torch.equal(same.shown, example.shown)
+    assert torch.equal(same.hinted, example.hinted)
+    assert example.overview.counts
+    for one, other in zip((example.overview, *example.closer), (same.overview, *same.closer), strict=True):
+        assert torch.equal(other.gist.scores, one.gist.scores)
+        assert torch.equal(other.gist.found, one.gist.found)
+        assert other.counts.keys() == one.counts.keys()
+        for size, counts in one.counts.items():
+            assert all(map(torch.equal, counts, other.counts[size]))
 
 
 @pytest.mark.slow
@@ -188,31 +189,33 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     torch.manual_seed(0)
     model = GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)
     config = FitZoomConfig(sought=3, passes=8, place=0.1, false_alarms=0.5)
-    searches = list(_mosaic_searches(model, scenes, opened, config, "test"))
+    searches = search_pictures(model, scenes, opened, config, "test")
     names = "background", *scenes.classes
     for sought in searches:
         assert sought.present == (sought.target in scenes.annotation(sought.picture).labels.tolist())
-        # Looks and end are those of the agent.
+        # The looks are those of the agent, as far as it goes without closer looks, and so is the probability.
         task = WindowTask(Goal.of(names, sought.target), model)
-        path = WindowEpisode(task, sought.looks, EpisodeLimits(8)).run()
-        found, count = sought.unverified_end(model.thresholds)
-        assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
-        assert [look.window for look in sought.window_looks[:count]] == [each.window for each in path.window_looks]
-        if found is not None:
+        path = WindowEpisode(task, sought.source, EpisodeLimits(8)).run()
+        assert [after.look.window for after in sought.known[: path.passes]] == [
+            each.window for each in path.window_looks
+        ]
+        presence = sought.look(path.passes - 1, path.passes).presence
+        assert presence == pytest.approx(path.decision.probability, abs=1e-6)
+        if path.decision.outcome == "found":
             boxes = scenes.annotation(sought.picture).boxes[scenes.annotation(sought.picture).labels == sought.target]
-            assert found == any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
-    kinds = "searched", "judged"
-    text = fit_closer_looks(model, {kind: [(scenes, opened)] for kind in kinds}, config)
+            right = any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
+            assert sought.right(path.decision.box) == right
+    text = fit_closer_looks(model, searches, searches, config)
     fitted = model.verification.thresholds
     assert (fitted.place, fitted.stop_below) == (0.1, 0.01)
     assert f"| {fitted.confirm:.2f} (chosen)" in text
     # The searches from which the threshold was chosen end as those of the agent.
     ends = []
     limits = Thresholds(1.0, model.thresholds.stop_below, config.place)
-    again = verify(searches, [model.verification], limits, model.thresholds)
+    again = verify(searches, [model.verification], limits)
     for sought, each in zip(searches, again, strict=True):
         task = WindowTask(Goal.of(names, sought.target), model, DecisionSettings(closer=MOST_CLOSER))
-        path = WindowEpisode(task, sought.looks, EpisodeLimits(8)).run()
+        path = WindowEpisode(task, sought.source, EpisodeLimits(8)).run()
         right, count = each.found(fitted.confirm)
         assert (right is not None, count) == (path.decision.outcome == "found", path.passes)
         assert right is None or right == sought.right(path.decision.box)
@@ -224,8 +227,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
 
 def test_without_right_and_wrong_places_there_is_no_verification():
     model = GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.01), verification=Verification()).eval()
-    kinds = "searched", "judged"
-    text = fit_closer_looks(model, {kind: [(Drawn(), ())] for kind in kinds}, FitZoomConfig(passes=8))
+    text = fit_closer_looks(model, [], [], FitZoomConfig(passes=8))
     assert text.startswith("None, since there are no places")
     assert model.verification is None
 

@@ -6,7 +6,7 @@ from torch.nn import functional
 from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
-from semfov.fit.windows_evidence import SurveyExample, ZoomExample, _LookCounts, _WindowResult, fit_survey
+from semfov.fit.windows_evidence import LookCounts, WindowResult, ZoomExample, fit_survey
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.hint_maps import neighbourhood_mean, neighbourhood_peak, through
@@ -14,7 +14,7 @@ from semfov.zoom.hints import Gist
 from semfov.zoom.looks import Window, half_steps
 from semfov.zoom.networks import network as small_network
 from semfov.zoom.survey import Survey
-from train.fit_zoom import judge_survey
+from train.zoom_choice import judge_survey
 
 LATTICE = Lattice.over((256, 192), (64, 64))
 CLASSES = 3
@@ -33,18 +33,27 @@ def survey():
     return Survey(CLASSES)
 
 
-def example(rule):
-    """A mosaic in which a closer look finds as many objects as `rule` gives for its window."""
+def looked_at(rule):
+    """The labels and looks of a mosaic in which a closer look finds as many objects as `rule` gives for its window."""
     objects = 12
-    looks = [_WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
+    looks = [WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
     for window in half_steps(LATTICE):
         if window.level == 0:
             continue
         seen = gist(window.level, window.cells[:2]) if window.level < LATTICE.levels - 1 else None
         looks.append(
-            _WindowResult(window, seen, torch.rand(CLASSES), torch.arange(objects) < rule(looks[0].gist, window))
+            WindowResult(window, seen, torch.rand(CLASSES), torch.arange(objects) < rule(looks[0].gist, window))
         )
-    return ZoomExample(LATTICE, torch.randint(1, CLASSES + 1, (objects,)), tuple(looks))
+    return torch.randint(1, CLASSES + 1, (objects,)), looks
+
+
+def by_class(labels):
+    """The class of each object as 0 and 1."""
+    return functional.one_hot(labels - 1, CLASSES).float()
+
+
+def example(rule):
+    return ZoomExample.of_results(*looked_at(rule))
 
 
 def test_rates_depend_on_the_class_of_the_hints_and_on_how_much_the_surroundings_hold(survey):
@@ -79,7 +88,7 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
     torch.manual_seed(0)
     evidence = GlimpseEvidence(CLASSES).eval().requires_grad_(False)
     evidence.survey.foresight = 0.125
-    look = _WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
+    look = WindowResult(Window.on(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
     for target, rates in ((0, evidence.survey.rates(look.gist)), (2, evidence.rates(look.gist, torch.tensor([2])))):
         belief = ZoomBelief(LATTICE, evidence, target)
         belief.add(look)
@@ -90,14 +99,15 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
         GlimpseEvidence(CLASSES).rates(gist(), torch.tensor([0, 2]))
 
 
-def test_loss_equals_the_poisson_loss_window_by_window(survey):
+@pytest.mark.parametrize("target", [None, 2])
+def test_loss_equals_the_poisson_loss_window_by_window(survey, target):
     """Against sums over the cells of each window, one at a time, and PyTorch's own Poisson likelihood."""
-    mosaic = example(lambda look, window: sum(window.cells) % 5)
-    overview = mosaic.looks[0]
+    labels, looks = looked_at(lambda look, window: sum(window.cells) % 5)
+    overview = looks[0]
     logs = survey.rates(overview.gist)[0].double()
     survey.double()
     terms = []
-    for closer in mosaic.looks:
+    for closer in looks:
         steps = closer.window.level
         if steps == 0:
             continue
@@ -108,17 +118,21 @@ def test_loss_equals_the_poisson_loss_window_by_window(survey):
             for x in range(x1, x2):
                 if 0 <= y < logs.shape[1] and 0 <= x < logs.shape[2]:
                     expected = expected + weight[y - y1] * weight[x - x1] * logs[steps - 1, y, x].exp()
-        terms.append(poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0))
-    counted = _LookCounts.of(mosaic, overview, overview.found)
-    torch.testing.assert_close(counted.loss(survey, logs), torch.stack(terms).mean())
+        counted = closer.found if target is None else closer.found & (labels == target)
+        terms.append(poisson_nll_loss(expected, counted.sum().double(), log_input=False, eps=0))
+    known = LookCounts.of(overview.gist, looks, by_class(labels), overview.found)
+    targets = None if target is None else torch.tensor([target])
+    torch.testing.assert_close(known.loss(survey, logs[None], targets), torch.stack(terms).mean())
 
 
 def test_objects_that_were_seen_before_are_not_new():
-    mosaic = example(lambda look, window: 3)
-    overview = mosaic.looks[0]
+    labels, looks = looked_at(lambda look, window: 3)
     for seen, new in ((0, 3), (2, 1), (12, 0)):
-        counts = _LookCounts.of(mosaic, overview, torch.arange(12) < seen).counts
-        assert {int(n) for _, _, numbers in counts.values() for n in numbers} == {new}
+        counts = LookCounts.of(looks[0].gist, looks, by_class(labels), torch.arange(12) < seen).counts
+        assert {int(n) for _, _, numbers in counts.values() for n in numbers.sum(-1)} == {new}
+        # The first objects count, by their classes.
+        expected = torch.bincount(labels[seen:3] - 1, minlength=CLASSES).float()
+        assert all(torch.equal(row, expected) for _, _, numbers in counts.values() for row in numbers)
 
 
 def test_fitting_improves_predictions_on_held_out_mosaics():
@@ -129,7 +143,7 @@ def test_fitting_improves_predictions_on_held_out_mosaics():
         x1, y1, x2, y2 = (max(n, 0) for n in window.cells)
         return int((look.scores[y1:y2, x1:x2, 1] > 0).sum()) // 4
 
-    examples, held = [SurveyExample.of(example(rule)) for _ in range(4)], [example(rule)]
+    examples, held = [example(rule) for _ in range(4)], [example(rule)]
     survey = Survey(CLASSES)
     overview, *_ = before = judge_survey(survey, held)
     fit_survey(survey, examples, 40, batch=2)
