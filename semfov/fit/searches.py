@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Generic, NamedTuple
 
@@ -84,7 +85,8 @@ class TargetSearch(ABC, Generic[LookType]):
         return None
 
 
-class SearchedPhotograph(NamedTuple):
+@dataclass(frozen=True)
+class SearchedPhotograph:
     """A photograph with the classes to search for, and all looks at it so far.
 
     Attributes:
