@@ -12,6 +12,7 @@ import eval.comparison.report_page as module
 from eval.comparison.replay import replay
 from eval.comparison.report_page import _choose_episodes, write_run_report
 from eval.comparison.settings import SaliencyConfig
+from eval.explore import episodes
 from eval.explore import report as explore_report
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search import report as search_report
@@ -194,7 +195,8 @@ def run_and_record_steps(run):
             yield step
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(protocols, "rollout", spy)
+        for module in (protocols, episodes):
+            patch.setattr(module, "rollout", spy)
         records, _ = run.outcomes(0)
     assert len(calls) == len(run.policies)
     by_policy = {name: [record for record in records if record["policy"] == name] for name in run.policies}
