@@ -24,10 +24,18 @@ from typing import Annotated, Literal
 
 import torch
 
+from semfov.errors import check
 from semfov.fit.cells import MOST_PHOTOGRAPHS, MappedLooks, fit_cells, mapped_looks
 from semfov.fit.observation import count_misses, fit_published, statistics_of
 from semfov.fit.samples import Samples
 from semfov.fit.settings import FitConfig
+from semfov.fit.through_belief import (
+    SearchedLooks,
+    fit_through_belief,
+    mean_landing_loss,
+    searched_looks,
+    starting_model,
+)
 from semfov.fit.training import split
 from semfov.io.files import write_text
 from semfov.io.ranges import Count, Positive, Range, Share, Weight, Whole
@@ -57,7 +65,11 @@ class FitFomConfig(FitConfig):
         method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
             and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
             `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
-            calibration is about. `python -m train.fit_search` goes on from it, through the belief of searches.
+            calibration is about. `search` starts from it, and learns through the belief where the target of a search
+            is (`semfov.fit.through_belief`): the odds of a miss.
+        steps: number of steps of the fit through the belief.
+        looks: most looks in a search of this fit.
+        max_target_area: classes that cover a larger share of the image are not searched for in this fit.
         mosaics: number of mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's
             input (0: photographs, through the fovea). The levels are then octaves by which the picture is reduced, and
             `width` and `sensor` are ignored.
@@ -81,7 +93,10 @@ class FitFomConfig(FitConfig):
         cache: folder for the labelled detections (None: `out`).
     """
 
-    method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
+    method: Literal["newton", "fixed_point", "gradient", "discriminative", "search"] = "discriminative"
+    steps: Count = 200
+    looks: Count = 8
+    max_target_area: Positive = 0.2
     mosaics: Whole = 0
     fixations: Count = 8
     levels: Annotated[int, Range(1, 1000)] = 8
@@ -103,12 +118,15 @@ class FitFomConfig(FitConfig):
         return self.sensor.level_edges(self.levels, self.width)
 
 
+_TRAINED = ("discriminative", "search")
+"""Methods that maximise the probability of the true class, from the published fit on."""
+
 _CELLS = (10, 10)  # columns and rows of the beliefs through which numbers are fitted
 
 
 def _fitted_name(config: FitFomConfig) -> str:
-    """Return the name of the fitted model in tables."""
-    return config.method if config.method == "discriminative" else f"Dirichlet, {config.method}"
+    """Return the name in tables of the model that is saved, or that the fit through the belief starts from."""
+    return "discriminative" if config.method in _TRAINED else f"Dirichlet, {config.method}"
 
 
 def _judgement(config: FitFomConfig, figures: dict[str, Calibration]) -> str:
@@ -128,7 +146,7 @@ class _Evaluation:
     """Models on held-out samples.
 
     Attributes:
-        model: the fitted model.
+        model: the model that is saved, or that the fit through the belief starts from.
         judged: M labelled detections.
         predictions: posteriors of the class by the name of the model, `(M, K+1)`.
         likelihood: mean log likelihood of the scores given the true class.
@@ -222,10 +240,10 @@ def _report_markdown(config: FitFomConfig, evaluation: _Evaluation) -> str:
     )
 
 
-def _write_report(config: FitFomConfig, evaluation: _Evaluation) -> list[Path]:
+def _write_report(config: FitFomConfig, evaluation: _Evaluation, landing: str) -> list[Path]:
     """Print the report, and write it with counts, settings, measures and a reliability diagram; returns the files."""
     model = evaluation.model
-    text = _report_markdown(config, evaluation)
+    text = landing + _report_markdown(config, evaluation)
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", config.yaml())
@@ -253,8 +271,30 @@ def _manifest(evaluation: _Evaluation) -> dict[str, object]:
     }
 
 
+def _fit_to_search(
+    config: FitFomConfig, sampler: Sampler, model: FovealObservationModel
+) -> tuple[FovealObservationModel, str]:
+    """Fit a model through the belief; returns it, and how much better searches of held-out photographs land."""
+    searches: dict[int, SearchedLooks] = {}
+    for shard in sampler.by_shard():
+        searches |= searched_looks(sampler.scenes, shard, _CELLS, config.max_target_area)
+    training = [looks for index, looks in searches.items() if index % config.holdout]
+    judged = [looks for index, looks in searches.items() if index % config.holdout == 0]
+    options = {"looks": config.looks, "steps": config.steps, "seed": config.seed}
+    fitted = fit_through_belief(model, training, **options, search={**options, "photographs": len(training)})
+    if not judged:
+        return fitted, ""
+    before = mean_landing_loss(starting_model(model), judged, config.looks)
+    after = mean_landing_loss(fitted, judged, config.looks)
+    return fitted, (
+        f"Searches of {len(judged)} held-out photographs: the negative log of the target's share of the belief in "
+        f"cells not fixated yet is {after:.3f} on average, before the fit through the belief {before:.3f}.\n\n"
+    )
+
+
 def fit_fom(config: FitFomConfig) -> None:
     """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
+    check(not (config.mosaics and config.method == "search"), "method", "another one with mosaics", config.method)
     kind = MosaicSampler if config.mosaics else Sampler
     sampler = collect_samples(config, (config.cache or config.out) / "samples", "looking", kind)
     # Only these are in memory at once; the published fits and the misses are sums over all shards.
@@ -266,12 +306,16 @@ def fit_fom(config: FitFomConfig) -> None:
     model.miss_rate = misses.rates().to(model.edges)
     if config.mosaics:
         model.metadata["cells"] = misses.total.sum(1).tolist()
-    elif config.method == "discriminative":
+    elif config.method in _TRAINED:
         fit_cells(model, _mapped_looks(config, sampler), seed=config.seed)
+    saved = model
+    landing = ""
+    if config.method == "search":
+        saved, landing = _fit_to_search(config, sampler, model)
     path = model_path(config, sampler.eye.detector.name)
-    model.save(path)
+    saved.save(path)
     models = _compared_models(config, published, model)
-    written = _write_report(config, _Evaluation(model, models, samples[held_out]))
+    written = _write_report(config, _Evaluation(model, models, samples[held_out]), landing)
     print("written:", *(f"  {file}" for file in [path, *written]), sep="\n")
 
 
@@ -287,7 +331,7 @@ def _fit_model(
     config: FitFomConfig, training: Samples, published: Callable[..., FovealObservationModel]
 ) -> FovealObservationModel:
     """Fit the model by the method of the settings."""
-    if config.method != "discriminative":
+    if config.method not in _TRAINED:
         return published(method=config.method)
     start = published(expected="empirical")
     return fit_discriminative(start, training.scores, training.distance, training.labels)
@@ -321,7 +365,9 @@ def _compared_models(
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
     for method in methods:
         models[f"Dirichlet, {method}"] = published(method=method)
-    if config.method == "discriminative":
+    models["Dirichlet with class prior"] = published(prior=True)
+    models["the same, tempered 0.1"] = published(prior=True, tempering=0.1)
+    if config.method in _TRAINED:
         models["discriminative"] = model
     return models
 

@@ -12,9 +12,10 @@ from torch.nn.utils import parametrize
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import SemanticSearch
-from semfov.data.scene import Annotation, legal_targets
+from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
+from semfov.fit.samples import Samples
 from semfov.fit.training import descend
 from semfov.observation.foveal import FovealObservationModel
 
@@ -41,6 +42,29 @@ class SearchedLooks:
     grid: Grid
     targets: Tensor
     goal: Tensor
+
+
+def searched_looks(
+    scenes: Scenes, samples: Samples, cells: tuple[int, int], max_target_area: float
+) -> dict[int, SearchedLooks]:
+    """Find the searches that stored looks allow.
+
+    Args:
+        scenes: the photographs.
+        samples: labelled detections of their looks.
+        cells: columns and rows of the grid.
+        max_target_area: classes that cover a larger share of the image are not searched for.
+
+    Returns:
+        The searches by the number of the photograph; some photographs have none.
+    """
+    searches = {}
+    for index in samples.scenes.unique().tolist():
+        annotation = scenes.annotation(index)
+        search = searches_of(annotation, *samples.looks_at(index), Grid(*cells, annotation.size), max_target_area)
+        if search is not None:
+            searches[index] = search
+    return searches
 
 
 def searches_of(
@@ -106,7 +130,28 @@ def landing_loss(observer: SemanticSearch, searched: SearchedLooks, order: Tenso
 
 
 @torch.no_grad()
-def _starting_model(model: FovealObservationModel) -> FovealObservationModel:
+def mean_landing_loss(model: FovealObservationModel, searches: Sequence[SearchedLooks], looks: int = 8) -> float:
+    """Average the loss of searches over photographs, with their first looks in the order in which they are stored.
+
+    Args:
+        model: an observation model that was fitted through the belief.
+        searches: looks at photographs.
+        looks: most looks in a search.
+
+    Returns:
+        The mean over photographs whose first look leaves a target to find.
+    """
+    observer = SemanticSearch(model)
+    losses = []
+    for searched in searches:
+        loss = landing_loss(observer, searched, torch.arange(min(looks, len(searched.fixations))))
+        if loss is not None:
+            losses.append(loss)
+    return float(torch.stack(losses).mean())
+
+
+@torch.no_grad()
+def starting_model(model: FovealObservationModel) -> FovealObservationModel:
     """Copy a model for `fit_through_belief`, with its exponents and refutation, and odds of a miss to start from."""
     start = deepcopy(model)
     start.log_exponents.fill_(math.log(_EXPONENT))
@@ -155,7 +200,7 @@ def fit_through_belief(
     check(min(looks, steps, batch) > 0 and rate > 0, "looks, steps, batch, rate", "positive numbers", (looks, steps))
     if not searches:
         raise DataError("data: expected a photograph with a class to search for, got none; raise max_target_area")
-    trained = _starting_model(model).eval().requires_grad_(False)
+    trained = starting_model(model).eval().requires_grad_(False)
     assert trained.log_miss is not None
     trained.log_miss.requires_grad_(True)
     parametrize.register_parametrization(trained, "log_miss", _Curve(trained.log_miss))

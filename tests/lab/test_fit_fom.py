@@ -11,6 +11,7 @@ from semfov.metrics.calibration import Calibration
 from semfov.observation import FovealObservationModel, match
 from semfov.runs.config import DataConfig
 from semfov.runs.seeds import generator_for
+from tests.refusals import refused
 from train.fit_fom import FitFomConfig, _judgement, fit_fom, main
 from train.samples import Sampler
 
@@ -66,6 +67,29 @@ def test_the_discriminative_fit_has_a_lower_loss_than_the_published_one(fitted, 
     figures = json.loads((tmp_path / "manifest.json").read_text())["held_out"]
     # No comparison with raw scores: a hundred detections of four scenes are too few for it.
     assert figures["discriminative"]["nll"] < figures["Dirichlet, newton"]["nll"] / 2
+
+
+def test_the_fit_through_the_belief_goes_on_from_the_discriminative_one(fitted, tmp_path):
+    """The looks of the other fits are enough; α stays, and searches of held-out scenes have a reported loss."""
+    data = DataConfig(limit=6, min_instances=0, max_target_area=None)
+    models = {}
+    for method in ("discriminative", "search"):
+        out = tmp_path / method
+        fit_fom(
+            FitFomConfig(
+                data=data, fixations=2, holdout=3, shard=2, out=out, cache=fitted, workers=1, method=method, steps=3
+            )
+        )
+        models[method] = FovealObservationModel.from_pretrained(out / "yolox-nano.safetensors")
+    before, after = models["discriminative"], models["search"]
+    assert torch.equal(before.log_alpha, after.log_alpha)
+    assert before.log_miss is None
+    assert after.log_miss is not None
+    assert 0 < float(after.refutation.detach()) <= 1
+    assert not torch.equal(after.log_exponents, before.log_exponents)
+    assert after.metadata["search"]["photographs"] >= 1
+    assert "target's share of the belief" in (tmp_path / "search" / "report.md").read_text()
+    refused("method", lambda: fit_fom(FitFomConfig(data=data, mosaics=1, method="search", out=tmp_path)))
 
 
 def test_the_published_fit_uses_all_detections_however_few_are_in_memory(fitted, tmp_path):
