@@ -19,7 +19,6 @@ from semfov.cli.options import CheckOptions
 from semfov.data.large import open_large
 from semfov.data.sources import picture_files
 from semfov.data.windowed import resized
-from semfov.detection import Objects
 from semfov.errors import DataError, check, printable
 from semfov.paths import Record
 from semfov.report.episode import jpeg
@@ -41,10 +40,14 @@ _Answer = TypeVar("_Answer")
 
 @dataclass(frozen=True)
 class Found:
-    """An object: its class, the probability (or score) that it is there, and its box in pixels of the picture."""
+    """An object: its class, its box in pixels of the picture, and how sure it is.
+
+    `probability` is that it is there. Where none was learned it is None, and `score` has what the detector gave.
+    """
 
     name: str
-    probability: float
+    probability: float | None
+    score: float | None
     box: list[float]
 
 
@@ -52,15 +55,17 @@ class Found:
 class Answer:
     """The answer of a search or a find.
 
-    `result` says it in words, and `ended` why no further look was taken. `expected` has the number of objects of each
-    class that is expected in all, also where nobody looked, and `further` that of those which are not listed yet: what
-    further looks can bring. Both are None for a class whose number is not known, and empty for a search, whose
-    looks count nothing.
+    `result` says it in words, and `ended` why no further look was taken. `probability` is that the picture holds the
+    target of a search; where none was learned it is None, and `score` has the number that decided. `expected` has the
+    number of objects of each class that is expected in all, also where nobody looked, and `further` that of those which
+    are not listed yet: what further looks can bring. Both are None for a class whose number is not known, and empty for
+    a search, whose looks count nothing.
     """
 
     result: str
     ended: str
     probability: float | None
+    score: float | None
     objects: list[Found]
     expected: dict[str, float | None]
     further: dict[str, float | None]
@@ -198,7 +203,7 @@ class PictureTools:
         crop = _shown(pixels)
         record = self.agent.find_all(pixels, passes=1, how="windows")
         left, top, _, _ = box
-        return View(crop, box, _rows(record.objects, record.classes, (left, top)))
+        return View(crop, box, _rows(record, (left, top)))
 
     @_one_at_a_time
     def where_people_look(self, picture: str) -> Gaze:
@@ -276,11 +281,13 @@ def _answer(record: Record) -> Answer:
     # A search ends as soon as it is decided, so its looks say little of how many there are.
     expected = record.expected if record.decision is None else {}
     further = {name: max(number - listed[name], 0.0) for name, number in expected.items()}
+    values = record.to_dict()
     return Answer(
         result=record.describe(),
         ended=record.words.ended,
-        probability=None if record.decision is None else round(record.decision.probability, 4),
-        objects=_rows(record.objects, record.classes),
+        probability=values.get("probability"),
+        score=values.get("score"),
+        objects=_rows(record),
         expected=_known_numbers(expected),
         further=_known_numbers(further),
         passes=record.passes,
@@ -293,13 +300,22 @@ def _known_numbers(numbers: Mapping[str, float]) -> dict[str, float | None]:
     return {name: None if math.isnan(number) else round(number, 2) for name, number in numbers.items()}
 
 
-def _rows(objects: Objects, classes: tuple[str, ...], corner: tuple[int, int] = (0, 0)) -> list[Found]:
+def _rows(record: Record, corner: tuple[int, int] = (0, 0)) -> list[Found]:
     """Make a row for each object; boxes of a crop are moved by its corner in the picture."""
+    measure = record.words.measure if record.decision is None else record.words.decided_by
     offset = torch.tensor([*corner, *corner])
+    objects = record.objects
     boxes = (objects.boxes + offset).tolist()
     rows = []
     for box, score, label in zip(boxes, objects.scores.tolist(), objects.labels.tolist(), strict=True):
-        rows.append(Found(name=classes[label], probability=round(score, 4), box=[round(edge, 1) for edge in box]))
+        number = round(score, 4)
+        row = Found(
+            name=record.classes[label],
+            probability=number if measure == "probability" else None,
+            score=None if measure == "probability" else number,
+            box=[round(edge, 1) for edge in box],
+        )
+        rows.append(row)
     return rows
 
 

@@ -243,11 +243,35 @@ def test_a_crop_is_no_wider_than_can_be_shown(tools, monkeypatch):
         tools.look("sheet.png", 800, 500, 600)
 
 
+@pytest.fixture(scope="module")
+def raw_agent() -> ActivePerception:
+    return ActivePerception.raw("yolox-nano")
+
+
 @pytest.mark.slow
-def test_an_agent_without_shares_of_its_fit_searches_without_a_prior(tools):
-    raw = PictureTools(tools.folder, ActivePerception.raw("yolox-nano"))
-    told = call(raw, "search", picture="sub/beach.png", target="boat", passes=4)
-    assert not told.is_error
+def test_an_agent_without_shares_of_its_fit_searches_without_a_prior(tools, raw_agent):
+    raw = PictureTools(tools.folder, raw_agent)
+    answer = call(raw, "search", picture="sub/beach.png", target="boat", passes=4)
+    assert not answer.is_error
+    found = answer.structured_content
+    record = raw_agent.search(tools.folder / "sub" / "beach.png", "boat", passes=4)
+    assert found["probability"] is None
+    assert found["score"] == pytest.approx(record.decision.probability, abs=1e-4)
+    assert [row["probability"] for row in found["objects"]] == [None] * len(record.objects)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learned", [True, False])
+def test_objects_have_a_probability_or_a_score(tools, agent, raw_agent, learned):
+    of_agent = PictureTools(tools.folder, agent if learned else raw_agent)
+    rows = call(of_agent, "find", picture="sub/beach.png", classes=[], passes=4).structured_content["objects"]
+    seen = json.loads(call(of_agent, "look", picture="sub/beach.png", x=320, y=250, width=480).content[1].text)
+    assert rows
+    assert seen["objects"]
+    number, empty = ("probability", "score") if learned else ("score", "probability")
+    for row in [*rows, *seen["objects"]]:
+        assert 0 < row[number] <= 1
+        assert row[empty] is None
 
 
 def test_a_check_opens_no_picture_by_a_link_out_of_the_folder(tools):
