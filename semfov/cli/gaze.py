@@ -298,7 +298,7 @@ def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> dict[str,
         "width": width,
         "height": height,
         "unlike": prediction.unlike,
-        "unlikeness": prediction.unlikeness,
+        "unlikeness": digits(prediction.unlikeness),
         "caution": prediction.caution,
     }
     for number, place in enumerate(prediction.first_fixations(), 1):

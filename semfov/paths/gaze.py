@@ -300,7 +300,7 @@ class GazePrediction(OtherWords):
             seed: seed of all draws.
 
         Returns:
-            A record for each viewer, in pixels of the picture, with durations.
+            A record for each viewer, in pixels of the picture to a hundredth, with durations in whole milliseconds.
 
         Raises:
             InputError: an argument is out of range.
@@ -314,6 +314,8 @@ class GazePrediction(OtherWords):
         viewers = []
         for number, (path, length, times) in enumerate(zip(paths, lengths.tolist(), durations, strict=True), 1):
             points = path[:length].double().numpy()
+            # Rounding to a hundredth puts none of them on the far edge.
+            points = np.minimum(points, np.array(self.size) - 0.51).round(2)
             spent = times[:length].double().round().numpy()
             viewers.append(Fixations(self.name, f"viewer {number}", points, self.size, spent))
         return viewers

@@ -237,6 +237,17 @@ def test_the_seed_repeats_scanpaths_whose_next_fixation_has_the_mean_of_the_dens
     assert not all(np.array_equal(a.points, b.points) for a, b in zip(again[0], other, strict=True))
 
 
+def test_points_of_viewers_have_two_digits_and_stay_in_the_picture(gaze, tmp_path):
+    """Also at the far edges, where the nearest hundredth lies outside."""
+    paths = gaze.scanpaths(100, seed=7)
+    gaze.to_csv(tmp_path / "viewers.csv", people=100, seed=7)
+    lines = (tmp_path / "viewers.csv").read_text().splitlines()[1:]
+    fields = [line.split(",") for line in lines]
+    assert len(lines) == sum(map(len, paths)) > 300
+    assert max(len(number.partition(".")[2]) for row in fields for number in (row[2], row[3])) == 2
+    assert all(path.inside.all() for path in paths)
+
+
 def test_the_next_density_is_over_the_pixels(gaze):
     path = gaze.scanpaths(1, seed=3)[0]
     density = gaze.next_density(path)
