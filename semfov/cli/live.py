@@ -1,6 +1,8 @@
 """Subcommand live: looks at a video, a camera or a network stream, and writes a video of the looks."""
 
-from collections import deque
+import shutil
+import sys
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
@@ -11,7 +13,7 @@ from time import perf_counter
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, white_of
 from semfov.cli.results import held_outputs
-from semfov.data.classes import amount, class_index
+from semfov.data.classes import amount, class_index, counted
 from semfov.data.sources import Picture, Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.io.files import check_apart, check_writable, write_text
@@ -108,25 +110,98 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
 def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path | None) -> None:
     """Look at every frame until Ctrl-C, print detections and belief, and write the video and the tracks, if wanted."""
     speed = _Speed()
+    sums = _Sums()
+    lines = _FrameLines()
     mot_lines: list[str] = []
     print(f"{stream.name}: {live.describe()}")
     with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add_frame:
         try:
             for picture, moment in _moments(live, stream):
                 speed.count_frame()
+                sums.add(moment)
                 if tracks is not None:
                     mot_lines.append(_mot_lines(moment))
                 if speed.frames == 1:
                     print("\n".join(_legend(live, moment)))
                 rate = speed.recent()
-                print(f"  {_moment_line(moment)}  {rate}", flush=True)
+                lines.show(f"  {_moment_line(moment)}  {rate}")
                 if add_frame is not None:
                     add_frame(draw_moment(picture.image, moment, f"{moment.describe()}   {rate}"))
         except KeyboardInterrupt:  # ends a stream in good order: what was written until then is whole
+            lines.end()
             print("  stopped")
+        finally:
+            lines.end()
     if tracks is not None:
         write_text(tracks, "".join(mot_lines))
     print(_totals(stream, speed))
+    if speed.frames:
+        print(sums.describe(), end="")
+
+
+class _FrameLines:
+    """The lines of the frames: one below the other, or on a terminal one line that is renewed."""
+
+    def __init__(self) -> None:
+        self._is_renewed = sys.stdout.isatty()
+        self._is_open = False
+
+    def show(self, line: str) -> None:
+        """Print the line of a frame; on a terminal as much of it as a line of it holds."""
+        if not self._is_renewed:
+            print(line, flush=True)
+            return
+        # A full line would make some terminals begin the next one.
+        width = shutil.get_terminal_size().columns - 1
+        print(f"\r{line[:width]:{width}}", end="", flush=True)
+        self._is_open = True
+
+    def end(self) -> None:
+        """End the line that is renewed, after which others are printed."""
+        if self._is_open:
+            print()
+        self._is_open = False
+
+
+class _Sums:
+    """What was listed in all frames: the different objects by their numbers, or in how many frames a target was found.
+
+    An object whose class changes counts once, as what it was listed last.
+    """
+
+    def __init__(self) -> None:
+        self._names: dict[int, str] = {}
+        self._sought: list[str] = []
+        self._target: str | None = None
+        self._frames = 0
+        self._frames_found = 0
+        self._have_numbers = False
+
+    def add(self, moment: Moment) -> None:
+        """Add the objects or the decision of a frame."""
+        self._frames += 1
+        if moment.decision is not None:
+            self._target = moment.target_name
+            self._frames_found += moment.decision.outcome == "found"
+            return
+        numbers = moment.objects.track_ids if isinstance(moment, WindowMoment) else None
+        if numbers is None:
+            return
+        self._have_numbers = True
+        self._sought = [moment.classes[label] for label in moment.sought]
+        for number, label in zip(numbers.tolist(), moment.objects.labels.tolist(), strict=True):
+            self._names[number] = moment.classes[label]
+
+    def describe(self) -> str:
+        """Say it in a line; empty where objects have no numbers."""
+        if self._target is not None:
+            return f"{self._target} found in {self._frames_found} of {amount(self._frames, 'frame')}\n"
+        if not self._have_numbers:
+            return ""
+        counts = Counter(dict.fromkeys(self._sought, 0))
+        counts.update(self._names.values())
+        kinds = ", ".join(counted(number, name) for name, number in counts.most_common())
+        return f"different objects listed: {kinds or 'none'}; one that was lost for long may count again\n"
 
 
 def _moments(live: LivePerception, stream: Stream) -> Iterator[tuple[Picture, Moment]]:

@@ -140,6 +140,43 @@ def test_large_frames_are_looked_at_by_windows(run, tmp_path, agent):
     assert "find: expected a target or classes to find, not both, got red" in printed.err
 
 
+@pytest.fixture
+def large_video(tmp_path):
+    large = torch.full((3, 768, 1024), 0.4)
+    large[0, 320:352, 640:672] = 0.95
+    return write(tmp_path / "large.avi", [large] * 6)
+
+
+@pytest.mark.slow
+def test_a_stream_ends_with_the_number_of_different_objects(tmp_path, capsys):
+    """It is the number of different identities in the tracks that are written beside it, but of no other class."""
+    path = write(tmp_path / "beach.avi", [example_scene("beach", ["person"]).image] * 4)
+    assert main(["live", str(path), "--find", "person,cat", "--tracks", str(tmp_path / "people.txt")]) == 0
+    rows = (tmp_path / "people.txt").read_text().splitlines()
+    different = {row.split(",")[1] for row in rows}
+    assert len(rows) > len(different) > 1
+    sentence = f"different objects listed: {len(different)} people, no cat; one that was lost for long may count again"
+    assert sentence in capsys.readouterr().out.splitlines()
+
+
+def test_a_searched_stream_ends_with_the_frames_in_which_the_target_was_found(run, agent, large_video):
+    agent.verification = small.Sure(thresholds=Thresholds(0.7, 0.01, 0.3))
+    _, printed = run("live", large_video, "--target", "red", "--how", "fovea")
+    found = printed.out.count("red: found")
+    assert found > 0
+    assert printed.out.splitlines()[-1] == f"red found in {found} of 6 frames"
+
+
+def test_a_terminal_has_one_line_that_is_renewed(run, large_video, monkeypatch):
+    monkeypatch.setattr(live.sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "70")
+    _, printed = run("live", large_video, "--find", "red")
+    (status,) = [line for line in printed.out.split("\n") if "\r" in line]
+    states = status.split("\r")[1:]
+    assert [int(state.split()[0]) for state in states] == list(range(6))
+    assert {len(state) for state in states} == {69}
+
+
 def test_windows_and_objects_are_drawn_into_a_frame(agent):
     """The present window has a wide frame, and the next one and each object a thin one."""
     large = torch.full((3, 768, 1024), 0.4)
