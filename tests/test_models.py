@@ -13,7 +13,7 @@ from semfov import ActivePerception, FovealObservationModel
 from semfov.belief import Verification
 from semfov.cli.agent import detector_classes, make_agent, note_of_detector
 from semfov.cli.options import SearchOptions
-from semfov.errors import InputError
+from semfov.errors import InputError, SemfovError
 from semfov.io.pretrained import shipped_model
 from semfov.observation.presence import presence_facts
 from semfov.observation.thresholds import Thresholds
@@ -313,7 +313,9 @@ def test_the_file_of_a_model_of_other_probabilities_of_cells_is_refused(one_of_e
     search.presence.centre = None
     verification = Verification.from_pretrained(folder / "verification.safetensors")
     del verification.metadata["true_cells"]
-    remedy = "fit again with python -m train.fit_search and python -m train.fit_verification"
+    remedy = (
+        "fit again with python -m train.fit_search and python -m train.fit_verification, or .* semfov fit yolox-nano"
+    )
     for model, expected, got in (
         (search, "probabilities of cells as the belief has them", "true probabilities of cells"),
         (verification, "true probabilities of cells", "probabilities of cells as the belief has them"),
@@ -376,6 +378,8 @@ def test_checks_are_of_the_detector_that_the_file_of_a_model_names():
     assert note_of_detector(SearchOptions(models=file)) == f"the detector is yolov3-tiny, to which {file} was fitted\n"
     assert note_of_detector(SearchOptions(models=file, detector="yolov3")) == ""
     assert note_of_detector(SearchOptions()) == ""
+    with pytest.raises(SemfovError, match=r"yolov3-tiny.*yolox-nano"):  # named, although it is the default
+        make_agent(SearchOptions(models=file, detector="yolox-nano"))
 
 
 @pytest.mark.parametrize("name", ["mine-search", "mine", "mine-published", "mine-published-0.1"])

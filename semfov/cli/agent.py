@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from semfov.agent import ActivePerception
-from semfov.cli.options import AgentOptions, DetectorOptions
+from semfov.cli.options import DEFAULT_DETECTOR, AgentOptions, DetectorOptions
 from semfov.data.classes import class_index
 from semfov.detection.load import check_detector, given_names
 from semfov.detection.onnx_file import write_settings
@@ -33,7 +33,7 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
     names = detector_options(options).get("classes")
     if options.models is not None and not is_model_file(options.models):
         return Manifest.read(options.models).classes
-    detector = _detector_of(options)
+    detector = detector_of(options)
     classes = check_detector(detector)
     if classes is not None and names is not None:
         expected = f"none for {detector}, which has its own; `semfov find --target CLASS` looks for one of them"
@@ -51,24 +51,31 @@ def _check_kind_of_weights(weights: Path | None, detector: str) -> None:
     check(registered.file.endswith(".onnx"), "weights", expected, weights)
 
 
-def _detector_of(options: AgentOptions) -> str:
-    """Name the detector: the one that is given, or else the one that the file of a model was fitted to."""
-    is_given = options.detector != AgentOptions.detector
-    if is_given or options.models is None or not is_model_file(options.models):
+def detector_of(options: AgentOptions) -> str:
+    """Name the detector: the one that is given, else the one that the file of a model was fitted to, or the default.
+
+    Args:
+        options: the options of a command.
+
+    Returns:
+        Its name or file.
+    """
+    if options.detector is not None:
         return options.detector
-    return str(open_model(options.models).metadata.get("detector", {}).get("name", options.detector))
+    if options.models is None or not is_model_file(options.models):
+        return DEFAULT_DETECTOR
+    return str(open_model(options.models).metadata.get("detector", {}).get("name", DEFAULT_DETECTOR))
 
 
 def note_of_detector(options: AgentOptions) -> str:
-    """Say which detector the file of a model names in place of the default; empty where it names that one.
-
-    Options do not tell whether the default detector was asked for by its name.
+    """Say which detector the file of a model names in place of the default; empty where it is given, or is that one.
 
     Args:
         options: the options of a command.
     """
-    detector = _detector_of(options)
-    return "" if detector == options.detector else f"the detector is {detector}, to which {options.models} was fitted\n"
+    detector = detector_of(options)
+    is_said = detector in (options.detector, DEFAULT_DETECTOR)
+    return "" if is_said else f"the detector is {detector}, to which {options.models} was fitted\n"
 
 
 def detector_options(options: DetectorOptions) -> dict[str, Any]:
@@ -147,7 +154,7 @@ def make_agent(options: AgentOptions) -> ActivePerception:
         The agent, ready for use.
     """
     device = options.device or "cpu"
-    detector = _detector_of(options)
+    detector = detector_of(options)
     if options.models is None or is_model_file(options.models):
         check_onnx_options(options, detector)
     agent = _load_agent(options, detector_options(options))
@@ -174,12 +181,13 @@ def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePercept
     """
     if options.models is not None:
         return _load_from_folder(options, options.models, loading)
+    detector = detector_of(options)
     if options.agent == "recommended":
         expected = "gradual with --agent recommended, whose models are fitted for it"
         check(options.sensor in (None, "gradual"), "sensor", expected, options.sensor)
-        return ActivePerception.recommended(options.detector, **loading)
+        return ActivePerception.recommended(detector, **loading)
     make = ActivePerception.published if options.agent == "published" else ActivePerception.raw
-    return make(options.detector, sensor=options.sensor or "published", **loading)
+    return make(detector, sensor=options.sensor or "published", **loading)
 
 
 def _load_from_folder(options: AgentOptions, folder: Path, loading: dict[str, Any]) -> ActivePerception:
@@ -188,7 +196,7 @@ def _load_from_folder(options: AgentOptions, folder: Path, loading: dict[str, An
     kinds = ("recommended",) if is_file else ("recommended", "published")
     form = "--models FILE, which takes the place of a shipped model" if is_file else "--models FOLDER"
     check(options.agent in kinds, "agent", f"{' or '.join(kinds)} with {form}", options.agent)
-    if options.detector != AgentOptions.detector:
+    if options.detector is not None:
         # The file of the detector is elsewhere now.
         loading = {"detector": options.detector, **loading}
     load = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from semfov.agents.picture import OpenedPicture
 from semfov.cli.agent import check_onnx_options, detector_options, remember
-from semfov.cli.options import GazeOptions
+from semfov.cli.options import DEFAULT_DETECTOR, GazeOptions
 from semfov.cli.results import held_outputs, tell_written, unfinished
 from semfov.cli.sources import example_source, picture_sources
 from semfov.data.examples import EXAMPLES
@@ -261,13 +261,14 @@ class _GazeJob:
 
 def _load(options: GazeOptions) -> tuple[Detector, FixationDensity]:
     """Load the detector, and the model of fixations: the stated one, or the one that is shipped for the detector."""
-    check_detector(options.detector)
-    check_onnx_options(options, options.detector)
+    name = options.detector or DEFAULT_DETECTOR
+    check_detector(name)
+    check_onnx_options(options, name)
     loading = detector_options(options)
     # A model that cannot be read is reported before the detector is loaded.
     stated_model = None if options.model is None else FixationDensity.from_pretrained(options.model)
-    detector = load_detector(options.detector, **loading)
-    remember(options, options.detector)
+    detector = load_detector(name, **loading)
+    remember(options, name)
     return detector, FixationDensity.for_detector(detector) if stated_model is None else stated_model
 
 

@@ -18,7 +18,7 @@ from semfov.agent import ActivePerception
 from semfov.agents.kinds import KINDS_OF_LOOK
 from semfov.agents.picture import PictureLike
 from semfov.belief.grid import Grid
-from semfov.cli.agent import detector_classes, make_agent, several_classes
+from semfov.cli.agent import detector_classes, detector_of, make_agent, several_classes
 from semfov.cli.options import ALL_DRAWINGS, ExploreOptions, FindOptions, PictureOptions, SearchOptions
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import STDOUT, kind_of
@@ -213,7 +213,7 @@ class SearchJob(PictureJob[SearchOptions]):
         options = self.options
         if not options.target:
             is_folder = options.models is not None and not is_model_file(options.models)
-            name = options.models if is_folder else options.detector
+            name = options.models if is_folder else detector_of(options)
             raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
         if classes is not None and self.weights is None:
             self.weights = meant_classes(options, classes)

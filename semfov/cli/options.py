@@ -30,6 +30,9 @@ ALL_DRAWINGS: tuple[Drawing, ...] = ("scanpath", "views", "belief", "animation")
 FIGURES = (".png", ".pdf", ".svg")
 """Ends of the name of a figure of one picture."""
 
+DEFAULT_DETECTOR = "yolox-nano"
+"""Detector of commands for which none is given."""
+
 AreasText = Annotated[
     str, Form("areas", "as NAME:LEFT,TOP,RIGHT,BOTTOM, with blanks between them, or a file .json", r".+:[\d.,-]+")
 ]
@@ -41,7 +44,7 @@ class DetectorOptions(Settings):
     """The detector.
 
     Args:
-        detector: name or file, as for `semfov.load_detector`.
+        detector: name or file, as for `semfov.load_detector` (none: yolox-nano).
         weights: file of the weights, for a detector that is a `.cfg` file or whose weights are not downloaded.
         classes: names of the detector's classes in the order of its scores, for a detector whose file does not hold
             them, or a text file with a name a line.
@@ -55,7 +58,7 @@ class DetectorOptions(Settings):
         device: where the detector runs, such as `cuda` or `cuda:1` (none: the processor).
     """
 
-    detector: str = "yolox-nano"
+    detector: str | None = None
     weights: Path | None = None
     classes: tuple[str, ...] | None = None
     head: str | None = None
@@ -78,7 +81,8 @@ class AgentOptions(StartSettings, DetectorOptions):
         agent: `recommended` (learned models, if they are shipped for the detector), `published` (the paper's:
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are).
-        detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
+        detector: name or file, as for `semfov.load_detector` (none: yolox-nano, or that of `models`); with `models`,
+            the new location of the detector's file.
         models: folder of models for your own detector, from `semfov fit`; it defines detector and sensor. The file of
             one model, as `python -m train.fit_search` writes it, takes the place of the shipped one.
         half: run a detector of PyTorch with numbers of 16 bits, which is faster on a GPU.
@@ -228,7 +232,8 @@ class GazeOptions(DetectorOptions):
     Args:
         pictures: photographs, folders of them, or patterns of names (none: one that comes with semfov).
         recursive: also take the photographs of the folders in a folder.
-        detector: name or file of the detector whose features are read, as for `semfov.load_detector`.
+        detector: name or file of the detector whose features are read, as for `semfov.load_detector` (none:
+            yolox-nano).
         model: file of a model for your own detector, from `semfov fit` (none: the one that is shipped).
         quality: `quick`, one pass of the detector; or `best`, six, over windows and a mirror image, too.
         panorama: each picture is a panorama of 360°, whose left and right edge meet.

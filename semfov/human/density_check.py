@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.agents.picture import OpenedPicture
-from semfov.cli.options import DetectorOptions
+from semfov.cli.options import DEFAULT_DETECTOR
 from semfov.data.fixations import Fixations
 from semfov.detection.load import load_detector
 from semfov.errors import SemfovError
@@ -39,7 +39,7 @@ def suspicions_by_content(
     names = sorted(counts, key=lambda name: (-counts[name], name))[:CONTENT_PICTURES]
     if len(names) < FEWEST_PICTURES:
         return []
-    detector = load_detector(DetectorOptions.detector)
+    detector = load_detector(DEFAULT_DETECTOR)
     densities: dict[str, Tensor] = {}
     picture_sizes: dict[str, tuple[int, int]] = {}
     with task_bar(len(names), "where people look", "picture", hidden=quiet) as bar:
