@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
-from semfov.io.pretrained import PretrainedForEye
+from semfov.io.pretrained import PretrainedForEye, fit_command
 from semfov.io.schema import Field, Schema
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
@@ -88,9 +88,11 @@ class Verification(DecidingModule, PretrainedForEye):
         kinds = {True: "true probabilities of cells", False: "probabilities of cells as the belief has them"}
         read = bool(self.metadata.get(TRUE_CELLS, False))  # files of earlier versions do not say so
         if read != searching.true_cells:
+            detector = searching.metadata.get("detector", {}).get("name", "MODEL")
             raise InputError(
                 f"verification: expected one that was fitted to a search with {kinds[searching.true_cells]}, got one "
-                f"of {kinds[read]}; fit again with python -m train.fit_search and python -m train.fit_verification"
+                f"of {kinds[read]}; fit again with python -m train.fit_search and python -m train.fit_verification, or "
+                f"fit both into a folder, which takes the place of the file: {fit_command(detector)}"
             )
 
     def _record(self) -> dict[str, Any]:
