@@ -176,7 +176,9 @@ def _matching(word: str) -> list[str]:
 
 
 def _check_may_be_picture(name: str, *, has_target: bool) -> None:
-    """Raise `InputError` for what cannot be a picture: an address, a word that is no file, or a video."""
+    """Raise `InputError` for what is no picture: an address, standard input, a word that is no file, or a video."""
+    remedy = "standard input is not read: write the picture to a file"
+    check(name != "-", "picture", "a file or folder", f"-; {remedy}")
     path = Path(name)
     is_stream = name.lower().startswith(("rtsp", "rtmp", "udp", "tcp", "srt"))
     remedy = "`semfov live` takes streams" if is_stream else "download it first"

@@ -1,7 +1,7 @@
 """Class names, matched between annotation files, detectors and other tables by spelling, number and synonyms."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence, Set
 from difflib import get_close_matches
 from itertools import chain
 from numbers import Integral
@@ -243,12 +243,12 @@ def _similar_classes(name: str, classes: Sequence[str]) -> list[str]:
 
 
 def class_numbers(
-    names: str | int | Sequence[str | int] | None, classes: Sequence[str], argument: str = "class"
+    names: str | int | Collection[str | int] | None, classes: Sequence[str], argument: str = "class"
 ) -> tuple[int, ...]:
     """Look up the indices of one class, of several, or of all classes.
 
     Args:
-        names: one name or index, or several; None for all classes.
+        names: one name or index, or several; those of a set are sorted. None for all classes.
         classes: names of the K classes.
         argument: name of the argument, for the message.
 
@@ -260,6 +260,8 @@ def class_numbers(
     """
     if names is None:
         return ()
+    if isinstance(names, Set):
+        names = sorted(names, key=str)
     if isinstance(names, str) or not isinstance(names, Sequence):
         return (_index_of_one(names, classes, argument),)
     check(len(names) > 0, argument, "a class, several, or None for all", names)

@@ -1,6 +1,7 @@
 """Conversion of pictures and points of common types into the tensors that the library works on."""
 
 from collections.abc import Sequence
+from io import IOBase
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union, get_args
 
@@ -217,6 +218,8 @@ def _other_kind(image: object) -> str:
         return "None (OpenCV returns None for a file that it cannot read); check the path"
     if isinstance(image, bytes | bytearray | memoryview):
         return f"{kind} of a file; open them with PIL.Image.open(io.BytesIO(…))"
+    if isinstance(image, IOBase):
+        return f"an open file, {kind}; give its path, or open it with PIL.Image.open"
     if isinstance(image, Sequence):
         return f"a {kind}; give pictures one by one, or all of them to semfov.run"
     return kind

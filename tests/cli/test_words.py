@@ -32,6 +32,7 @@ REFUSED = {
     "explore film.mp4": "picture: expected photographs; `semfov live` takes videos, got film.mp4",
     "explore http://example.org/a.jpg": "on this machine, got 'http://example.org/a.jpg'; download it first",
     "find rtsp://camera/1": "on this machine, got 'rtsp://camera/1'; `semfov live` takes streams",
+    "find - --target cup": "got -; standard input is not read: write the picture to a file",
     "explore FOLDER": "and --recursive also searches the folders in it, got none",
     "search nosuch.jpg cup": "picture: no such file or folder: nosuch.jpg; check the path",
     "search zebr nosuch.jpg": "picture: expected a file or folder (a class is given by --target zebr), got zebr",

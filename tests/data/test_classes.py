@@ -20,3 +20,4 @@ def test_every_class_name_matches_only_its_own_class():
     refused("unknown class 'spaceship'", class_index, "spaceship", COCO_CLASSES)
     refused("expected 2 different names", class_indices, ("sofa", "couch"))
     refused(r"; several classes are a list: \['cup', 'sofa'\]$", class_numbers, "cup, sofa", ("cup", "couch"))
+    assert class_numbers({"sofa", "cup"}, ("couch", "cup")) == (2, 1)  # sorted as they are written

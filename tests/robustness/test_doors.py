@@ -181,7 +181,7 @@ INVALID_IMAGES = {
     "None": (lambda _: None, "expected a path.*got None \\(OpenCV returns None"),
     "list": (lambda _: [RGB, RGB], "expected a path.*got a list; give pictures one by one"),
     "bytes": (lambda _: b"x", r"got bytes of a file; open them with PIL\.Image\.open\(io\.BytesIO"),
-    "file object": (lambda _: io.BytesIO(b"x"), "expected a path.*got BytesIO"),
+    "file object": (lambda _: io.BytesIO(b"x"), r"got an open file, BytesIO; give its path, or open it with PIL"),
     "stream": (lambda _: "rtsp://admin:secret@camera/1", "expected a file on this machine.*rtsp://….*use live"),
     "address": (lambda _: "https://example.org/cup.jpg", "expected a file on this machine.*download it first"),
     "missing": (lambda folder: folder / "nosuch.jpg", r"nosuch\.jpg: no such file; check"),
