@@ -177,19 +177,19 @@ class _GazeJob:
             "facts": _facts(prediction, shares),
             "part": None if self.report is None else gaze_part(prediction, paths, self.areas),
         }
-        density = self._density_path(number, prediction)
+        density = self._density_path(number)
         if density is not None:
             outcome["density"] = str(self._save_density(density, prediction))
         if options.compare:
             self.predictions[number] = prediction
         self.outcomes[number] = outcome
 
-    def _density_path(self, number: int, prediction: GazePrediction) -> Path | None:
+    def _density_path(self, number: int) -> Path | None:
         """Name the file of a density: the one that is given, or one in the folder, numbered if there are several."""
         folder = self.outputs.folder
         if folder is None:
             return self.outputs.density
-        name = f"{plain_name(Path(prediction.name).stem)}.png"
+        name = f"{plain_name(self.sources[number].place.stem)}.png"
         return folder / (f"{number:03d}-{name}" if self.several else name)
 
     def _save_density(self, path: Path, prediction: GazePrediction) -> Path:

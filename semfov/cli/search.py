@@ -21,6 +21,7 @@ from semfov.cli.jobs import ExploreJob, FindJob, PictureJob, SearchJob, make_aga
 from semfov.cli.options import AgentKind, ExploreOptions, FindOptions, PictureOptions, SearchOptions
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import held_outputs
+from semfov.cli.sources import EXAMPLE
 from semfov.cli.written import PictureFiles
 from semfov.data.classes import counted
 from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
@@ -77,8 +78,8 @@ def with_target(options: PictureOptions) -> PictureOptions:
 
 
 def _may_be_class(name: str) -> bool:
-    """Tell whether a word among the pictures looks like a class: no path, no pattern, and no file."""
-    is_bare = Path(name).name == name and not Path(name).suffix
+    """Tell whether a word among the pictures looks like a class: no path, no pattern, no file, and no example."""
+    is_bare = Path(name).name == name and not Path(name).suffix and not name.startswith(EXAMPLE)
     return is_bare and not os.path.lexists(name) and not set(name) & set("*?[")
 
 

@@ -28,7 +28,8 @@ _DEBUG = "SEMFOV_DEBUG"  # variable of the environment that also prints where in
 
 FlatPicture = str | Tensor | LargePicture  # a picture that is no scene: a file, pixels, or one that is open
 
-_EXAMPLE = "example:"  # before the name of a picture that comes with the package
+EXAMPLE = "example:"
+"""What is before the name of a picture that comes with the package."""
 
 
 class _Shown(TypedDict, total=False):
@@ -125,7 +126,7 @@ def example_source(name: str, classes: Sequence[str] = CLASSES, target: str | No
     """
     scene = example_scene(name, classes)
     boxes = None if target is None else scene.boxes[scene.labels == [*classes].index(target) + 1]
-    return PictureSource(f"{_EXAMPLE}{name}", scene=Picture(name, scene.image, boxes), place=Path(name))
+    return PictureSource(f"{EXAMPLE}{name}", scene=Picture(name, scene.image, boxes), place=Path(name))
 
 
 def picture_sources(options: PictureOptions | GazeOptions | CompareOptions) -> list[PictureSource]:
@@ -143,8 +144,8 @@ def picture_sources(options: PictureOptions | GazeOptions | CompareOptions) -> l
     sources: dict[str, PictureSource] = {}
     shown = _shown_by(options)
     for name in _names_of_pictures(options.pictures):
-        if name.startswith(_EXAMPLE):
-            sources.setdefault(name, example_source(name.removeprefix(_EXAMPLE)))
+        if name.startswith(EXAMPLE):
+            sources.setdefault(name, example_source(name.removeprefix(EXAMPLE)))
             continue
         _check_may_be_picture(name, has_target=hasattr(options, "target"))
         path = Path(name)

@@ -282,7 +282,8 @@ def test_a_detector_without_a_model_is_told(run, photos, monkeypatch):
     assert "colours" in err
 
 
-def test_without_a_picture_it_takes_an_embedded_scene(run):
-    code, out, _ = run("--people", 2)
+def test_without_a_picture_it_takes_an_embedded_scene(run, tmp_path):
+    code, out, _ = run("--people", 2, "--out", tmp_path / "gaze")
     assert code == 0
     assert "looking at example:beach, which comes with semfov" in out
+    assert {path.name for path in (tmp_path / "gaze").iterdir()} == {"beach.png", "pictures.csv", "scanpaths.csv"}

@@ -451,6 +451,8 @@ def test_the_names_of_a_shell_are_those_of_a_folder_and_a_class_may_stand_among_
     assert shown[0] == shown[1] == shown[2] != []
     options = SearchOptions(pictures=("a.jpg", "Cups", "b.jpg"))
     assert with_target(options) == replace(options, pictures=("a.jpg", "b.jpg"), target="Cups")
+    options = FindOptions(pictures=("example:beach", "boat"))
+    assert with_target(options) == replace(options, pictures=("example:beach",), target="boat")
     for others in (("a.jpg", "cupp"), ("a.jpg", "cup", "fork"), ("cup",)):
         options = FindOptions(pictures=others)
         assert with_target(options) is options
