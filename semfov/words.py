@@ -204,6 +204,7 @@ OBJECTS = _by_word(
     {
         "objects.boxes, which are corners: objects.boxes[:, 2:] - objects.boxes[:, :2] are their sizes": "area xywh",
         "objects.above(score), or objects.of(name)": "filter select where",
+        "len(objects.of(name)), or record.expected with what was not seen": "count",
         "the objects as they are, as each has one box already": "nms with_nms with_nmm",
         "record.to_csv(path, 'objects')": "save to_csv write",
         "record.to_frame('objects')": "dataframe df to_dataframe to_df to_frame to_pandas",

@@ -201,7 +201,8 @@ class _Sums:
         counts = Counter(dict.fromkeys(self._sought, 0))
         counts.update(self._names.values())
         kinds = ", ".join(counted(number, name) for name, number in counts.most_common())
-        return f"different objects listed: {kinds or 'none'}; one that was lost for long may count again\n"
+        limit = "; one that was lost for long may count again" if self._names else ""
+        return f"different objects listed: {kinds or 'none'}{limit}\n"
 
 
 def _moments(live: LivePerception, stream: Stream) -> Iterator[tuple[Picture, Moment]]:

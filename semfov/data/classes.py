@@ -1,11 +1,14 @@
 """Class names, matched between annotation files, detectors and other tables by spelling, number and synonyms."""
 
 import re
-from collections.abc import Collection, Sequence, Set
+from collections.abc import Sequence, Set
 from difflib import get_close_matches
 from itertools import chain
 from numbers import Integral
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.errors import InputError, check
@@ -243,12 +246,14 @@ def _similar_classes(name: str, classes: Sequence[str]) -> list[str]:
 
 
 def class_numbers(
-    names: str | int | Collection[str | int] | None, classes: Sequence[str], argument: str = "class"
+    names: str | int | Sequence[str | int] | Set[str | int] | NDArray[Any] | None,
+    classes: Sequence[str],
+    argument: str = "class",
 ) -> tuple[int, ...]:
     """Look up the indices of one class, of several, or of all classes.
 
     Args:
-        names: one name or index, or several; those of a set are sorted. None for all classes.
+        names: one name or index, or several, also in an array; those of a set are sorted. None for all classes.
         classes: names of the K classes.
         argument: name of the argument, for the message.
 
@@ -262,6 +267,8 @@ def class_numbers(
         return ()
     if isinstance(names, Set):
         names = sorted(names, key=str)
+    elif isinstance(names, np.ndarray):
+        names = names.tolist()
     if isinstance(names, str) or not isinstance(names, Sequence):
         return (_index_of_one(names, classes, argument),)
     check(len(names) > 0, argument, "a class, several, or None for all", names)

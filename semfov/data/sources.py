@@ -116,8 +116,13 @@ def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
     """Drop the figures and crops that semfov has written, with a warning."""
     written = [path for path in files if _is_made_here(path)]
     if written:
-        text = f"{len(written)} pictures that semfov has written, such as {printable(str(written[0]))}, are left out"
-        warnings.warn(f"{source}: {text}; name them, or their folder, to look at them", stacklevel=3)
+        name = printable(str(written[0]))
+        text = (
+            f"{len(written)} pictures that semfov has written, such as {name}, are left out; name them, or their folder"
+        )
+        if len(written) == 1:
+            text = f"1 picture that semfov has written, {name}, is left out; name it or its folder"
+        warnings.warn(f"{source}: {text}, to look there", stacklevel=3)
     return [path for path in files if path not in written]
 
 

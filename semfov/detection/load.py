@@ -217,6 +217,7 @@ def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
 def _detector_name(name_or_path: str | PathLike[str]) -> str:
     """Return a name as it is written in tables, and the path of a file as it is."""
     name = fspath(name_or_path)
+    check(bool(Path(name).name), "detector", "a name or a file", repr(name))
     check("://" not in name, "detector", "a file on this machine, or a name", f"{name}; download it")
     if name.endswith(_FILES):
         return name

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from semfov.data import canonical_name, class_index
@@ -21,3 +22,4 @@ def test_every_class_name_matches_only_its_own_class():
     refused("expected 2 different names", class_indices, ("sofa", "couch"))
     refused(r"; several classes are a list: \['cup', 'sofa'\]$", class_numbers, "cup, sofa", ("cup", "couch"))
     assert class_numbers({"sofa", "cup"}, ("couch", "cup")) == (2, 1)  # sorted as they are written
+    assert class_numbers(np.array(["cup", "sofa"]), ("couch", "cup")) == (2, 1)

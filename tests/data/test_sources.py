@@ -81,6 +81,10 @@ def test_pictures_that_semfov_has_written_are_left_out_of_folders_in_a_folder(tm
         assert picture_files(tmp_path, recursive=True) == [tmp_path / "photo.jpg"]
     assert picture_files(figure) == [figure]
     assert [path.name for path in picture_files(made)] == ["crop.jpg", "film.gif", "scanpath.png"]
+    for name in ("film.gif", "scanpath.png"):
+        (made / name).unlink()
+    with pytest.warns(UserWarning, match=r": 1 picture that semfov has written, \S+crop.jpg, is left out; name it or"):
+        picture_files(tmp_path, recursive=True)
 
 
 def test_frames_of_a_video_are_read_in_order(video):

@@ -82,6 +82,8 @@ def test_missing_and_unsuitable_files_names_and_modules_are_refused(small_cfg, s
         load_detector(small_cfg, weights=small_weights, classes=tmp_path / "missing.names")
     for name in ["yolov3-tinny", "nothing"]:
         refused(f"unknown detector '{name}'; .*yolov3-tiny", load_detector, name)
+    for name in ("", "."):
+        refused("detector: expected a name or a file, got '", load_detector, name)
     refused(r"torchvision, transformers or Ultralytics, got torch\.nn.*Linear", load_detector, nn.Linear(1, 1))
 
 
