@@ -265,14 +265,15 @@ def class_numbers(
     """
     if names is None:
         return ()
+    entries: Any = names
     if isinstance(names, Set):
-        names = sorted(names, key=str)
+        entries = sorted(names, key=str)
     elif isinstance(names, np.ndarray):
-        names = names.tolist()
-    if isinstance(names, str) or not isinstance(names, Sequence):
-        return (_index_of_one(names, classes, argument),)
-    check(len(names) > 0, argument, "a class, several, or None for all", names)
-    indices = [class_index(name, classes, argument) for name in names]
+        entries = names.tolist()
+    if isinstance(entries, str) or not isinstance(entries, Sequence):
+        return (_index_of_one(entries, classes, argument),)
+    check(len(entries) > 0, argument, "a class, several, or None for all", entries)
+    indices = [class_index(name, classes, argument) for name in entries]
     return tuple(dict.fromkeys(indices))
 
 
