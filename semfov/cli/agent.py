@@ -9,7 +9,7 @@ import torch
 
 from semfov.agent import ActivePerception
 from semfov.cli.options import DEFAULT_DETECTOR, AgentOptions, DetectorOptions
-from semfov.data.classes import class_index
+from semfov.data.classes import known_class
 from semfov.detection.load import check_detector, given_names
 from semfov.detection.onnx_file import write_settings
 from semfov.detection.weights import WEIGHTS
@@ -192,10 +192,12 @@ def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePercept
 
 def _load_from_folder(options: AgentOptions, folder: Path, loading: dict[str, Any]) -> ActivePerception:
     """Load an agent from a folder of models, or the file of one, which say what their detector is."""
-    is_file = is_model_file(folder)
-    kinds = ("recommended",) if is_file else ("recommended", "published")
-    form = "--models FILE, which takes the place of a shipped model" if is_file else "--models FOLDER"
-    check(options.agent in kinds, "agent", f"{' or '.join(kinds)} with {form}", options.agent)
+    if is_model_file(folder):
+        expected = "recommended with --models FILE, which takes the place of a shipped model"
+        check(options.agent == "recommended", "agent", expected, options.agent)
+    else:
+        expected = "recommended or published with --models FOLDER"
+        check(options.agent in ("recommended", "published"), "agent", expected, options.agent)
     if options.detector is not None:
         # The file of the detector is elsewhere now.
         loading = {"detector": options.detector, **loading}
@@ -220,4 +222,4 @@ def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str
         return None
     names = [name.strip() for name in text.split(",") if name.strip()]
     check(bool(names), "target", "a class, or several with commas", repr(text))
-    return names if classes is None else [classes[class_index(name, classes, "target") - 1] for name in names]
+    return names if classes is None else [known_class(name, classes, "target") for name in names]

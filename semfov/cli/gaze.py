@@ -31,7 +31,6 @@ from semfov.report.drafts import drafts_section
 from semfov.report.episode import Data
 from semfov.report.gaze import gaze_page_html, gaze_part
 from semfov.report.template import page_path, write_html
-from semfov.runs.config import WHERE
 from semfov.runs.results import SceneResults
 from semfov.viz.style import save_figure
 
@@ -93,16 +92,16 @@ class _Outputs:
         if out is None:
             return cls()
         kind = "" if out.is_dir() else out.suffix.lower()
-        if compared:
-            check(kind in ("", ".csv", ".png"), "out", "a folder, or a file .csv or .png", out)
-        else:
-            check(kind in ("", ".csv", *_DENSITIES), "out", "a folder, or a file .csv, .npy, .tif or .png", out)
-            check(kind not in _DENSITIES or not several, "out", "a .csv file or a folder for several pictures", out)
         if kind == "":
             return cls(out / "scanpaths.csv", out / _PICTURES, folder=out, figure=out / "compare.png")
         if kind == ".csv":
             return cls(out, out.with_name(f"{out.stem}-{_PICTURES}"))
-        return cls(figure=out) if compared else cls(density=out)
+        if compared:
+            check(kind == ".png", "out", "a folder, or a file .csv or .png", out)
+            return cls(figure=out)
+        check(kind in _DENSITIES, "out", "a folder, or a file .csv, .npy, .tif or .png", out)
+        check(not several, "out", "a .csv file or a folder for several pictures", out)
+        return cls(density=out)
 
 
 class _GazeJob:
@@ -127,9 +126,7 @@ class _GazeJob:
         self.outputs = _Outputs.of(options.out, several=self.several, compared=options.compare)
         check_apart(options.out, "out", [source.file for source in self.sources])
         self.areas = None if options.areas is None else boxes_of(options.areas)
-        self.report = options.report
-        if options.compare and options.out is None:
-            self.report = options.report or _COMPARED  # a comparison is always written somewhere
+        self.report = _page_of(options)
         if self.report is not None:
             check_writable(page_path(self.report))
         self.detector, self.model = _load(options)
@@ -139,14 +136,14 @@ class _GazeJob:
         self.predictions: dict[int, GazePrediction] = {}
         self.outcomes: dict[int, _Outcome] = {}
         self.finished: SceneResults | None = None
+        # A comparison needs both predictions whole, and what is kept of a picture is less.
         if self.several and not options.compare and self.outputs.table is not None:
             self.finished = self._take_up(self.outputs.table)
 
     def _take_up(self, table: Path) -> SceneResults:
         """Read what an interrupted command has predicted of the same pictures."""
-        settings = {name: value for name, value in self.options.plain().items() if name not in (*WHERE, "quiet")}
         depends_on = {
-            "options": settings,
+            "options": self.options.result_settings(),
             "detector": self.detector.settings(),
             "model": self.model,
             "areas": self.areas,
@@ -212,15 +209,20 @@ class _GazeJob:
         written += [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
         drafts = Drafts(*self.predictions.values()) if len(self.predictions) == 2 else None
         if drafts is not None:
-            print(drafts.describe(self.areas))
-            if self.outputs.figure is not None:
-                written.append(save_figure(drafts.plot(areas=self.areas), self.outputs.figure))
+            written += self._write_comparison(drafts)
         # Where one of two drafts cannot be read, an earlier comparison is not replaced by half of one.
         lacks_draft = self.options.compare and drafts is None
         if self.report is not None and outcomes and not lacks_draft:
             written.append(self._write_page(self.report, outcomes, drafts))
         progress = None if complete else f"{len(outcomes)} of {len(self.sources)}"
         tell_written(written, self.finished, progress)
+
+    def _write_comparison(self, drafts: Drafts) -> list[Path]:
+        """Say how two drafts differ, and draw it if a figure is written."""
+        print(drafts.describe(self.areas))
+        if self.outputs.figure is None:
+            return []
+        return [save_figure(drafts.plot(areas=self.areas), self.outputs.figure)]
 
     def _write_tables(self, outcomes: Mapping[int, _Outcome]) -> list[Path]:
         """Write the table of scanpaths, and beside it that of the pictures."""
@@ -257,6 +259,13 @@ class _GazeJob:
         count = Counter(name.lower() for name in names)
         pairs = zip(names, self.sources, strict=True)
         return [name if count[name.lower()] == 1 else source.name for name, source in pairs]
+
+
+def _page_of(options: GazeOptions) -> Path | None:
+    """Name the page that is written; a comparison is always written somewhere."""
+    if options.compare and options.report is None and options.out is None:
+        return _COMPARED
+    return options.report
 
 
 def _load(options: GazeOptions) -> tuple[Detector, FixationDensity]:

@@ -24,7 +24,8 @@ from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import STDOUT, kind_of
 from semfov.cli.sources import PictureSource, example_source, picture_sources
 from semfov.cli.truth import Truth
-from semfov.data import WordVectors, class_index, spread
+from semfov.data import WordVectors, spread
+from semfov.data.classes import known_class
 from semfov.data.examples import example_with
 from semfov.data.large import picture_size
 from semfov.errors import InputError, SemfovError, check
@@ -36,7 +37,6 @@ from semfov.io.ranges import CheckedSettings
 from semfov.kinds import Drawing
 from semfov.model_folder import is_model_file
 from semfov.paths import Record
-from semfov.runs.config import WHERE
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 
 _Options_co = TypeVar("_Options_co", bound=PictureOptions, covariant=True)
@@ -122,9 +122,8 @@ class PictureJob(ABC, Generic[_Options_co]):
         agent = self.agent
         models = self.options.models
         manifest = None if models is None else models if is_model_file(models) else models / MANIFEST
-        options = self.options.plain()
         return {
-            "options": {name: value for name, value in options.items() if name not in (*WHERE, "quiet")},
+            "options": self.options.result_settings(),
             "eye": agent.eye.settings(),
             "classes": agent.classes,
             "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
@@ -337,7 +336,7 @@ def meant_classes(options: SearchOptions, classes: Sequence[str]) -> dict[str, f
     """
     target = options.target or ""
     try:
-        return {classes[class_index(target, classes, "target") - 1]: 1.0}
+        return {known_class(target, classes, "target"): 1.0}
     except InputError as error:
         if options.embeddings is None:
             return _any_of_classes(options, classes, error)
@@ -353,13 +352,14 @@ def _any_of_classes(options: SearchOptions, classes: Sequence[str], error: Input
     """Read a target that is no class as several classes for a fovea; else raise the error with what it can be."""
     names: list[str] = []
     with suppress(InputError):
-        names = [classes[class_index(name.strip(), classes) - 1] for name in (options.target or "").split(",")]
-    if len(names) > 1:
-        if options.how == "fovea" or options.is_for_fovea:
-            return dict.fromkeys(names, 1.0)
-        raise InputError(
-            f"{error}; a search is for one class: for any of several add --how fovea, for all use `semfov find`"
-        ) from None
-    if "did you mean" in str(error):
+        names = [known_class(name.strip(), classes) for name in (options.target or "").split(",")]
+    has_several = len(names) > 1
+    is_foveal = options.how == "fovea" or options.is_for_fovea
+    if has_several and is_foveal:
+        return dict.fromkeys(names, 1.0)
+    remedy = "a description needs --embeddings, a file of word vectors"
+    if has_several:
+        remedy = "a search is for one class: for any of several add --how fovea, for all use `semfov find`"
+    elif "did you mean" in str(error):
         raise error
-    raise InputError(f"{error}; a description needs --embeddings, a file of word vectors") from None
+    raise InputError(f"{error}; {remedy}") from None

@@ -13,7 +13,7 @@ from time import perf_counter
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, white_of
 from semfov.cli.results import held_outputs
-from semfov.data.classes import amount, class_index, counted
+from semfov.data.classes import amount, counted, known_class
 from semfov.data.sources import Picture, Stream, open_stream
 from semfov.errors import InputError, check
 from semfov.io.files import check_apart, check_writable, write_text
@@ -99,7 +99,7 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
     if options.target is None or classes is None:
         return options.target
     try:
-        return classes[class_index(options.target, classes, "target") - 1]
+        return known_class(options.target, classes, "target")
     except InputError as error:
         if "," not in options.target:
             raise

@@ -10,9 +10,11 @@ from typing import Annotated, ClassVar, Literal
 
 from semfov.data.tone import White
 from semfov.errors import InputError
+from semfov.io.files import JsonObject
 from semfov.io.ranges import Count, Form, Range, Seed, Whole, Workers
 from semfov.kinds import Drawing, Quality
 from semfov.report.template import page_path
+from semfov.runs.config import WHERE
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 from semfov.settings import (
@@ -68,6 +70,10 @@ class DetectorOptions(Settings):
     per_class: bool = False
     remember: bool = False
     device: str | None = None
+
+    def result_settings(self) -> JsonObject:
+        """List the settings on which results depend: not those of folders, processes and printing."""
+        return {name: value for name, value in self.plain().items() if name not in (*WHERE, "quiet")}
 
 
 AgentKind = Literal["recommended", "published", "raw"]

@@ -13,7 +13,7 @@ import torch
 
 from semfov.agent import ActivePerception
 from semfov.cli.truth import Truth
-from semfov.data.annotations import Annotations, Entry, Id
+from semfov.data.annotations import Annotations, Entry, Id, annotation_of
 from semfov.data.classes import canonical_name
 from semfov.data.scene import Annotation
 from semfov.data.windowed import LargePicture
@@ -135,12 +135,11 @@ def all_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float)
     """
 
     def way(picture: LargePicture) -> list[Finding]:
-        began = time.perf_counter()
+        clock = _Clock()
         source = LiveWindowLooks(eye, eye.open(picture))
         windows = [Window.overview(source.lattice), *_slices_of(source.lattice, side, overlap)]
         looks = [source.see([window], hints=False)[0] for window in windows]
-        objects = merge(looks, labels)
-        return [Finding(len(looks), time.perf_counter() - began, objects, SCORE_THRESHOLD)]
+        return [clock.finding(looks, labels)]
 
     return way
 
@@ -158,29 +157,44 @@ def best_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float
     Returns:
         The way.
     """
+    wanted = _wanted(passes)
 
     def way(picture: LargePicture) -> list[Finding]:
-        began = time.perf_counter()
+        clock = _Clock()
         source = LiveWindowLooks(eye, eye.open(picture))
         order = ranked(_slices_of(source.lattice, side, overlap), labels)
         looks: list[WindowLook] = []
         findings = []
-        merged = 0.0  # seconds for points before, which a run to a later one does not take
         for step in islice(look_by_look(source, order, None), passes):
             looks.append(step.look)
-            if len(looks) in _wanted(passes):
-                seconds = time.perf_counter() - began - merged
-                merging = time.perf_counter()
-                objects = merge(looks, labels)
-                duration = time.perf_counter() - merging
-                merged += duration
-                findings.append(Finding(len(looks), seconds + duration, objects, SCORE_THRESHOLD))
-        if len(looks) not in _wanted(passes):
-            seconds = time.perf_counter() - began - merged
-            findings.append(Finding(len(looks), seconds, merge(looks, labels), SCORE_THRESHOLD))
+            if len(looks) in wanted:
+                findings.append(clock.finding(looks, labels))
+        # The last look counts also where there are no more slices before the next of the numbers.
+        if len(looks) not in wanted:
+            findings.append(clock.finding(looks, labels))
         return findings
 
     return way
+
+
+class _Clock:
+    """Time of a run since this was made.
+
+    Objects are merged for each point on the way, which a run that ends at a later point does not do: a merge counts
+    for its own point alone.
+    """
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+
+    def finding(self, looks: Sequence[WindowLook], labels: Sequence[int]) -> Finding:
+        """Merge what the looks so far show, and tell the time with this merge."""
+        merging = time.perf_counter()
+        objects = merge(looks, labels)
+        merged = time.perf_counter()
+        finding = Finding(len(looks), merged - self._began, objects, SCORE_THRESHOLD)
+        self._began += merged - merging
+        return finding
 
 
 def warm_up(eye: WindowEye, picture: LargePicture) -> None:
@@ -300,11 +314,7 @@ class AnnotatedReference(Reference):
             has_area = min(entry["bbox"][2:]) > 0
             if has_area and entry["category_id"] in label_of_category:
                 sought.append(entry)
-        boxes = torch.tensor([entry["bbox"] for entry in sought], dtype=torch.float32).view(-1, 4)  # (N, 4)
-        boxes[:, 2:] += boxes[:, :2]  # a file has width and height, and not the right lower corner
-        labels = torch.tensor([label_of_category[entry["category_id"]] for entry in sought], dtype=torch.long)
-        crowd = torch.tensor([bool(entry["iscrowd"]) for entry in sought], dtype=torch.bool)
-        self.pictures[image] = Annotation(boxes, labels, crowd, size)
+        self.pictures[image] = annotation_of(sought, label_of_category, size)
 
     def annotations(self) -> Annotations:
         return self.truth.annotations

@@ -1,7 +1,7 @@
 """Annotation files in COCO's format; every entry is checked before it is used."""
 
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 
+from semfov.data.scene import Annotation
 from semfov.errors import DataError, check_data
 from semfov.io.files import read_json, sha256
 from semfov.io.schema import excerpt, is_number, is_plain
@@ -52,6 +53,24 @@ class Annotations:
         if width is None or height is None:
             return None
         return int(width), int(height)
+
+
+def annotation_of(entries: Sequence[Entry], labels: Mapping[Id, int], size: tuple[int, int]) -> Annotation:
+    """Convert the objects of an image.
+
+    Args:
+        entries: its objects, whose boxes are `[x, y, width, height]`.
+        labels: class 1..K of each category.
+        size: `(width, height)` of the image in pixels.
+
+    Returns:
+        The objects, with both corners of their boxes.
+    """
+    boxes = torch.tensor([entry["bbox"] for entry in entries], dtype=torch.float32).view(-1, 4)  # (N, 4)
+    boxes[:, 2:] += boxes[:, :2]
+    numbers = torch.tensor([labels[entry["category_id"]] for entry in entries], dtype=torch.long)
+    crowd = torch.tensor([bool(entry["iscrowd"]) for entry in entries], dtype=torch.bool)
+    return Annotation(boxes, numbers, crowd, size)
 
 
 _OF_YOLO = (
@@ -165,14 +184,22 @@ def _checked(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> 
     entries = data.get(key)
     if not isinstance(entries, list):
         raise DataError(f"{name}: expected {key} to be a list, got {_shown(data, key)}; {_REMEDY}")
-    for place, entry in enumerate(entries):  # of which there are many, so that messages are made where they are needed
-        if not isinstance(entry, dict):
-            raise DataError(f"{name}: {key}[{place}]: expected an object, got {excerpt(entry)}; {_REMEDY}")
-        for field, (accepts, expected) in fields.items():
-            if not accepts(entry.get(field)):
-                fault = f"expected {field} to be {expected}, got {_shown(entry, field)}; {_REMEDY}"
-                raise DataError(f"{name}: {key}[{place}]: {fault}")
+    for place, entry in enumerate(entries):
+        fault = _fault_of(entry, fields)
+        if fault is not None:
+            raise DataError(f"{name}: {key}[{place}]: {fault}; {_REMEDY}")
     return entries
+
+
+def _fault_of(entry: object, fields: Mapping[str, _Field]) -> str | None:
+    """Say which field of an entry is not as expected; None if all are."""
+    if not isinstance(entry, dict):
+        return f"expected an object, got {excerpt(entry)}"
+    # There are many entries, so that the message is made where it is needed.
+    for field, (accepts, expected) in fields.items():
+        if not accepts(entry.get(field)):
+            return f"expected {field} to be {expected}, got {_shown(entry, field)}"
+    return None
 
 
 def _by_id(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> dict[Id, Entry]:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence, Set
 from difflib import get_close_matches
-from itertools import chain
 from numbers import Integral
 from typing import Any
 
@@ -202,6 +201,26 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
     raise InputError(_unknown(argument, name, suggestions, classes))
 
 
+def known_class(name: str, classes: Sequence[str], argument: str = "class") -> str:
+    """Find the class that a name means, as the detector spells it.
+
+    Args:
+        name: name of the class in any spelling of `class_index`.
+        classes: names of the K classes.
+        argument: name of the argument, for the message.
+
+    Returns:
+        The name among `classes`.
+
+    Raises:
+        InputError: there is no such class; the message suggests classes with this synonym or a similar name.
+
+    >>> known_class("Wine_Glasses", ("cup", "wine glass"))
+    'wine glass'
+    """
+    return classes[class_index(name, classes, argument) - 1]
+
+
 def _matches(name: str, classes: Sequence[str]) -> list[int]:
     """Find the places of the classes that a name spells, from 0: in the same number, else in the other one.
 
@@ -237,9 +256,10 @@ def _similar_classes(name: str, classes: Sequence[str]) -> list[str]:
     by_key: dict[str, str] = {}
     for class_name in classes:
         by_key.setdefault(_plain_key(class_name), class_name)  # the first of two in one spelling
-    singular = [word for word in _SYNONYMS if wanted in _other_numbers(word)]
-    names = chain.from_iterable(_SYNONYMS.get(word, ()) for word in (wanted, *singular))
-    meant = [key for key in map(_plain_key, names) if key in by_key]
+    words = [wanted, *(word for word in _SYNONYMS if wanted in _other_numbers(word))]
+    meant: list[str] = []
+    for word in words:
+        meant += filter(by_key.__contains__, map(_plain_key, _SYNONYMS.get(word, ())))
     # A synonym says more than a similar spelling, which then has to be closer.
     similar = get_close_matches(wanted, by_key, n=3, cutoff=0.8 if meant else 0.6)
     return [by_key[key] for key in (*meant, *similar)]

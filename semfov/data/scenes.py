@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.data.annotations import Entry, Id
+from semfov.data.annotations import annotation_of
 from semfov.data.classes import class_indices
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, ComposedScenes, Scene, legal_targets
@@ -48,19 +48,9 @@ def _photographs() -> tuple[tuple[str, ...], tuple[_Photograph, ...]]:
     for image in record["images"]:
         entries = [entry for entry in record["annotations"] if entry["image_id"] == image["id"]]
         size = image["width"], image["height"]
-        objects = _objects(entries, labels_by_id, size)
+        objects = annotation_of(entries, labels_by_id, size)
         photographs.append(_Photograph(image["file_name"].removesuffix(".jpg"), objects))
     return classes, tuple(photographs)
-
-
-def _objects(entries: Sequence[Entry], labels_by_id: dict[Id, int], size: tuple[int, int]) -> Annotation:
-    """Convert the entries of a picture's objects in COCO's format, whose boxes are `[x, y, width, height]`."""
-    numbers = torch.tensor([entry["bbox"] for entry in entries], dtype=torch.float32)
-    x, y, width, height = numbers.unbind(-1)
-    boxes = torch.stack([x, y, x + width, y + height], -1)
-    labels = torch.tensor([labels_by_id[entry["category_id"]] for entry in entries])
-    crowd = torch.tensor([entry["iscrowd"] == 1 for entry in entries])
-    return Annotation(boxes, labels, crowd, size)
 
 
 CLASSES, PHOTOGRAPHS = _photographs()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.prior import Prior, check_share
-from semfov.data.classes import class_index
+from semfov.data.classes import known_class
 from semfov.decision import SAME, CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import NO_TRACK, SCORE_THRESHOLD, Objects
@@ -34,7 +34,7 @@ class NumberByClass(dict[str, float]):
     def __missing__(self, name: str) -> float:
         """Return the number of the class that a name means."""
         names = list(self)
-        return self[names[class_index(name, names, "expected") - 1]]
+        return self[known_class(name, names, "expected")]
 
     if not TYPE_CHECKING:  # to which any name would be an attribute
 
@@ -325,9 +325,10 @@ class Outcome(ABC):
         if decision.box is None or self.target is None:
             return None
         probability = decision.probability if decision.place is None else decision.place
-        looks = [look.index_of_look for look in self.closer if look.box.equal(decision.box)]
+        close_ups = [close_up for close_up in self.closer if close_up.box.equal(decision.box)]
         # A box of no closer look is of the look by which the search decided, its last one.
-        return _ConfirmedPlace(decision.box, self.target, probability, looks[0] if looks else len(self) - 1)
+        look = close_ups[0].index_of_look if close_ups else len(self) - 1
+        return _ConfirmedPlace(decision.box, self.target, probability, look)
 
     @property
     def _has_missed(self) -> bool:
