@@ -136,12 +136,19 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
         f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "
         f"{_precision(slices)} in {slices.seconds:.2f} s ({_passes(slices)})."
     ]
-    # The passes, counted back from the last one, after which semfov is at least as good.
-    # Not where all slices find nothing, with which all would be level.
-    level = [*takewhile(lambda point: (point.ap50 or 0) >= (slices.ap50 or 0) > 0, reversed(ours))]
-    if level:
-        sentences.append(f"It is level with them from {_passes(level[-1])} and {level[-1].seconds:.2f} s on.")
+    level = _level_from(ours, slices)
+    if level is not None:
+        sentences.append(f"It is level with them from {_passes(level)} and {level.seconds:.2f} s on.")
     return sentences
+
+
+def _level_from(ours: Sequence[Point], slices: Point) -> Point | None:
+    """Find the point from which on semfov is at least as good as all slices; None where they find nothing."""
+    least = slices.ap50 or 0
+    if least == 0:  # with which all points would be level
+        return None
+    level = [*takewhile(lambda point: (point.ap50 or 0) >= least, reversed(ours))]
+    return level[-1] if level else None
 
 
 def _agreement(last: Point, slices: Point) -> list[str]:

@@ -141,15 +141,17 @@ def _object_lines(picture: Values) -> list[Values]:
         return [picture]
     objects: list[Values] = picture["objects"]
     present = {line["class"] for line in objects}
-    absent = [name for name in picture["targets"] if name not in present]
-    if not objects and not absent:
-        absent = [None]
-    lines = []
-    for line in [*objects, *({"class": name} for name in absent)]:
-        of_picture = {name: picture[name] for name in ("picture", "width", "height")}
-        of_class = {name: picture[name].get(line["class"]) for name in _EXPECTED}
-        lines.append({**of_picture, **line, **of_class})
-    return lines
+    absent = [{"class": name} for name in picture["targets"] if name not in present]
+    # A picture in which nothing was found, when nothing in particular was looked for, has a line, too.
+    lines = [*objects, *absent] or [{"class": None}]
+    return [_with_picture(line, picture) for line in lines]
+
+
+def _with_picture(line: Values, picture: Values) -> Values:
+    """Put what is known of the picture before the line of an object, and of the class after it."""
+    of_picture = {name: picture[name] for name in ("picture", "width", "height")}
+    of_class = {name: picture[name].get(line["class"]) for name in _EXPECTED}
+    return {**of_picture, **line, **of_class}
 
 
 class GeoJson(ResultsFormat):

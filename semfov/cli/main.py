@@ -127,8 +127,9 @@ def _text(name: str, rest: Sequence[str]) -> str | None:
         return OVERVIEW
     if name == "completion":
         return _completion("".join(rest[:1]), {command: _option_names(command) for command in SUBCOMMANDS})
-    asks_for_help = name in SUBCOMMANDS and {"--help", "-h"}.intersection(rest)
-    return SUBCOMMANDS[name].help if asks_for_help else None
+    if name in SUBCOMMANDS and {"--help", "-h"}.intersection(rest):
+        return SUBCOMMANDS[name].help
+    return None
 
 
 _BASH = """\
@@ -236,15 +237,23 @@ def _refusal(command: str, option: str) -> str | None:
     positional = SUBCOMMANDS[command].positional
     if positional is None:
         return None
-    is_unknown = bool(option) and option not in _option_names(command)
-    # The parts of the detector are options of `semfov fit`: detector.name and others.
-    is_whole_detector = (command, option) == ("fit", "detector")
-    if is_whole_detector or (is_unknown and _means_positional(option, positional)):
-        singular = positional.removesuffix("s")
-        usage = f"semfov {command} {singular.upper()}"
-        return f"unknown option --{option}; the {singular} has no option before it: {usage}"
-    is_advised = is_unknown and command in (*_LOOKING, "gaze")
+    if (command, option) == ("fit", "detector"):
+        # The parts of the detector are options of `semfov fit`: detector.name and others.
+        return _without_option(command, option, positional)
+    if not option or option in _option_names(command):
+        return None
+    if _means_positional(option, positional):
+        return _without_option(command, option, positional)
+    # The parser lists all options of the other subcommands, which have few.
+    is_advised = command in (*_LOOKING, "gaze")
     return _meant_instead(command, option) if is_advised else None
+
+
+def _without_option(command: str, option: str, positional: str) -> str:
+    """Say that what a subcommand is for stands after its name, without an option."""
+    singular = positional.removesuffix("s")
+    usage = f"semfov {command} {singular.upper()}"
+    return f"unknown option --{option}; the {singular} has no option before it: {usage}"
 
 
 def _means_positional(option: str, positional: str) -> bool:
@@ -288,8 +297,12 @@ def _in_command_words(message: str, options: Iterable[str]) -> str:
     names = "|".join(map(re.escape, by_name))
 
     def option(match: re.Match[str]) -> str:
+        words = [f"--{dashed(by_name[match[1]])}"]
+        # A flag that is set, `half=True`, has no value in a command.
         value = (match[2] or "").strip("'\"").removeprefix("True")
-        return f"--{dashed(by_name[match[1]])}{' ' if value else ''}{value}"
+        if value:
+            words.append(value)
+        return " ".join(words)
 
     # Settings of other programs stay as they are.
     return re.sub(rf"(?<![\w.-])(?<!yolo export )({names})=('[^']*'|\"[^\"]*\"|[\w.]*\w)?", option, message)

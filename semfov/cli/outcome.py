@@ -17,6 +17,7 @@ from semfov.cli.options import ALL_DRAWINGS, PictureOptions
 from semfov.cli.results import kind_of, results_format
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
+from semfov.data.classes import amount
 from semfov.decision import Decision
 from semfov.detection.objects import box_text
 from semfov.io.files import plain_name
@@ -35,13 +36,15 @@ _CROP_QUALITY = 92  # of the JPEGs of crops
 def _outcome_text(record: Record, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
-    limit = " (the limit)" if record.ending == "passes" else ""
-    looks = f"{record.passes} look{'s' if record.passes != 1 else ''}{limit} in {seconds:.1f} s"
+    is_at_limit = record.ending == "passes"
+    limit = " (the limit)" if is_at_limit else ""
+    looks = f"{amount(record.passes, 'look')}{limit} in {seconds:.1f} s"
     if record.kind.turns:  # whose seconds are those of its movements and looks
         looks += f" on this machine, {record[-1].seconds:.1f} s of eye and head"
     decision = record.decision
     headline = record.words.objects if decision is None else _decision_text(record, decision)
-    reason = record.words.lack() if limit else record.words.ended
+    reason = record.words.lack() if is_at_limit else record.words.ended
+    # Where there is no reason, the line begins with the looks.
     lines = [f"{name}, {width} × {height} px: {headline}", f"  {reason} {looks}.".replace("   ", "  ")]
     assumption = record.words.assumption()
     if assumption:
@@ -58,14 +61,22 @@ def _decision_text(record: Record, decision: Decision) -> str:
     decided_by = record.words.decided_by
     measure = "probability that the picture holds it:" if decided_by == "probability" else decided_by
     probability = f"{measure} {decision.probability:.2f}"
-    if decision.outcome != "found":
-        is_absent = decision.outcome == "absent"
-        verdict = f"{name} is {record.words.doubt}not there" if is_absent else record.words.verdict(name)
-        return "; ".join(filter(None, (f"{verdict}, {probability}", record.words.best_place)))
-    point = record.found_at
-    place = "" if point is None else f" at ({point[0]:.0f}, {point[1]:.0f})"
-    edges = "" if decision.box is None else f", box {box_text(decision.box.tolist())}"
-    return f"found {name}{place}{edges}, {probability}"
+    if decision.outcome == "found":
+        return f"found {name}{_place_text(record, decision)}, {probability}"
+    is_absent = decision.outcome == "absent"
+    verdict = f"{name} is {record.words.doubt}not there" if is_absent else record.words.verdict(name)
+    return "; ".join(filter(None, (f"{verdict}, {probability}", record.words.best_place)))
+
+
+def _place_text(record: Record, decision: Decision) -> str:
+    """Say where the target was found, as far as it is known."""
+    text = ""
+    if record.found_at is not None:
+        x, y = record.found_at
+        text = f" at ({x:.0f}, {y:.0f})"
+    if decision.box is not None:
+        text += f", box {box_text(decision.box.tolist())}"
+    return text
 
 
 def _objects_lines(record: Record) -> list[str]:
@@ -88,14 +99,15 @@ def _object_line(row: Values) -> str:
 
 def _regions_lines(record: Record) -> list[str]:
     """Write a line for each class that was looked for and that the final map names, with its most probable cell."""
+    sought = [record.classes[label] for label in record.targets] or record.classes
     cells: Counter[str] = Counter()
     best: dict[str, Region] = {}
     for region in record.regions():
-        is_sought = not record.targets or record.classes.index(region.name) in record.targets
-        if not is_sought:
+        if region.name not in sought:
             continue
         cells[region.name] += len(region.cells)
-        if region.name not in best or region.probability > best[region.name].probability:
+        first = best.setdefault(region.name, region)
+        if region.probability > first.probability:
             best[region.name] = region
 
     lines = []
@@ -111,10 +123,11 @@ def _looks_text(record: Record) -> str:
     headings = ["look", "at (x, y)", "shows", f"detections from score {CONFIDENT:g} on", "value", "s"]
     rows = [_look_row(record, look) for look in record]
     lines = [f"  {line}" for line in table_lines([headings, *rows])]
-    if any(look.value is not None for look in record):
+    has_values = any(look.value is not None for look in record)
+    if has_values:
         lines.append(f"  value: {record.words.value}")
+    lines += [_closer_line(record, number) for number in range(len(record.closer))]
     if record.closer:
-        lines += [_closer_line(record, number) for number in range(len(record.closer))]
         lines.append("  in the picture: by all looks so far, so also where that closer look shows nothing of it")
     return "\n".join(lines)
 

@@ -11,7 +11,7 @@ from contextlib import nullcontext, redirect_stdout
 from dataclasses import fields, replace
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Literal, TextIO, get_args, get_type_hints
+from typing import Any, Literal, TextIO, TypeVar, get_args, get_type_hints
 
 from tqdm import tqdm
 
@@ -29,6 +29,8 @@ from semfov.paths.conversion import Values
 from semfov.paths.words import number_with_error
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
+
+_Value = TypeVar("_Value")
 
 _TASKS: dict[str, tuple[type[PictureOptions], type[PictureJob[PictureOptions]]]] = {
     "search": (SearchOptions, SearchJob),
@@ -170,9 +172,14 @@ def _as_settings(options: Mapping[str, Any], kind: type[PictureOptions]) -> dict
     if isinstance(values.get("draw"), str):
         values["draw"] = (values["draw"],)
     if isinstance(values.get("start"), str):
-        numbers = tuple(int(number) for number in values["start"].strip("()[] ").split(","))
-        values["start"] = numbers if len(numbers) > 1 else numbers[0]
+        values["start"] = _start_of(values["start"])
     return values
+
+
+def _start_of(text: str) -> int | tuple[int, ...]:
+    """Read a cell by its number, `5`, or by its column and row, `3,2`."""
+    numbers = tuple(int(number) for number in text.strip("()[] ").split(","))
+    return numbers if len(numbers) > 1 else numbers[0]
 
 
 def _check_agent_is_made(options: Mapping[str, Any]) -> None:
@@ -252,23 +259,27 @@ def _expected_in_all(rows: Iterable[Values]) -> str:
     The errors of pictures are independent: the square of that of the sum is the sum of their squares.
     """
     looked_at = [row for row in rows if "error" not in row]
-    targets = {name for row in looked_at for name in row["targets"]}
-    if len(targets) != 1:
+    target = _only({name for row in looked_at for name in row["targets"]})
+    if target is None:
         return ""
-    (target,) = targets
     means = [row["expected"].get(target) for row in looked_at]
     errors = [row["expected_error"].get(target) for row in looked_at]
+    # A sum without the pictures of which no number is expected would be too small.
     if None in means or None in errors:
         return ""
     return f"expect {number_with_error(sum(means), math.hypot(*errors))} in all"
 
 
+def _only(values: set[_Value]) -> _Value | None:
+    """Take the only one of some values; None where there are others, or none."""
+    return next(iter(values)) if len(values) == 1 else None
+
+
 def _assumed_in_all(files: PictureFiles) -> str:
     """Say how many pictures the probabilities of searches assume to hold the target; empty where it is not known."""
-    shares = {row["assumed"] for row in files.rows.values() if row.get("assumed") is not None}
-    if len(shares) != 1:
+    share = _only({row["assumed"] for row in files.rows.values() if row.get("assumed") is not None})
+    if share is None:
         return ""
-    (share,) = shares
     how_many = "half" if share == 0.5 else f"{100 * share:.3g} %"
     return f"The probabilities assume that {how_many} of the pictures hold it. If you know better, give a prior.\n"
 
@@ -292,7 +303,8 @@ def _outcomes(
     options = job.options
     numbers = [number for number in range(len(job.sources)) if number not in before]
     where: Where = options.workers if options.scheduler is None else options.scheduler
-    if numbers and where != 1 and (where is None or isinstance(where, int)):
+    has_processes = where is None or isinstance(where, int)
+    if numbers and has_processes and where != 1:
         # A process takes as long to start as this one has taken so far. The first picture tells whether that pays.
         start = time.process_time()
         first = numbers.pop(0)
@@ -314,4 +326,7 @@ def _outcomes(
 def _worth_starting(processes: int | None, tasks: int, seconds: float, start: float) -> int:
     """Choose the number of processes for tasks of some seconds; 1 where to start them takes longer than they save."""
     most = min(available_cores() if processes is None else processes, tasks)
-    return most if most > 1 and tasks * seconds * (1 - 1 / most) > start else 1
+    if most <= 1:
+        return 1
+    seconds_saved = tasks * seconds * (1 - 1 / most)
+    return most if seconds_saved > start else 1

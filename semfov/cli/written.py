@@ -86,15 +86,25 @@ class PictureFiles:
             for path, content in outcome.files.items():
                 write_bytes(path, content)
             if self._folder is not None:
-                name = plain_name(Path(source.name).name)
-                folder = self._folder / f"{number:03d}-{name}" if self.job.several else self._folder
-                for file, content in outcome.figures.items():
-                    check_apart(folder / file, "out", [source.file])
-                    write_bytes(folder / file, content)
-                self._written += [folder / file for file in outcome.names]
+                self._write_into(self._folder_of(number, self._folder), outcome, source.file)
         except Exception as error:
             return source.fault(error, several=self.job.several)
         return outcome
+
+    def _folder_of(self, number: int, folder: Path) -> Path:
+        """Name the folder of a picture's figures: one of its own within that of several pictures."""
+        if not self.job.several:
+            return folder
+        name = plain_name(Path(self.job.sources[number].name).name)
+        return folder / f"{number:03d}-{name}"
+
+    def _write_into(self, folder: Path, outcome: PictureOutcome, picture: Path | None) -> None:
+        """Write the figures of a picture into a folder, but not over the picture itself."""
+        for file, content in outcome.figures.items():
+            check_apart(folder / file, "out", [picture])
+            write_bytes(folder / file, content)
+        # An earlier command may have written them, of which the outcome keeps the names alone.
+        self._written += [folder / file for file in outcome.names]
 
     def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
         """Write the row of a picture, and keep it for the same command.
@@ -127,14 +137,19 @@ class PictureFiles:
         options = self.job.options
         written: list[object] = []
         if self._results is not None:
-            self._results.write()
-            if complete and any("error" not in row for row in self.rows.values()):
-                self._results.print_judgement()
-            if self._results.path != STDOUT:
-                written.append(self._results.path)
+            written += self._write_results(self._results, complete=complete)
         written += self._written
         if options.report is not None and self._episodes:
             episodes = [self._episodes[number] for number in sorted(self._episodes)]
             written.append(write_page(options.report, f"semfov: {self.job.title}", episodes))
         written += [folder for folder in (options.crops, options.labels) if folder is not None]
-        tell_written(written, self.finished, None if complete else f"{len(self.rows)} of {len(self.job.sources)}")
+        part = None if complete else f"{len(self.rows)} of {len(self.job.sources)}"
+        tell_written(written, self.finished, part)
+
+    def _write_results(self, results: ResultsFile, *, complete: bool) -> list[Path]:
+        """Write the file of results, judge the objects of a complete one, and list it unless it is a stream."""
+        results.write()
+        was_looked_at = any("error" not in row for row in self.rows.values())
+        if complete and was_looked_at:
+            results.print_judgement()
+        return [] if results.path == STDOUT else [results.path]
