@@ -117,9 +117,12 @@ class CocoScenes(Scenes):
             return list(range(len(image_ids)))
         chosen = {str(image) for image in ids}
         missing = sorted(chosen - set(image_ids))
-        first = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
-        got = f"none for {len(missing)} of them: {first}; correct ids or the annotations"
-        check_data(not missing, self._name, f"an image for each of {len(chosen)} ids", got)
+        if missing:
+            named = ", ".join([*missing[:5], "…"] if len(missing) > 5 else missing)
+            raise DataError(
+                f"{self._name}: expected an image for each of {len(chosen)} ids, got none for {len(missing)} of them: "
+                f"{named}; correct ids or the annotations"
+            )
         return [row for row, image in enumerate(image_ids) if image in chosen]
 
     def _select(self, criteria: "_Criteria", rows: Sequence[int], limit: int | None) -> dict[int, list[int]]:

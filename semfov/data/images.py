@@ -211,17 +211,20 @@ def opening(source: Path | str, action: str) -> Iterator[None]:
 def _fault(error: Exception, source: Path | str, action: str) -> str:
     """Say what is wrong with a picture by the error of a decoder, and the remedy (`opening`)."""
     # By their names, as Pillow need not be imported yet.
-    if type(error).__name__ == "DecompressionBombError":
+    error_name = type(error).__name__
+    if error_name == "DecompressionBombError":
         most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
         return f"{most}, got more; convert it to a tiled TIFF"
-    reason = " ".join(str(error).split()) or type(error).__name__
+    reason = " ".join(str(error).split()) or error_name
     if not isinstance(source, Path):
         return f"truncated, damaged or closed, and cannot be {action} ({reason}); open it again or replace it"
-    is_unidentified = type(error).__name__ == "UnidentifiedImageError"
+    is_unidentified = error_name == "UnidentifiedImageError"
     kind, is_read = kind_of(source)
-    if (kind or is_unidentified) and not is_read:
+    is_named = kind != "" or is_unidentified
+    if is_named and not is_read:
         return _of_another_kind(kind)
-    reason = f"as {kind}" if is_unidentified else reason
+    if is_unidentified:
+        reason = f"as {kind}"
     return f"truncated, damaged or of an unsupported kind, and cannot be {action} ({reason}); replace it"
 
 

@@ -103,11 +103,13 @@ def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBand
 
 def _bytes_of(source: ImageLike, color: Color, white: White | None) -> NDArray[np.uint8]:
     """Convert a picture in memory to bytes, `(H, W, 3)` or `(H, W)`; an array of them is not copied."""
-    if white is not None or not _is_of_bytes(source):
+    is_copied = white is not None or not _is_of_bytes(source)
+    if is_copied:
         return to_bytes(as_image(source, argument="picture", color=color, white=white).detach())
     if isinstance(source, np.ndarray) and _has_channels_last(source):
         is_bgr = lookup(color, get_args(Color), "order of channels") == "bgr"
-        return source[..., ::-1] if is_bgr and source.ndim == 3 else source
+        has_colours = source.ndim == 3
+        return source[..., ::-1] if is_bgr and has_colours else source
     # Bytes are not converted to floats in between, which would take four times the memory.
     pixels = as_pixels(source, argument="picture", color=color)
     check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")

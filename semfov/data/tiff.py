@@ -183,15 +183,23 @@ class TiffPicture(LargePicture):
         # What is not stored is without data, or 0, as GDAL reads it.
         window = np.full((y2 - y1, x2 - x1, len(self._channels)), self._nodata or 0, self.page.dtype)
         if self._tiles.separate:
-            for place, channel in enumerate(self._channels):
-                for rows, columns, values in self._tiles.parts(box, channel):
-                    window[rows, columns, place] = values[..., 0]
-            return window
+            self._read_planes(box, window)
+        else:
+            self._read_samples(box, window)
+        return window
+
+    def _read_planes(self, box: Box, window: Values) -> None:
+        """Read the values of channels that are stored one after the other into a window."""
+        for place, channel in enumerate(self._channels):
+            for rows, columns, values in self._tiles.parts(box, channel):
+                window[rows, columns, place] = values[..., 0]
+
+    def _read_samples(self, box: Box, window: Values) -> None:
+        """Read the values of channels that are stored together at each pixel into a window."""
         for rows, columns, values in self._tiles.parts(box):
             # Choosing channels copies the tile, which is needless where they are all of them.
             are_all = self._channels == [*range(values.shape[-1])]
             window[rows, columns] = values if are_all else values[..., self._channels]
-        return window
 
     def _colour_values(self, box: Box) -> Values:
         """Read the values in a window without the alpha, `(h, w, 1 or 3)`."""
@@ -424,10 +432,13 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
     # A page of several samples has its channels in itself.
     if page.samplesperpixel > 1 or not 2 <= channels <= _MOST_LAYERS:
         return [page], pictures
-    layers = [pages[number] for number in _first_picture(axes, lengths)]
-    # Others are of another size, or not in the file.
-    layers_alike = [layer for layer in layers if layer is not None and layer.shape == page.shape]
-    return (layers_alike if len(layers_alike) == channels else [page]), pictures
+    layers: list[_Layer] = []
+    for number in _first_picture(axes, lengths):
+        layer = pages[number]
+        if layer is None or layer.shape != page.shape:
+            return [page], pictures  # a channel that is not in the file, or of another size
+        layers.append(layer)
+    return layers, pictures
 
 
 def _first_picture(axes: str, lengths: tuple[int, ...]) -> list[int]:

@@ -107,14 +107,16 @@ class WordVectors:
         Returns:
             Similarities `(M, N)`, NaN for names without a known word.
         """
+        return self._units(names) @ self._units(others).mT
+
+    def _units(self, names: Sequence[str]) -> Tensor:
+        """Scale the vectors of names to length 1, `(n, d)`, NaN for names without one."""
         size = len(next(iter(self.vectors.values())))
-        unknown = torch.full((size,), torch.nan, dtype=torch.float64)
-        units = []
-        for group in (names, others):
-            rows = [self.vector(name).double() if self.knows(name) else unknown for name in group]
-            stacked = torch.stack(rows) if rows else torch.empty(0, size, dtype=torch.float64)
-            units.append(stacked / stacked.norm(dim=-1, keepdim=True))
-        return units[0] @ units[1].mT
+        rows = torch.full((len(names), size), torch.nan, dtype=torch.float64)
+        for row, name in zip(rows, names, strict=True):
+            if self.knows(name):
+                row.copy_(self.vector(name))
+        return rows / rows.norm(dim=-1, keepdim=True)
 
 
 def _read_vectors(path: Path, wanted: frozenset[str]) -> dict[str, Tensor]:
