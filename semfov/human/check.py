@@ -201,7 +201,8 @@ class _Reading(NamedTuple):
         """Read the records of a file; of one picture of several, those that were made in it."""
         picture = self.arguments.get("picture")
         takes_picture = reader is not read_table and "picture" in signature(reader).parameters
-        if picture is None or (takes_picture and self.sizes is None):
+        is_said_by_name = takes_picture and self.sizes is None
+        if picture is None or is_said_by_name:
             return self._in_frames(reader, path, self.arguments)
         other_arguments = {name: value for name, value in self.arguments.items() if name != "picture"}
         try:
@@ -211,6 +212,7 @@ class _Reading(NamedTuple):
             return self._in_frames(reader, path, self.arguments)
         if self.sizes is None:
             raise InputError(f"picture: expected a picture or folder that exists, got {picture}")
+        # A file with other names is compared as it is, and the report says that their pictures are not there.
         return [record for record in records if record.picture in self.sizes] or records
 
     def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> list[Fixations]:

@@ -285,14 +285,13 @@ def _viewings(rows: Sequence[Row]) -> list[Row]:
 def _of_one_eye(rows: Sequence[Row], eye: str | None) -> list[Row]:
     """Take the rows of an eye, of the right one in viewings of both; rows that name no eye, or both, stay."""
     sides = [_side(row.fields.pop("eye")) for row in rows]
-    with_right = {row.fields["trial"] for row, side in zip(rows, sides, strict=True) if side == "right"}
-    chosen = []
-    for row, side in zip(rows, sides, strict=True):
-        # Samples of both eyes would count each fixation twice.
-        preferred = eye or ("right" if row.fields["trial"] in with_right else "left")
-        if side in ("", preferred):
-            chosen.append(row)
-    return chosen
+    trials = [row.fields["trial"] for row in rows]
+    eye_of_trial = dict.fromkeys(trials, eye or "left")
+    if eye is None:
+        seen_by_right = [trial for trial, side in zip(trials, sides, strict=True) if side == "right"]
+        eye_of_trial |= dict.fromkeys(seen_by_right, "right")
+    # Samples of both eyes would count each fixation twice.
+    return [row for row, side in zip(rows, sides, strict=True) if side in ("", eye_of_trial[row.fields["trial"]])]
 
 
 def _side(text: str) -> str:

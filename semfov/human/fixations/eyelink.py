@@ -155,16 +155,15 @@ def read_eyelink(
 
 def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _Place:
     """Find the screen, `(x, y, width, height)`, in the pixels of the points; `size` overrides that of the file."""
-    frame = next((match for line in lines if (match := _FRAME.match(line))), None)
-    if frame is None:
-        if size is None:
-            raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
-        return 0.0, 0.0, *size
-    left, top, right, bottom = map(float, frame.groups())
-    if size is None:
+    frame = next(filter(None, map(_FRAME.match, lines)), None)
+    if frame is not None:
+        left, top, right, bottom = map(float, frame.groups())
         # The message has the first and the last pixel.
-        size = round(right - left) + 1, round(bottom - top) + 1
-    return left, top, *size
+        stated_size = (round(right - left) + 1, round(bottom - top) + 1)
+        return left, top, *(size or stated_size)
+    if size is None:
+        raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
+    return 0.0, 0.0, *size
 
 
 def _record(view: _View, screen: _Place, person: str) -> Fixations:

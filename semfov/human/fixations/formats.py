@@ -405,15 +405,16 @@ def _in_pictures(scanpaths: list[Fixations], sizes: Mapping[str, tuple[int, int]
 
 def _frame(name: str, trial: Mapping[str, Any], screen: tuple[int, int] | None) -> tuple[int, int]:
     """Find the frame of a trial of COCO-Search18: its own, else the screen."""
-    width = trial.get("width")
-    height = trial.get("height")
-    if width is None and height is None:
+    sides = (trial.get("width"), trial.get("height"))
+    if sides == (None, None):
         return _SCREEN if screen is None else screen
+    width, height = sides
     if width is None or height is None:
-        raise DataError(f"{name}: expected both a width and a height, or neither, got {(width, height)}")
+        raise DataError(f"{name}: expected both a width and a height, or neither, got {sides}")
     frame = int(width), int(height)
-    check_data(frame == (width, height), name, "a width and a height in whole pixels", (width, height))
-    check_data(screen is None or (*screen,) == frame, name, f"{screen}, which is given", frame)
+    check_data(frame == sides, name, "a width and a height in whole pixels", sides)
+    if screen is not None:
+        check_data(tuple(screen) == frame, name, f"{screen}, which is given", frame)
     return frame
 
 

@@ -71,12 +71,8 @@ def read_by(reader: _Reader, source: str | PathLike[str] | DataFrame, options: M
         InputError: the reader has no such argument.
         DataError: the content is not of its form.
     """
-    # A file of OSIE has the size of its pictures; others have that of the screen, or of each trial.
-    if "size" in options and reader in (read_cocosearch, read_ruarte):
-        expected = f"none for {source}, a file of {DATA_SETS[reader]}, whose frame is that of each trial"
-        check(reader is read_cocosearch, "size", expected, options["size"])
-        options_without_size = {name: value for name, value in options.items() if name != "size"}
-        options = {"screen": options["size"], **options_without_size}
+    if "size" in options:
+        options = _with_frame(reader, source, options)
     name = source if isinstance(source, str | PathLike) else "it"
     check_options(options, [*signature(reader).parameters][1:], f"{reader.__name__}, which reads {name}")
     try:
@@ -85,6 +81,19 @@ def read_by(reader: _Reader, source: str | PathLike[str] | DataFrame, options: M
         if reader not in DATA_SETS:
             raise
         raise DataError(f"{error}; it was read as a file of {DATA_SETS[reader]}") from None
+
+
+def _with_frame(
+    reader: _Reader, source: str | PathLike[str] | DataFrame, options: Mapping[str, object]
+) -> Mapping[str, object]:
+    """Name the size of the frame as the reader does; raises `InputError` where a data set has one in each trial."""
+    # A file of OSIE has the size of its pictures.
+    if reader not in (read_cocosearch, read_ruarte):
+        return options
+    expected = f"none for {source}, a file of {DATA_SETS[reader]}, whose frame is that of each trial"
+    check(reader is read_cocosearch, "size", expected, options["size"])
+    options_without_size = {name: value for name, value in options.items() if name != "size"}
+    return {"screen": options["size"], **options_without_size}
 
 
 def reader_of(source: str | PathLike[str] | DataFrame, columns: Mapping[str, str] | None = None) -> _Reader:

@@ -126,7 +126,10 @@ def _views(fields: list[str], separator: str, place: str) -> list[_View]:
 def _picture_at(start: float, trial: str, views: list[_View]) -> str:
     """Name the picture of the last view that has begun, if it is of this trial."""
     begun = bisect_right(views, start, key=lambda view: view.start)
-    return views[begun - 1].picture if begun and views[begun - 1].trial == trial else ""
+    if not begun:
+        return ""
+    last = views[begun - 1]
+    return last.picture if last.trial == trial else ""
 
 
 def _time(text: str, place: str) -> float:

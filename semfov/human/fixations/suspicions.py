@@ -231,29 +231,32 @@ def _would_enlarge(record: Fixations, sizes: Mapping[str, tuple[int, int]]) -> b
 def _of_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
     """Say what is suspicious beside the sizes of the pictures."""
     pictures = {record.picture for record in records}
-    unknown = sorted(picture for picture in pictures if picture not in sizes)
+    unknown = sorted(pictures - sizes.keys())
     lines = []
     if unknown:
         lines.append(f"{len(unknown)} of {len(pictures)} pictures are not there, such as {unknown[0]}")
     if other_frame_of(records) is not None:
         return lines  # of which the frame tells nothing
+    smaller = _smaller_pictures(records, sizes)
     # What tells where the pictures were comes before what asks.
-    explained = _own_size(records, sizes) + _smaller_pictures(records, sizes)
-    return lines + (_smaller_pictures(records, sizes) if explained else _other_proportions(records, sizes))
+    if smaller or _own_size(records, sizes):
+        return lines + smaller
+    return lines + _other_proportions(records, sizes)
 
 
 def _other_proportions(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]]) -> list[str]:
     """Find pictures with other proportions than their frames."""
+    pictures = {record.picture for record in records}
     frames = sorted({(record.picture, record.size) for record in records if record.picture in sizes})
     stretched = [(picture, frame) for picture, frame in frames if not _alike(frame, sizes[picture])]
     if not stretched:
         return []
-    picture, frame = stretched[0]
-    width, height = sizes[picture]
-    count = len({picture for picture, _ in stretched})
+    first, frame = stretched[0]
+    width, height = sizes[first]
+    count = len(dict(stretched))  # a picture may have several frames
     return [
-        f"{count} of {len({record.picture for record in records})} pictures have other proportions than their frames, "
-        f"such as {picture}, {width} × {height} in {frame[0]} × {frame[1]}: was it letterboxed on a screen? "
+        f"{count} of {len(pictures)} pictures have other proportions than their frames, such as {first}, "
+        f"{width} × {height} in {frame[0]} × {frame[1]}: was it letterboxed on a screen? "
         "(Fixations.in_picture; with scale=1 at its own size, with place= elsewhere)"
     ]
 

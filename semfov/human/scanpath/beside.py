@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence, Sized
 from os import PathLike
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,9 +173,7 @@ def _fixations_in_file(path: str | PathLike[str], picture: str | None) -> list[F
 
 def _as_fixations(people: Fixations | Record | Sequence[Fixations | Record], picture: str | None) -> list[Fixations]:
     """Take fixations and records as fixations; a record without a source is of the same picture as the others."""
-    # What is no sequence is one entry; one that is neither fixations nor a record is refused below.
-    is_sequence = isinstance(people, Iterable) and not isinstance(people, Fixations | Record)
-    entries = [*cast(Iterable[Fixations | Record], people)] if is_sequence else [cast(Fixations | Record, people)]
+    entries = _entries(people)
     recorded = (entry.picture for entry in entries if isinstance(entry, Fixations))
     name = picture or next(recorded, "")
     viewed = []
@@ -185,6 +183,14 @@ def _as_fixations(people: Fixations | Record | Sequence[Fixations | Record], pic
         check(isinstance(fixations, Fixations), "people", "fixations, records of an agent, or a file", got)
         viewed.append(fixations)
     return viewed
+
+
+def _entries(people: Fixations | Record | Sequence[Fixations | Record]) -> list[Fixations | Record]:
+    """List the entries of a sequence; what is none is one entry, of which the caller sees whether it can be one."""
+    # Fixations and records have a length, too, and can be gone through.
+    if isinstance(people, Fixations | Record) or not isinstance(people, Iterable):
+        return [people]
+    return [*people]
 
 
 class _Measures:
