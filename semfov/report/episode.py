@@ -186,11 +186,10 @@ def _about_data(scanpath: Scanpath, settings: Settings | None) -> Data:
     """Tell detector, sensor and decision in words; None for parts that were not kept."""
     if settings is None and scanpath.stimulus is not None:
         settings = scanpath.stimulus.settings
-    return {
-        "detector": scanpath.detector if settings is None else settings["detector"]["name"],
-        "sensor": None if settings is None else _sensor_in_words(settings["sensor"]),
-        "decision": _decision_in_words(scanpath),
-    }
+    about: Data = {"detector": scanpath.detector, "sensor": None}
+    if settings is not None:
+        about = {"detector": settings["detector"]["name"], "sensor": _sensor_in_words(settings["sensor"])}
+    return {**about, "decision": _decision_in_words(scanpath)}
 
 
 def _decision_in_words(scanpath: Scanpath) -> str:
@@ -231,11 +230,9 @@ def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
     detections = []
     for box, scores in zip(found.boxes, found.class_scores, strict=True):
         best = scores.topk(min(_SCORES, len(scores)))  # of (K,), without background
-        classes = []
-        for score, index in zip(best.values.tolist(), best.indices.tolist(), strict=True):
-            classes.append([scanpath.classes[index + 1], rounded(score, 9)])
-        best_class = classes[0][0]
-        detections.append({"box": [round(x, 1) for x in box.tolist()], "label": best_class, "scores": classes})
+        names = [scanpath.classes[index + 1] for index in best.indices.tolist()]
+        classes = [[name, rounded(score, 9)] for name, score in zip(names, best.values.tolist(), strict=True)]
+        detections.append({"box": [round(x, 1) for x in box.tolist()], "label": names[0], "scores": classes})
     width, height = scanpath.grid.extent.tolist()
     texts = [f"{number} {detection['label']}" for number, detection in enumerate(detections, 1)]
     # No label covers the mark of the gaze.

@@ -110,11 +110,13 @@ def _overview(parts: Sequence[Data]) -> str:
     # Where nothing is to be cautious of, the column would be empty.
     has_caution = any(part["caution"] for part in parts)
     columns = [OverviewColumn(name, "number") for name in areas]
-    columns += [OverviewColumn("caution", "aside")] if has_caution else []
+    if has_caution:
+        columns.append(OverviewColumn("caution", "aside"))
     rows = []
     for number, part in enumerate(parts):
         cells = [part["shares"].get(name, "") for name in areas]
-        cells += [part["caution"] or ""] if has_caution else []
+        if has_caution:
+            cells.append(part["caution"] or "")
         picture = part["picture"]
         drawing = small_picture(picture["image"], _first_fixations(picture))
         rows.append(OverviewRow(picture["name"], f"facts-{number}", drawing, cells))
@@ -180,14 +182,8 @@ def _lead(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
 
 def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
     """Tell what is known of a picture without the script: first fixations, areas, places, and details in bits."""
-    first = [
-        (str(number), f"{place['x']:.0f}, {place['y']:.0f}", percent(place["share"]))
-        for number, place in enumerate(prediction.first_fixations(), 1)
-    ]
-    places = [
-        (str(number), f"{place['x']:.0f}, {place['y']:.0f}", percent(place["share"]))
-        for number, place in enumerate(prediction.peaks(), 1)
-    ]
+    first = _place_rows(prediction.first_fixations())
+    places = _place_rows(prediction.peaks())
     tables = [
         _table("Where people look first", ("Fixation", "x, y in pixels", "Viewers"), first),
         _table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations"), places),
@@ -196,6 +192,14 @@ def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
         areas = [(name, percent(share)) for name, share in shares.items()]
         tables.insert(0, _table("Share of all fixations in each area", ("Area", "Fixations"), areas))
     return f'<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
+
+
+def _place_rows(places: Sequence[Mapping[str, float]]) -> list[tuple[str, str, str]]:
+    """Write places as rows of a table, numbered in their order."""
+    rows = []
+    for number, place in enumerate(places, 1):
+        rows.append((str(number), f"{place['x']:.0f}, {place['y']:.0f}", percent(place["share"])))
+    return rows
 
 
 def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

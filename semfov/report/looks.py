@@ -134,13 +134,18 @@ def _object_shapes(data: Data, unit: float, obstacles: Sequence[LabelBox]) -> li
     """
     width, height = data["size"]
     objects = data["objects"]
-    names = [_object_name(found) for found in objects]
-    # Room for letters of 11 pixels of the screen.
-    sizes = [(unit * (6.3 * len(name) + 4), unit * 13) for name in names]
-    candidates = [_corner_places(found["box"], size) for found, size in zip(objects, sizes, strict=True)]
+    sizes: list[tuple[float, float]] = []
+    candidates: list[list[tuple[float, float]]] = []
+    for found in objects:
+        # Room for letters of 11 pixels of the screen.
+        size = (unit * (6.3 * len(_object_name(found)) + 4), unit * 13)
+        sizes.append(size)
+        candidates.append(_corner_places(found["box"], size))
     labels = place_within(candidates, sizes, (width, height), obstacles)
-    pairs = zip(objects, labels, strict=True)
-    return [_object_shape(found, label, order, unit) for order, (found, label) in enumerate(pairs, 1)]
+    shapes = []
+    for order, (found, label) in enumerate(zip(objects, labels, strict=True), 1):
+        shapes.append(_object_shape(found, label, order, unit))
+    return shapes
 
 
 def _object_name(found: Data) -> str:

@@ -55,9 +55,9 @@ def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
     Returns:
         HTML.
     """
-    first, *body_rows = rows
-    kinds = ["", *[' class="number"'] * (len(first) - 1)]
-    head = "".join(f'<th scope="col"{kind}>{escape(cell)}</th>' for kind, cell in zip(kinds, first, strict=True))
+    (first_heading, *headings), *body_rows = rows
+    head = f'<th scope="col">{escape(first_heading)}</th>'
+    head += "".join(f'<th scope="col" class="number">{escape(heading)}</th>' for heading in headings)
     body = "".join(f"<tr>{_row(name, numbers)}</tr>" for name, *numbers in body_rows)
     label = escape(caption)
     return (

@@ -60,19 +60,19 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     ('<!DOCTYPE html>', True)
     """
     parts = [part_of(episode, number) for number, episode in enumerate(episodes)]
-    is_drawn_by_script = [isinstance(part, EpisodePart) for part in parts]
     # A single episode begins with its outcome, and one of several has it where it is chosen.
     is_single = len(episodes) == 1 and not sections
+    contents = _of_single(episodes[0]) if is_single else _of_several(episodes)
     if len(episodes) > 1 and not sections:
         sections = overview_html(episodes, [part.article for part in parts])
-    contents = {
+    has_fixations = not parts or any(isinstance(part, EpisodePart) for part in parts)
+    contents |= {
         "title": escape(title),
         "sections": sections,
         "looks": "".join(part.looks_html(is_named=not is_single) for part in parts),
         "objects": "".join(part.section_html for part in parts),
         "least": f"{CONFIDENT:g}",
-        "fixations": hidden_unless(any(is_drawn_by_script) or not parts),
-        **(_of_single(episodes[0]) if is_single else _of_several(episodes)),
+        "fixations": hidden_unless(has_fixations),
     }
     return filled("page", _script_data(parts), contents)
 
