@@ -136,9 +136,11 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
         last = len(record)
     marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.index_of_look <= last]
     rows = [row for row in record.object_rows() if row["look"] - 1 <= last]
+    many = len(rows) > _NAMED
     for row in reversed(rows):
-        marks += _marks_of_object(row, record, many=len(rows) > _NAMED)
-    if record.best_place is not None and last >= len(record) - 1:
+        marks += _marks_of_object(row, record, many=many)
+    is_over = last >= len(record) - 1
+    if record.best_place is not None and is_over:
         best, chance = record.best_place
         has_label = bool((record.objects.boxes == best).all(-1).any())
         text = None if has_label else f"best place {chance:.2f}"

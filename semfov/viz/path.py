@@ -169,14 +169,18 @@ class GazePath:
         scale = per_point(axes)
         # The width of a digit is about 0.64 of the font size, and the frame adds 4 points.
         height = (_POINTS + 4) * scale
-        digits = [len(str(number)) for number in range(1, len(self.path) + 1)]
-        sizes = [((0.64 * count * _POINTS + 4.5) * scale, height) for count in digits]
-        points = [(float(x), float(y)) for x, y in self.path]
+        points: list[tuple[float, float]] = []
+        sizes: list[tuple[float, float]] = []
+        for number, (x, y) in enumerate(self.path.tolist(), 1):
+            digits = len(str(number))
+            points.append((x, y))
+            sizes.append(((0.64 * digits * _POINTS + 4.5) * scale, height))
         places = place_numbers(points, sizes, self.frame, 60 * scale)
         self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
-        return [
-            None if place is None else self._number(axes, index, place, scale) for index, place in enumerate(places)
-        ]
+        numbers: list[Annotation | None] = []
+        for index, place in enumerate(places):
+            numbers.append(None if place is None else self._number(axes, index, place, scale))
+        return numbers
 
     def _number(self, axes: Axes, index: int, place: LabelBox, scale: float) -> Annotation:
         """Write the number of a fixation into a rectangle; a line joins it to its dot if it is not written on it."""
@@ -211,15 +215,19 @@ class GazePath:
             lines.set_segments(list(self.segments[: last * self.pieces]))
         self.dots.set_offsets(self.path[: last + 1])
         self.dots.set_facecolor([tuple(colour) for colour in self.colours[: last + 1]])
-        found_here = self.found and last == len(self.path) - 1
         for number, text in enumerate(self.numbers):
-            if text is None:
-                continue
-            is_last = number == last
-            text.set_visible(number <= last)
-            frame = text.get_bbox_patch()
-            assert frame is not None  # all numbers are written with one
-            frame.set(edgecolor=FOUND if is_last and found_here else "white", linewidth=1.6 if is_last else 0.7)
+            if text is not None:
+                text.set_visible(number <= last)
+                self._frame_number(text, is_last=number == last)
+
+    def _frame_number(self, text: Annotation, *, is_last: bool) -> None:
+        """Draw the frame of a number: of the last one shown a thicker one, in green where the target was found."""
+        frame = text.get_bbox_patch()
+        assert frame is not None  # all numbers are written with one
+        colour = "white"
+        if is_last and self.found and text is self.numbers[-1]:
+            colour = FOUND
+        frame.set(edgecolor=colour, linewidth=1.6 if is_last else 0.7)
 
 
 def _saccades(path: NDArray[np.float64], around: float | None) -> list[NDArray[np.float64]]:
