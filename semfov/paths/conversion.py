@@ -176,8 +176,7 @@ class Conversion(Outcome, OtherWords):
     def _decided_place(self, decision: Decision) -> dict[str, float | None]:
         """Make JSON values of the place of a found target, or of the best place: a point and a box."""
         if self.best_place is not None:
-            x1, y1, x2, y2 = self.best_place[0].tolist()
-            return _rounded_place((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2)
+            return _middle_and_box(*self.best_place[0].tolist())
         x, y = self.found_at or (None, None)
         edges = [None] * 4
         if decision.outcome == "found" and decision.box is not None:
@@ -197,14 +196,13 @@ class Conversion(Outcome, OtherWords):
         columns = (objects.labels, objects.scores, self.confirmed, objects.passes, objects.boxes)
         rows: list[Values] = []
         for label, score, confirmed, index, box in zip(*(column.tolist() for column in columns), strict=True):
-            x1, y1, x2, y2 = box
             rows.append(
                 {
                     "object": len(rows),
                     "class": self.classes[label],
                     "score": digits(score),
                     "confirmed": confirmed,
-                    **_rounded_place((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2),
+                    **_middle_and_box(*box),
                     "look": index + 1,
                 }
             )
@@ -462,6 +460,11 @@ def _geometry(row: Values, place: PlaceOnEarth | None) -> Geometry:
     if place is not None:
         return box_on_earth(np.array(corners), place)
     return {"type": "Polygon", "coordinates": [[*corners, corners[0]]]}
+
+
+def _middle_and_box(x1: float, y1: float, x2: float, y2: float) -> dict[str, float | None]:
+    """Round a box for a table, with its middle as the point."""
+    return _rounded_place((x1 + x2) / 2, (y1 + y2) / 2, x1, y1, x2, y2)
 
 
 def _rounded_place(*edges: float | None) -> dict[str, float | None]:

@@ -354,11 +354,12 @@ class Scanpath(_CellRecord):
         if closer:
             tensors["closer_regions"] = torch.tensor([look.region for look in closer], dtype=torch.float64)
             tensors["closer_values"] = torch.tensor([look.value for look in closer], dtype=torch.float64)
-        if self.stimulus is None:
-            return tensors, {**record, "placement": None, "settings": None}
-        tensors["canvas"] = self.stimulus.canvas
-        placement = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
-        return tensors, {**record, "placement": placement, "settings": dict(self.stimulus.settings)}
+        record |= {"placement": None, "settings": None}
+        if self.stimulus is not None:
+            tensors["canvas"] = self.stimulus.canvas
+            record["placement"] = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
+            record["settings"] = dict(self.stimulus.settings)
+        return tensors, record
 
     @classmethod
     def _fields(cls, tensors: dict[str, Tensor], record: Values, shared: SharedFields) -> Values:

@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from semfov.data.fixations import Fixations
-from semfov.errors import InputError, check
+from semfov.errors import InputError
 from semfov.paths.base import Record
 
 ScanpathLike = Fixations | Record | Tensor | np.ndarray | Sequence[Sequence[float]]
@@ -46,7 +46,8 @@ def _as_fixations(given: object, argument: str, size: tuple[int, int], source: s
     if not isinstance(given, list | tuple | np.ndarray | Tensor):
         raise InputError(f"{argument}: expected {expected}, got {got}")
     if _holds_viewers(given):
-        check(False, argument, expected, f"a {got} of {len(given)}; take one: {argument}=scanpaths[0]")
+        remedy = f"take one: {argument}=scanpaths[0]"
+        raise InputError(f"{argument}: expected {expected}, got a {got} of {len(given)}; {remedy}")
     try:
         return Fixations(source or "", "viewer", given, size)  # type: ignore[arg-type]  # which makes an array
     except InputError as error:
