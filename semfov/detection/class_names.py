@@ -102,11 +102,11 @@ def named_outputs(classes: Sequence[str]) -> tuple[tuple[str, ...], tuple[int, .
     remedy = "YAML reads no, off, yes and on so: put names in quotes, or give classes="
     check(not wrong, "classes", "names", f"{wrong[:3]}; {remedy}")
     names = [str(name).strip() for name in classes]
-    places = tuple(index for index, name in enumerate(names) if name.lower() not in _PLACEHOLDERS)
-    named = tuple(names[index] for index in places)
+    by_place = {place: name for place, name in enumerate(names) if name.lower() not in _PLACEHOLDERS}
+    named = tuple(by_place.values())
     are_distinct = len(set(named)) == len(named)
     check(are_distinct and bool(named), "classes", "at least one name, all different", named)
-    return named, places
+    return named, tuple(by_place)
 
 
 def _may_be_name(name: object) -> bool:

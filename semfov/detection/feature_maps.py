@@ -120,11 +120,17 @@ def _head_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict
     end = _backbone_end(steps, strides, order)
     # The first tensor that a convolution reads is its map; the others are weights.
     readers = Counter(step.reads[0] for step in steps if step.convolution and step.reads)
-    later = [name for name in strides if order[name] >= end]
-    with_reader = {strides[name]: name for name in later if readers[name] > 0}
+    read: dict[int, str] = {}
+    shared: dict[int, str] = {}
+    for name, stride in strides.items():
+        if order[name] < end:
+            continue
+        if readers[name] > 0:
+            read[stride] = name
+        if readers[name] > 1:
+            shared[stride] = name
     # Boxes and scores come from a map that two convolutions read, so that such a map replaces any other.
-    with_readers = {strides[name]: name for name in later if readers[name] > 1}
-    return {**with_reader, **with_readers}
+    return {**read, **shared}
 
 
 def _backbone_end(steps: Sequence[NetworkStep], strides: Mapping[str, int], order: Mapping[str, int]) -> int:

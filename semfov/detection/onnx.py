@@ -190,18 +190,20 @@ class OnnxDetector(Detector):
         count = candidates.boxes.shape[1]
         check_data(count <= _MOST_BOXES, self.name, f"at most {_MOST_BOXES:,} boxes", f"{count:,}")
         # A wrong head shows in the first pass, so later ones spend no time on it.
-        first = not self._first_checked and values_known(candidates.boxes, candidates.classes)
-        if first:
+        is_first = not self._first_checked and values_known(candidates.boxes, candidates.classes)
+        if is_first:
             self._check_first(outputs, candidates, size)
         if self.logits:
             candidates = _with_scores(candidates, Tensor.sigmoid)
-        if values_known(candidates.boxes):
+        is_known = values_known(candidates.boxes)
+        if is_known:
+            are_finite = all(map(math.isfinite, _range(candidates.boxes)))
             remedy = f"others with head {self.head!r}; check that head= names the model's head"
-            check_data(all(map(math.isfinite, _range(candidates.boxes))), self.name, "finite boxes", remedy)
+            check_data(are_finite, self.name, "finite boxes", remedy)
             candidates = self._rounded_scores(candidates)
-        self._first_checked |= first
+        self._first_checked |= is_first
         candidates = keep_classes(candidates, self._places, self._scores)
-        return candidates.as_checked() if values_known(candidates.boxes) else candidates
+        return candidates.as_checked() if is_known else candidates
 
     def _rounded_scores(self, candidates: Candidates) -> Candidates:
         """Clamp scores that rounding has put a little outside [0, 1], with one warning."""
