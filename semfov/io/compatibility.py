@@ -156,12 +156,13 @@ def check_sensor(fitted: Settings, sensor: Settings, what: str, *, strict: bool 
     if not sensor or not fitted:
         return
     differences = "; ".join(_differences(fitted, sensor, set()))
-    if differences and strict:
+    if not differences:
+        return
+    if strict:
         remedy = "make the sensor with these settings, or fit a model for this one (semfov fit)"
         expected = f"the sensor that the {what} was fitted for"
         raise InputError(f"eye: expected {expected}, got another: {differences}; {remedy}")
-    if differences:
-        warnings.warn(f"the {what} was fitted for another sensor: {differences}", stacklevel=3)
+    warnings.warn(f"the {what} was fitted for another sensor: {differences}", stacklevel=3)
 
 
 def check_grid(fitted: Settings, grid: tuple[int, int], what: str) -> None:

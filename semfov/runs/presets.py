@@ -65,11 +65,12 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
 
 def _search_presets(plain: _Presets, salient: _Presets) -> _Presets:
     """Make the presets of searches, of policies and of saliency maps by name."""
-    # The scores do not matter to these, which no belief guides.
     without_scores = {Uniform.name: PolicyConfig(Uniform.name)}
-    without_scores |= {name: policy for name, policy in plain.items() if not FUNCTIONS[name].by_belief}
-    without_scores |= salient
-    scored = {name: policy for name, policy in plain.items() if name not in without_scores}
+    scored: _Presets = {}
+    for name, policy in plain.items():
+        # The scores do not matter to a policy that no belief guides.
+        presets = scored if FUNCTIONS[name].by_belief else without_scores
+        presets[name] = policy
     # Of the learned belief these use the probabilities alone, for which it is fitted.
     by_chance = [name for name in scored if name == TargetPosterior.name or FUNCTIONS[name].by_place]
     learned = {f"{name}-learned": PolicyConfig(name, "learned") for name in by_chance}
@@ -77,7 +78,7 @@ def _search_presets(plain: _Presets, salient: _Presets) -> _Presets:
     named = {"recommended": with_scores[AGENT], "published": with_scores["predictive-calibrated"]}
     for scores in get_args(Scores):
         named[f"{_MAXIMUM_A_POSTERIORI}-{scores}"] = with_scores[f"non-predictive-{scores}"]
-    return {**without_scores, **with_scores, **named}
+    return {**without_scores, **salient, **with_scores, **named}
 
 
 def _exploration_presets(plain: _Presets, salient: _Presets) -> _Presets:

@@ -137,11 +137,10 @@ class SceneResults:
             times = json.loads(seconds)
         except (ValueError, RecursionError):
             return None
-        if not isinstance(outcomes, list) or not all(isinstance(outcome, dict) for outcome in outcomes):
-            return None
-        if not isinstance(times, dict) or not all(map(is_number, times.values())):
-            return None
-        return {"records": outcomes, "seconds": times}
+        # The sum tells that the texts are those of this row, and not that they are of this form.
+        are_outcomes = isinstance(outcomes, list) and all(isinstance(outcome, dict) for outcome in outcomes)
+        are_times = isinstance(times, dict) and all(map(is_number, times.values()))
+        return {"records": outcomes, "seconds": times} if are_outcomes and are_times else None
 
     def _sha256(self, index: int, seconds: str, records: str) -> str:
         # With what the outcomes depend on: a row of another scene or run is none of this one.

@@ -28,10 +28,10 @@ def check_sources(data: DataConfig, detector: DetectorConfig | None = None) -> N
     """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
     paths = {"data.root": data.root, "data.annotations": data.annotations}
     absent = [name for name, path in paths.items() if path is None]
-    present = [name for name in paths if name not in absent]
-    expected = "both data.root and data.annotations, or neither for the embedded scenes"
-    if absent and present:
-        raise InputError(f"data: expected {expected}, got {present[0]} alone; add {absent[0]}")
+    if len(absent) == 1:
+        (present,) = paths.keys() - absent
+        expected = "both data.root and data.annotations, or neither for the embedded scenes"
+        raise InputError(f"data: expected {expected}, got {present} alone; add {absent[0]}")
     if data.root is not None and not data.root.is_dir():
         raise DataError(f"data.root: no such folder: {data.root}; check the path")
     if data.annotations is not None and not data.annotations.exists():
