@@ -362,11 +362,12 @@ class ZoomScenery(_Surroundings[WindowEye]):
         """
         for _ in range(_DRAWS):
             picture = int(random.integers(len(self.pictures))) if scene is None else scene
-            if task == "exploration" and self._may_have_objects(picture):
-                return picture, 0
-            if task == "search" and self.episodes(picture):
+            if task == "search":
                 targets = self.episodes(picture)
-                return picture, targets[random.integers(len(targets))]
+                if targets:
+                    return picture, targets[random.integers(len(targets))]
+            elif self._may_have_objects(picture):
+                return picture, 0
         raise DataError(
             "scenes: expected pictures with objects to look for, found none; give other pictures or targets"
         )

@@ -115,21 +115,24 @@ class Policy(nn.Module):
         Raises:
             InputError: the function needs a target or a setting, and has none, or has one of another type.
         """
+        arguments = self._arguments({"target": target, "model": self.model, "grid": grid})
+        try:
+            return self.function(**arguments)
+        except TypeError as error:
+            expected = f"values that fit {', '.join(arguments)}"
+            raise InputError(f"policy {self.name!r}: expected {expected}, got others ({error})") from error
+
+    def _arguments(self, scene: Mapping[str, object]) -> dict[str, object]:
+        """Choose what the function takes of a scene, and add the settings; raises `InputError` for what it lacks."""
         parameters = self.function.takes
-        scene = {"target": target, "model": self.model, "grid": grid}
-        wanted = [name for name in scene if name in parameters]
-        arguments: dict[str, object] = {name: scene[name] for name in wanted if scene[name] is not None}
+        arguments = {name: value for name, value in scene.items() if name in parameters and value is not None}
         arguments |= {name: getattr(self, name) for name in self._settings}
         for name, parameter in parameters.items():
             is_needed = parameter.default is parameter.empty
             if is_needed and arguments.get(name) is None:
                 expected = "a target to search for" if name == "target" else f"{name} of a scene"
                 raise InputError(f"policy {self.name!r}: expected {expected}, got none")
-        try:
-            return self.function(**arguments)
-        except TypeError as error:
-            expected = f"values that fit {', '.join(arguments)}"
-            raise InputError(f"policy {self.name!r}: expected {expected}, got others ({error})") from error
+        return arguments
 
 
 def policy_names(task: Task) -> list[str]:
