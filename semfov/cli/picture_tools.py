@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Concatenate, NamedTuple, ParamSpec, TypedDict, TypeVar
+from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -92,13 +92,6 @@ class Gaze:
     size: list[int]
 
 
-class _Limits(TypedDict):
-    """Limits of a search."""
-
-    passes: int
-    seconds: float
-
-
 class View(NamedTuple):
     """A crop: its JPEG, its box in the picture, and what the detector shows in it."""
 
@@ -164,8 +157,8 @@ class PictureTools:
         """
         path = self._path(picture)
         _check_passes(passes)
-        limits: _Limits = {"passes": passes, "seconds": _SECONDS}
-        return _answer(self.agent.search(path, target, prior=prior, **limits))
+        record = self.agent.search(path, target, prior=prior, passes=passes, seconds=_SECONDS)
+        return _answer(record)
 
     @_one_at_a_time
     def find(self, picture: str, classes: list[str], passes: int = 24) -> Answer:
@@ -323,15 +316,17 @@ def _crop_box(size: tuple[int, int], x: float, y: float, width: float) -> tuple[
     """Place a square crop in a picture; it is moved, and at most cut to the picture, where it would reach beyond it."""
     longest = min(max(size), _WIDEST)
     check(_SMALLEST <= width <= longest, "width", f"{_SMALLEST} to {longest} pixels", width)
-    for name, place, side in (("x", x, size[0]), ("y", y, size[1])):
-        check(0 <= place <= side, name, f"0 to {side}, a pixel of the picture", place)
-    lengths = [min(round(width), side) for side in size]
-    starts = [
-        min(max(round(place - length / 2), 0), side - length)
-        for place, length, side in zip((x, y), lengths, size, strict=True)
-    ]
-    left, top = starts
-    return left, top, left + lengths[0], top + lengths[1]
+    left, right = _span("x", x, size[0], width)
+    top, bottom = _span("y", y, size[1], width)
+    return left, top, right, bottom
+
+
+def _span(name: str, middle: float, side: int, width: float) -> tuple[int, int]:
+    """Place a crop along one axis of a picture, whose side is `side` pixels."""
+    check(0 <= middle <= side, name, f"0 to {side}, a pixel of the picture", middle)
+    length = min(round(width), side)
+    start = min(max(round(middle - length / 2), 0), side - length)
+    return start, start + length
 
 
 def _shown(pixels: Tensor) -> bytes:

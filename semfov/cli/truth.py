@@ -77,13 +77,19 @@ class Truth:
         got = f"{len(images)} of {len(names)}, which are named as {names[0]!r:.100}" if names else "no images"
         check_data(len(images) == 1, f"annotations {self.path}", expected, got)
         (image,) = images
-        stated = self.annotations.size(image)
-        if size is not None and stated is not None and stated != size:
-            raise DataError(
-                f"annotations {self.path}: expected {name} to have {stated[0]} × {stated[1]} px, got {size[0]} × "
-                f"{size[1]}; its boxes are in another frame"
-            )
+        if size is not None:
+            self._check_size(image, name, size)
         return image
+
+    def _check_size(self, image: Id, name: str, size: tuple[int, int]) -> None:
+        """Raise `DataError` for a picture of another size than the one that the file says, if it says one."""
+        stated = self.annotations.size(image)
+        if stated is not None and stated != size:
+            width, height = stated
+            raise DataError(
+                f"annotations {self.path}: expected {name} to have {width} × {height} px, got {size[0]} × {size[1]}; "
+                "its boxes are in another frame"
+            )
 
     def _named(self, name: str, agree: Callable[[str, str], bool]) -> list[Id]:
         """List the images of a picture's name, those whose folders agree best.
