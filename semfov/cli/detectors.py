@@ -65,7 +65,11 @@ def _in_columns(names: Sequence[str]) -> list[str]:
     width = max(map(len, names)) + 2  # with two blanks between columns
     columns = max(1, _WIDTH // width)
     rows = -(-len(names) // columns)  # rounded up
-    return ["".join(name.ljust(width) for name in names[row::rows]).rstrip() for row in range(rows)]
+    lines = []
+    for row in range(rows):
+        padded = [name.ljust(width) for name in names[row::rows]]
+        lines.append("".join(padded).rstrip())
+    return lines
 
 
 def show(options: DetectorsOptions) -> int:

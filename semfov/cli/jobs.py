@@ -121,7 +121,9 @@ class PictureJob(ABC, Generic[_Options_co]):
         """List what outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
         agent = self.agent
         models = self.options.models
-        manifest = None if models is None else models if is_model_file(models) else models / MANIFEST
+        manifest = models
+        if models is not None and not is_model_file(models):
+            manifest = models / MANIFEST
         return {
             "options": self.options.result_settings(),
             "eye": agent.eye.settings(),

@@ -303,13 +303,13 @@ def _outcomes(
     options = job.options
     numbers = [number for number in range(len(job.sources)) if number not in before]
     where: Where = options.workers if options.scheduler is None else options.scheduler
-    has_processes = where is None or isinstance(where, int)
-    if numbers and has_processes and where != 1:
+    may_start_processes = options.scheduler is None and options.workers != 1
+    if numbers and may_start_processes:
         # A process takes as long to start as this one has taken so far. The first picture tells whether that pays.
         start = time.process_time()
         first = numbers.pop(0)
         yield first, job.outcome(first)
-        where = _worth_starting(where, len(numbers), time.process_time() - start, start)
+        where = _worth_starting(options.workers, len(numbers), time.process_time() - start, start)
     yield from run_tasks(
         PictureJob.outcome,
         numbers,

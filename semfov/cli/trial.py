@@ -114,7 +114,8 @@ def _rows(bare: Trial, objects: Objects, classes: tuple[str, ...]) -> list[list[
     for number, (box, score, label) in enumerate(zip(bare.boxes, bare.scores, bare.labels, strict=True)):
         best = int(overlap[number].argmax()) if len(objects) else 0
         listed_score = "-"
-        if best in unmatched and float(overlap[number, best]) >= _SAME:
+        is_same = best in unmatched and float(overlap[number, best]) >= _SAME
+        if is_same:
             unmatched.remove(best)
             listed_score = f"{objects.scores[best]:.2f}"
         rows.append([classes[label], f"{score:.2f}", listed_score, box_text(box.tolist())])
@@ -168,7 +169,9 @@ def _about_colours(bare: Trial, agent: ActivePerception, photo: Path) -> list[st
         swapped = Trial.of(agent, photo)
     finally:
         detector.preprocessing = usual
-    if float(swapped.scores.sum()) < _MORE * float(bare.scores.sum()) or not len(swapped.scores):
+    shows_more = float(swapped.scores.sum()) >= _MORE * float(bare.scores.sum())
+    # Where the detector shows nothing either way, no sum is less than the other.
+    if not len(swapped.scores) or not shows_more:
         return []
     return [
         f"with --colour {other} it shows {len(swapped.scores)} from {SCORE_THRESHOLD:g} on; other photographs will tell"
