@@ -512,9 +512,11 @@ def _alpha_of(extra: Mapping[int, int], names: Mapping[str, int]) -> int | None:
         Its number; None without one, and where GDAL gives it another name.
     """
     alphas = [band for band, kind in extra.items() if kind in (PREMULTIPLIED, UNASSOCIATED)]
-    if not alphas or (alphas[0] in names.values() and "alpha" not in names):
+    if not alphas:
         return None
-    return alphas[0]
+    band = alphas[0]
+    has_other_name = band in names.values() and "alpha" not in names
+    return None if has_other_name else band
 
 
 def _named_bands(page: _Page) -> dict[str, int]:

@@ -384,9 +384,10 @@ class OnnxTwin:
         """Return the session of this process that returns the maps of layers; opened if there is none."""
         # A session that was opened before a process was forked has none of its threads.
         holder = os.getpid(), torch.get_num_threads()
-        if layers not in self._opened or self._opened[layers].holder != holder:
-            self._opened[layers] = _OpenSession(holder, self._new_session(network, layers))
-        return self._opened[layers].session
+        opened = self._opened.get(layers)
+        if opened is None or opened.holder != holder:
+            opened = self._opened[layers] = _OpenSession(holder, self._new_session(network, layers))
+        return opened.session
 
     def _new_session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
         try:

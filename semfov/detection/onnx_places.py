@@ -45,7 +45,8 @@ def _misreading(rows: Tensor, canvas: Canvas) -> str | None:
         return "boxes whose right or lower edge comes first"
     # Corners `(x1, y1, x2, y2)` read as centre and size give the corners `x1 ± x2 / 2`, of which the upper one is at
     # least three times the lower one, as x2 is at least x1.
-    if _spread_out(middle, size) and bool((upper >= 3 * lower).all()):
+    are_three_times = bool((upper >= 3 * lower).all())
+    if are_three_times and _spread_out(middle, size):
         return "corners of boxes that were read as their centres and sizes"
     is_outside = ((middle - size / 2).abs() > size).any(-1)
     if _share(is_outside) >= _MISPLACED_SHARE:

@@ -74,8 +74,10 @@ def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path
     while todo:
         name = todo.pop()
         parent = name.rpartition(".")[0]
-        if name in visited or (parent in single_files and name not in sys.modules):
-            continue  # what is imported from a single file is a class or function, and no module
+        # What is imported from a single file is a class or function, and no module.
+        is_no_module = parent in single_files and name not in sys.modules
+        if name in visited or is_no_module:
+            continue
         visited.add(name)
         file = source_file(name)
         if file is None or file in files:

@@ -58,8 +58,10 @@ class Drafts:
         name = self.first.name
         if name != self.second.name:
             return name, self.second.name
-        if self.first.source is not None and self.second.source not in (None, self.first.source):
-            return self.first.source, self.second.source
+        source = self.first.source
+        other = self.second.source
+        if source is not None and other is not None and source != other:
+            return source, other
         return f"{name} (first)", f"{name} (second)"
 
     @property

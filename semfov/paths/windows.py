@@ -455,7 +455,9 @@ class WindowMomentWords(WindowWords, MomentWords):
         listed = super()._listed
         for label in record.sought:
             number = len(record.objects.of([label]))
-            if self._expected(label) and number > round(record.expected[record.classes[label]]):
+            if not self._expected(label):
+                continue
+            if number > round(record.expected[record.classes[label]]):
                 return f"{listed}, some of them doubtful"
         return listed
 

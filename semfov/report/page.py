@@ -79,8 +79,10 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
 
 def _script_data(parts: Sequence[Part]) -> Data:
     """Collect what the script of a page reads; each picture is in it once, also where several episodes show it."""
-    uris = dict.fromkeys(uri for part in parts for uri in part.pictures)  # in their order, each once
-    numbers = {uri: number for number, uri in enumerate(uris)}
+    numbers: dict[str, int] = {}
+    for part in parts:
+        for uri in part.pictures:
+            numbers.setdefault(uri, len(numbers))
     return {
         "episodes": [part.script_data(numbers) for part in parts],
         "pictures": list(numbers),

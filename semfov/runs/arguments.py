@@ -81,7 +81,9 @@ def _leave_out(word: str, words: deque[str]) -> None:
     """Leave out an option of earlier versions and its value, with a note."""
     name, has_value, _ = word.partition("=")
     print(f"note: {note_of_dropped(name)}", file=sys.stderr)
-    if not has_value and words and not words[0].startswith("--"):
+    # The value is in the word, `--name=value`, or else the next word, unless that is an option itself.
+    value_follows = not has_value and words and not words[0].startswith("--")
+    if value_follows:
         words.popleft()
 
 

@@ -103,7 +103,9 @@ def _warn_of_shares(points: Tensor, size: Sequence[int]) -> None:
     """Warn of fixations on a processor that look like shares of a picture `(height, width)`, not like its pixels."""
     if not points.is_floating_point() or points.device.type != "cpu" or not values_known(points):
         return
-    if points.numel() and min(size) >= _SMALLEST_PICTURE and bool(((points > 0) & (points < 1)).all()):
+    in_first_pixel = bool(((points > 0) & (points < 1)).all())
+    # In a picture of a few pixels, or of no points, that says nothing.
+    if in_first_pixel and points.numel() and min(size) >= _SMALLEST_PICTURE:
         doubt = f"all fixations lie in the first pixel, such as {points.reshape(-1, 2)[0].tolist()}"
         warnings.warn(f"gaze: {doubt}; of shares of the picture take gaze * (width, height)", stacklevel=4)
 

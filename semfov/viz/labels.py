@@ -86,7 +86,8 @@ def _free_place(
     width, height = size
     for x, y in _around(point, size, reach):
         label = _into(x - width / 2, y - height / 2, width, height, frame)
-        if not _covered(label, placed) and not any(_inside(other, label) for other in points):
+        covers_label = bool(_covered(label, placed))
+        if not covers_label and not any(_inside(other, label) for other in points):
             return label
     return None
 

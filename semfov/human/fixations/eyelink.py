@@ -317,7 +317,8 @@ def _outside_views(trials: Sequence[_Trial], fixations: Sequence[_Fixation]) -> 
     for trial in trials:
         first, end = np.searchsorted(starts, (trial.start, trial.end))
         has_fixations = bool(end > first)
-        if has_fixations and trial.views and not any(view.fixations for view in trial.views):
+        any_on_picture = any(view.fixations for view in trial.views)
+        if has_fixations and trial.views and not any_on_picture:
             missed.append(trial)
     if not missed:
         return []

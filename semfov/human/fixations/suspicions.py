@@ -114,9 +114,9 @@ def _other_unit(points: _Array, sides: _Array) -> str | None:
     """Recognise fractions: all points `(n, 2)` in [0, 1], not all at its ends, in frames of more than some pixels."""
     in_unit_square = ((points >= 0) & (points <= 1)).all()
     are_whole = (points % 1 == 0).all()
-    if not in_unit_square or are_whole or sides.min() <= 8:
-        return None
-    return "fractions of the sides (units='fractions')"
+    are_fractions = in_unit_square and not are_whole
+    # In a frame of some pixels they may be pixels.
+    return "fractions of the sides (units='fractions')" if are_fractions and sides.min() > 8 else None
 
 
 def _other_origin(points: _Array, sides: _Array) -> str | None:
@@ -351,7 +351,8 @@ def _other_time_unit(durations: _Array) -> list[str]:
     least = durations.min()
     most = durations.max()
     are_whole = (durations % 1 == 0).all()
-    if median < 2 and most < 20 and not are_whole:
+    are_short = median < 2 and most < 20
+    if are_short and not are_whole:
         return [f"durations from {least:g} to {most:g} look like seconds (multiply them by 1000)"]
     if median > 20_000:
         return [f"durations of {median:g} in the median look like microseconds or nanoseconds (in milliseconds ~250)"]
