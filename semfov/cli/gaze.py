@@ -124,7 +124,7 @@ class _GazeJob:
             remedy = "; without it the page of several pictures has the shares side by side"
             check(len(self.sources) == 2, "compare", "two pictures", f"{len(self.sources)}{remedy}")
         self.outputs = _Outputs.of(options.out, several=self.several, compared=options.compare)
-        check_apart(options.out, "out", [source.file for source in self.sources])
+        check_apart(options.out, [source.file for source in self.sources])
         self.areas = None if options.areas is None else boxes_of(options.areas)
         self.report = _page_of(options)
         if self.report is not None:

@@ -96,7 +96,7 @@ class PictureJob(ABC, Generic[_Options_co]):
             first = "none for find, which begins with the whole picture"
             check(options.start is None, "start", first, repr(options.start))
         _check_outputs(options)
-        check_apart(options.figure, "out", [source.file for source in self.sources])
+        check_apart(options.figure, [source.file for source in self.sources])
         expected = f"a folder for the figures of {len(self.sources):,} pictures"
         check(options.figure is None or not self.several, "out", expected, options.figure)
 

@@ -52,7 +52,7 @@ def look_live(options: LiveOptions) -> int:
     settings = {setting.name: getattr(options, setting.name) for setting in fields(StreamSettings)}
     live = agent.live(_sought(options, agent.classes[1:]), **settings)
     path = _video_path(options.out)
-    check_apart(path, "out", [Path(source)] if isinstance(source, str) else [])
+    check_apart(path, [Path(source)] if isinstance(source, str) else [])
     with held_outputs(options):
         _watch(live, stream, path, options.tracks)
     written = [str(file) for file in (path, options.tracks) if file is not None]

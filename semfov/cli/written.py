@@ -101,7 +101,7 @@ class PictureFiles:
     def _write_into(self, folder: Path, outcome: PictureOutcome, picture: Path | None) -> None:
         """Write the figures of a picture into a folder, but not over the picture itself."""
         for file, content in outcome.figures.items():
-            check_apart(folder / file, "out", [picture])
+            check_apart(folder / file, [picture])
             write_bytes(folder / file, content)
         # An earlier command may have written them, of which the outcome keeps the names alone.
         self._written += [folder / file for file in outcome.names]

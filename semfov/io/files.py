@@ -248,19 +248,18 @@ def check_writable(path: Path | None, *, folder: bool = False) -> None:
         raise DataError(f"cannot write {path}: no permission to write in {place}")
 
 
-def check_apart(path: Path | None, argument: str, files: Iterable[Path | None]) -> None:
+def check_apart(path: Path | None, files: Iterable[Path | None]) -> None:
     """Raise `InputError` where what is written would take the place of a file that is read.
 
     Args:
-        path: what is written; None for nothing.
-        argument: name of the option, for the message.
+        path: what is written, as the option `out` says; None for nothing.
         files: the files that are read; None is left out.
     """
     if path is None or not path.is_file():
         return
     for file in files:
         if file is not None and file.is_file():
-            check(not file.samefile(path), argument, "a file other than the one that is looked at", path)
+            check(not file.samefile(path), "out", "a file other than the one that is looked at", path)
 
 
 @contextmanager

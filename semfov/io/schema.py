@@ -18,6 +18,7 @@ _Sizes = dict[str, int]  # the numbers that names of sizes stand for, as far as 
 
 _FLOATS = (torch.float32, torch.float64)
 _SIMPLEX_ERROR = 1e-2  # the sum of many numbers of 32 bits differs from 1 by their rounding
+_LARGEST = 1e6  # magnitude of the values of a fitted perceptron
 
 
 @dataclass(frozen=True)
@@ -308,7 +309,7 @@ def check_content(where: object, value: object, kind: Json) -> None:
         raise DataError(f"{where}: {str(error).lstrip('.: ')}") from None
 
 
-def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, largest: float = 1e6) -> dict[str, Field]:
+def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1) -> dict[str, Field]:
     """List the requirements of the tensors of an `nn.Sequential` with two hidden layers, each with an activation.
 
     Args:
@@ -316,7 +317,6 @@ def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, large
         inputs: number of inputs.
         hidden: number of units of a hidden layer.
         outputs: number of outputs.
-        largest: largest magnitude of a value.
 
     Returns:
         The requirements by name.
@@ -325,8 +325,8 @@ def perceptron(name: str, inputs: int, hidden: _Size, outputs: int = 1, *, large
     tensors = {}
     for number, shape in enumerate(shapes_of_weights):
         layer = f"{name}.{2 * number}"  # an activation, which has no tensors, follows each layer
-        tensors[f"{layer}.weight"] = Field(shape, low=-largest, high=largest)
-        tensors[f"{layer}.bias"] = Field(shape[:1], low=-largest, high=largest)
+        tensors[f"{layer}.weight"] = Field(shape, low=-_LARGEST, high=_LARGEST)
+        tensors[f"{layer}.bias"] = Field(shape[:1], low=-_LARGEST, high=_LARGEST)
     return tensors
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image as PillowImage
 
 _Frame = NDArray[np.uint8]
+_SAMPLED = 6  # largest number of frames from which a palette is made
 
 
 @dataclass(frozen=True)
@@ -158,19 +159,11 @@ def write_webp(
     )
 
 
-def _in_one_palette(frames: Sequence[_Frame], most: int = 6) -> list[PillowImage]:
-    """Convert frames to images with a common palette, without which static parts would flicker.
-
-    Args:
-        frames: `(H, W, 3)` each.
-        most: number of frames that the palette is made from.
-
-    Returns:
-        The images.
-    """
+def _in_one_palette(frames: Sequence[_Frame]) -> list[PillowImage]:
+    """Convert frames `(H, W, 3)` to images with a common palette, without which static parts would flicker."""
     from PIL import Image
 
-    numbers = np.linspace(0, len(frames) - 1, min(most, len(frames)))
+    numbers = np.linspace(0, len(frames) - 1, min(_SAMPLED, len(frames)))
     # Every second pixel of a few frames has all colours.
     samples = [frames[round(number)][::2, ::2] for number in numbers]
     palette = Image.fromarray(np.concatenate(samples)).quantize(256)

@@ -32,16 +32,13 @@ def read_recording(path: str | PathLike[str]) -> tuple[str, str]:
     return text, encoding
 
 
-def warn_of_letters(
-    source: str | PathLike[str], encoding: str, fixations: list[Fixations], *, stacklevel: int = 3
-) -> list[Fixations]:
+def warn_of_letters(source: str | PathLike[str], encoding: str, fixations: list[Fixations]) -> list[Fixations]:
     """Warn of names whose letters are right only if the encoding is that of the file.
 
     Args:
         source: the file, for the message.
         encoding: in which it was read.
         fixations: the records.
-        stacklevel: as for `warnings.warn`.
 
     Returns:
         The records.
@@ -55,6 +52,6 @@ def warn_of_letters(
         warnings.warn(
             f"{source}: is not UTF-8, so names are read as Western European ones of Windows ({WINDOWS}), such as "
             f"{uncertain[0]!r}; if that is wrong, save the file as UTF-8",
-            stacklevel=stacklevel,
+            stacklevel=3,
         )
     return fixations
