@@ -24,7 +24,7 @@ from semfov.cli.own_looks import SCRIPT, STYLE, TEMPLATE, look_at_cells, scene_j
 from semfov.data import Scene, read_image
 from semfov.data.examples import EXAMPLES, example_scene
 from semfov.data.images import PhotographPicture
-from semfov.errors import DataError, InputError, SemfovError, check, check_data
+from semfov.errors import DataError, InputError, SemfovError, check_data
 from semfov.paths import Record
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
@@ -292,8 +292,8 @@ def _share(text: str | None) -> PriorLike:
 
 def _read(path: str | None) -> Tensor:
     """Read the picture in a file that was uploaded, `(3, H, W)`; one that a page should not wait for is refused."""
-    check(path is not None, "picture", _PICTURE, "none")
-    assert path is not None
+    if path is None:
+        raise InputError(f"picture: expected {_PICTURE}, got none")
     check_data(Path(path).exists(), "picture", "it once more, as it is kept for an hour", "one from before")
     width, height = PhotographPicture(path).size
     got = f"{width} × {height}; reduce it, or give it to semfov find"

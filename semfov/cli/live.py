@@ -226,9 +226,8 @@ def _totals(stream: Stream, speed: "_Speed") -> str:
 
 def _mot_lines(moment: Moment) -> str:
     """Write the objects of a frame in MOTChallenge's format; raises `InputError` where they have no numbers."""
-    has_numbers = isinstance(moment, WindowMoment) and moment.candidates.track_ids is not None
-    check(has_numbers, "tracks", "looks at windows, by an agent with evidence for them", "others")
-    assert isinstance(moment, WindowMoment)
+    if not isinstance(moment, WindowMoment) or moment.candidates.track_ids is None:
+        raise InputError("tracks: expected looks at windows, by an agent with evidence for them, got others")
     return moment.to_mot()
 
 

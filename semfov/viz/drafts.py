@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
-from semfov.errors import check
+from semfov.errors import InputError
 from semfov.paths.areas import AreasLike, percent
 from semfov.paths.drafts import Drafts
 from semfov.viz.drawing import draw_image
@@ -79,9 +79,8 @@ def plot_difference(drafts: Drafts, *, ax: Axes | None = None, title: bool = Tru
     """
     difference = drafts.difference
     moved = drafts.moved
-    check(difference is not None and moved is not None, "drafts", "two pictures of the same proportions", drafts.names)
-    assert difference is not None
-    assert moved is not None
+    if difference is None or moved is None:
+        raise InputError(f"drafts: expected two pictures of the same proportions, got {drafts.names}")
     width, height = drafts.second.size
     inches = _WIDTH * height / width + 0.6
     figure, (axes,) = make_figure(1, 1, width=_WIDTH, height=inches, layout="compressed", axes=only(ax))
