@@ -216,11 +216,13 @@ def _columns_and_lines(path: Path, text: str, separator: str) -> tuple[list[str]
         lines = [(f"line {reader.line_num}", line) for line in reader if any(line)]
     except csv.Error as error:
         raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
+    filled = []
     for place, line in lines:
-        if len(line) > len(columns):
+        left_out = len(columns) - len(line)  # a line may end early
+        if left_out < 0:
             raise DataError(f"{path}: {place}: expected {len(columns)} fields, got more; quote them with {separator!r}")
-        line += [""] * (len(columns) - len(line))  # a line may end early
-    return columns, [(place, _texts(line, separator)) for place, line in lines]
+        filled.append((place, _texts([*line, *[""] * left_out], separator)))
+    return columns, filled
 
 
 def _texts(fields: Iterable[str], separator: str) -> list[str]:

@@ -182,10 +182,12 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
     scanpaths = []
     for picture, people in _read(path, _OSIE).items():
         for number, person in enumerate(people):
-            if person["x"] or person["y"]:
-                name = f"{path}: {picture}[{number}]"
-                points, durations = _points_and_durations(name, person, ("x", "y", "duration_ms"))
-                scanpaths.append(Fixations(picture, str(number + 1), points, size, durations))
+            has_fixation = person["x"] or person["y"]
+            if not has_fixation:
+                continue
+            name = f"{path}: {picture}[{number}]"
+            points, durations = _points_and_durations(name, person, ("x", "y", "duration_ms"))
+            scanpaths.append(Fixations(picture, str(number + 1), points, size, durations))
     return warn_of_frames(path, scanpaths)
 
 

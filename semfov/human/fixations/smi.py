@@ -76,23 +76,7 @@ class Events(NamedTuple):
         begins_right = tuple(map(str.lower, columns[: len(_FIRST_FIELDS)])) == _FIRST_FIELDS
         expected = "columns of fixations that begin with Event Type, Trial, Number, Start"
         check_data(begins_right, name, expected, ", ".join(columns)[:200])
-
-        views: list[_View] = []
-        fixations: list[_Fixation] = []
-        for number, line in enumerate(text.splitlines(), start=1):
-            fields = [field.strip() for field in line.split(separator)]
-            kind = fields[0].lower().replace(" ", "")
-            place = f"line {number}"
-            if kind.startswith("userevent"):
-                views += _views(fields, separator, f"{name}: {place}")
-            elif kind.startswith("fixation"):
-                has_all_fields = len(fields) == len(columns)
-                check_data(has_all_fields, f"{name}: {place}", f"{len(columns)} fields", str(len(fields)))
-                fixations.append(_Fixation(_time(fields[3], f"{name}: {place}"), place, fields))
-
-        # Some texts have one kind of events, or one eye, after the other.
-        views.sort(key=lambda view: view.start)
-        fixations.sort(key=lambda fixation: fixation.start)
+        views, fixations = _events(text, separator, len(columns), name)
         head = _head(text)
         lines = []
         for start, place, fields in fixations:
@@ -104,6 +88,32 @@ class Events(NamedTuple):
 def has_events(text: str) -> bool:
     """Tell whether a text has the events of an eye tracker of SMI, fixations among them."""
     return any(section.lower() == _FIXATIONS for section, _ in _SECTION.findall(text))
+
+
+def _events(text: str, separator: str, count: int, name: str) -> tuple[list[_View], list[_Fixation]]:
+    """Read the views and the fixations of a text, in the order of time.
+
+    Args:
+        text: the text.
+        separator: of the fields in a line.
+        count: number of fields of a fixation.
+        name: of the text, for messages.
+    """
+    views: list[_View] = []
+    fixations: list[_Fixation] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = [field.strip() for field in line.split(separator)]
+        kind = fields[0].lower().replace(" ", "")
+        place = f"line {number}"
+        if kind.startswith("userevent"):
+            views += _views(fields, separator, f"{name}: {place}")
+        elif kind.startswith("fixation"):
+            check_data(len(fields) == count, f"{name}: {place}", f"{count} fields", len(fields))
+            fixations.append(_Fixation(_time(fields[3], f"{name}: {place}"), place, fields))
+    # Some texts have one kind of events, or one eye, after the other.
+    views.sort(key=lambda view: view.start)
+    fixations.sort(key=lambda fixation: fixation.start)
+    return views, fixations
 
 
 def _head(text: str) -> list[str]:
