@@ -14,7 +14,6 @@ from semfov.io.files import JsonObject
 from semfov.io.ranges import Count, Form, Range, Seed, Whole, Workers
 from semfov.kinds import Drawing, Quality
 from semfov.report.template import page_path
-from semfov.runs.config import WHERE
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 from semfov.settings import (
@@ -73,6 +72,8 @@ class DetectorOptions(Settings):
 
     def result_settings(self) -> JsonObject:
         """List the settings on which results depend: not those of folders, processes and printing."""
+        from semfov.runs.config import WHERE  # with the sensors and policies, which help and refusals do without
+
         return {name: value for name, value in self.plain().items() if name not in (*WHERE, "quiet")}
 
 
