@@ -283,19 +283,16 @@ def _load(options: GazeOptions) -> tuple[Detector, FixationDensity]:
 
 def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], shares: Mapping[str, float]) -> str:
     """Say what is known of a prediction and the viewers that are drawn from it."""
-    places = "; ".join(
-        f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %"
-        for number, peak in enumerate(prediction.peaks(), 1)
-    )
-    mean = sum(map(len, paths)) / len(paths)
-    lines = [
-        f"{name}: {prediction.describe()}",
-        f"  most of all fixations: {places}",
-        f"  {len(paths)} viewers drawn, {mean:.1f} fixations each",
-    ]
+    lines = [f"{name}: {prediction.describe()}"]
     if shares:
         said = ", ".join(f"{area} {percent(share)}" for area, share in shares.items())
-        lines.insert(1, f"  share of all fixations: {said}")
+        lines.append(f"  share of all fixations: {said}")
+    places = []
+    for number, peak in enumerate(prediction.peaks(), 1):
+        places.append(f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %")
+    lines.append(f"  most of all fixations: {'; '.join(places)}")
+    mean = sum(map(len, paths)) / len(paths)
+    lines.append(f"  {len(paths)} viewers drawn, {mean:.1f} fixations each")
     if prediction.caution is not None:
         lines.append(f"  caution: {prediction.caution}")
     return "\n".join(lines)

@@ -130,14 +130,14 @@ def run(
     check(task != "search" or target is not None, "target", "a class to search for; task='find' finds all objects",
           target)  # fmt: skip
     values = _as_settings(options, kind)
-    if isinstance(agent, ActivePerception):
-        _check_agent_is_made(options)
-    else:
+    made_agent = agent if isinstance(agent, ActivePerception) else None
+    if made_agent is None:
         values["agent"] = agent
+    else:
+        _check_agent_is_made(options)
     if target is not None:
         values["target"] = ",".join(_classes_of(target))
     settings = kind(pictures=names, quiet=quiet, **values)
-    made_agent = agent if isinstance(agent, ActivePerception) else None
     with _turn, open(os.devnull, "w", encoding="utf-8") as nothing:
         stream = sys.stdout
         with redirect_stdout(nothing) if quiet else nullcontext():
@@ -184,8 +184,9 @@ def _start_of(text: str) -> int | tuple[int, ...]:
 
 def _check_agent_is_made(options: Mapping[str, Any]) -> None:
     """Raise `InputError` for options that have no place beside an agent that is made already."""
-    for name in {"detector", "weights", "models", "classes", "device", "half", "sensor"} & options.keys():
-        raise InputError(f"{name}: expected none beside an agent that is made already, got {options[name]}")
+    for name in ("detector", "weights", "models", "classes", "device", "half", "sensor"):
+        if name in options:
+            raise InputError(f"{name}: expected none beside an agent that is made already, got {options[name]}")
     is_one = options.get("workers", 1) == 1 and options.get("scheduler") is None
     check(is_one, "workers", "1 for an agent that is made already", options.get("workers"))
 

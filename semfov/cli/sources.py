@@ -180,10 +180,11 @@ def _check_may_be_picture(name: str, *, has_target: bool) -> None:
     """Raise `InputError` for what is no picture: an address, standard input, a word that is no file, or a video."""
     remedy = "standard input is not read: write the picture to a file"
     check(name != "-", "picture", "a file or folder", f"-; {remedy}")
+    if "://" in name:
+        is_stream = name.lower().startswith(("rtsp", "rtmp", "udp", "tcp", "srt"))
+        remedy = "`semfov live` takes streams" if is_stream else "download it first"
+        raise InputError(f"picture: expected a file on this machine, got {name!r}; {remedy}")
     path = Path(name)
-    is_stream = name.lower().startswith(("rtsp", "rtmp", "udp", "tcp", "srt"))
-    remedy = "`semfov live` takes streams" if is_stream else "download it first"
-    check("://" not in name, "picture", "a file on this machine", f"{name!r}; {remedy}")
     looks_like_file = path.exists() or bool(path.suffix) or len(path.parts) > 1
     of_class = f" (a class is given by --target {name})" if has_target else ""
     check(looks_like_file, "picture", f"a file or folder{of_class}", f"{name}, which does not exist")

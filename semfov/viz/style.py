@@ -101,12 +101,13 @@ def _show_in_notebook(figure: Figure) -> None:
         while _waiting:
             display(_waiting.pop(0))
 
+    shows_pictures = hasattr(shell, "kernel")  # a terminal has none, and can show none
     pictures = shell.display_formatter.formatters["image/png"]
     if Figure not in pictures.type_printers:
         pictures.for_type(Figure, print_once)
-        if hasattr(shell, "kernel"):  # a terminal can show no pictures
+        if shows_pictures:
             shell.events.register("post_execute", end_cell)
-    if hasattr(shell, "kernel"):
+    if shows_pictures:
         _waiting.append(figure)
 
 
