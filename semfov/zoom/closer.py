@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -88,15 +89,20 @@ class SearchLook(NamedTuple):
 
 
 class _Scored(NamedTuple):
-    """Boxes `(M, 4)` of the target in one look, their scores `(M,)`, and which the present frame shows `(M,)`."""
+    """Boxes `(M, 4)` of the target in several looks, the scores `(M,)`, and which the present frame shows `(M,)`."""
 
     boxes: Tensor
     scores: Tensor
     in_view: Tensor
 
-    def of(self, chosen: Tensor) -> "_Scored":
-        """Select some of the boxes, `(M,)` boolean."""
-        return _Scored(self.boxes[chosen], self.scores[chosen], self.in_view[chosen])
+    def joined(self, others: "_Scored") -> "_Scored":
+        """Append the boxes of a later look."""
+        return _Scored(*map(torch.cat, zip(self, others, strict=True))) if len(self.boxes) else others
+
+    def last(self, count: int) -> "_Scored":
+        """Take the last boxes."""
+        first = len(self.boxes) - count
+        return _Scored(*(column[first:] for column in self)) if first else self
 
 
 class CandidateBoxes(CandidatePlaces[SearchLook]):
@@ -108,11 +114,12 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
     the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). In a stream scores fade, and
     places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
 
-    Private attributes: `_look` is the last look of the search. `_looks` has the boxes of the target that looks have
-    shown, where they lie in the present frame, each with the time of the look. `_next` is the index of the next look.
+    Private attributes: `_look` is the last look of the search. `_scored` has the boxes of the target that looks have
+    shown, where they lie in the present frame, and `_looks` the time of each of these looks, with its number of boxes.
+    `_next` is the index of the next look.
 
-    Invariant: `_most_evident`, once it was computed, is that of `_looks`, the examined places and the present time.
-    What changes one of these calls `_change`.
+    Invariant: `_scored` has the boxes of `_looks`, in their order. `_most_evident`, once it was computed, is that of
+    `_scored`, the examined places and the present time. What changes one of these calls `_change`.
     """
 
     least = DETECTION_SCORE
@@ -125,6 +132,7 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         self.target = target
         self.likely = likely
         self._next = 0
+        self._scored = _Scored(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).bool())
 
     _look: SearchLook
 
@@ -139,7 +147,9 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
             boxes = look.detections.boxes[0][of_target]
-            self._looks.append((self._now, _Scored(boxes, scores[of_target], torch.ones(len(boxes)).bool())))
+            in_view = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+            self._looks.append((self._now, len(boxes)))
+            self._scored = self._scored.joined(_Scored(boxes, scores[of_target], in_view))
 
     @property
     def hit_chance(self) -> float:
@@ -187,25 +197,22 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         """Let seconds pass."""
         self._change()
         super().wait(passed)
+        self._forget_boxes()
+
+    def _forget_boxes(self) -> None:
+        """Forget the boxes of looks that are forgotten, which are the oldest."""
+        self._scored = self._scored.last(sum(count for _, count in self._looks))
 
     def follow(self, motion: Motion | None, size: tuple[int, int]) -> None:
-        """Carry the boxes of the target along, too; those that come to lie behind the camera are dropped."""
+        """Carry the boxes of the target along, too; those that come to lie behind the camera count no more."""
         self._change()
         super().follow(motion, size)
-        if motion is None or not self._looks:
+        self._forget_boxes()
+        boxes, scores, _ = self._scored
+        if motion is None or not len(boxes):
             return
-        # The boxes of all looks are moved together.
-        parts = [scored.boxes for _, scored in self._looks]
-        counts = [len(boxes) for boxes in parts]
-        together = torch.cat(parts)
-        moved, is_ahead = motion.boxes_ahead(together)
-        are_all_ahead = bool(is_ahead.all())  # mostly; selecting from each look takes longer than moving them
-        columns = [column.split(counts) for column in (moved, inside_frame(moved, size), is_ahead)]
-        moved_looks = []
-        for (time, scored), boxes, in_view, ahead in zip(self._looks, *columns, strict=True):
-            moved_look = _Scored(boxes, scored.scores, in_view)
-            moved_looks.append((time, moved_look if are_all_ahead else moved_look.of(ahead)))
-        self._looks = moved_looks
+        moved, is_ahead = motion.boxes_ahead(boxes)
+        self._scored = _Scored(moved, scores * is_ahead.to(scores.device), inside_frame(moved, size))
 
     def probability(self, look: CloseUp) -> float:
         """Compute the present probability that the target is at the place of a closer look.
@@ -225,15 +232,12 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
     @cached_property
     def _scored_boxes(self) -> tuple[Tensor, Tensor]:
         """Boxes `(M, 4)` of the target in view that count, and their scores `(M,)`, faded."""
-        if not self._looks:
-            return torch.zeros(0, 4), torch.zeros(0)
+        boxes, scores, in_view = self._scored
         keep = self.forgetting.keep
-        boxes = torch.cat([scored.boxes for _, scored in self._looks])
-        counts = torch.tensor([len(scored.boxes) for _, scored in self._looks])
-        scores = torch.cat([scored.scores for _, scored in self._looks])
-        shares_left = scores.new_tensor([keep ** (self._now - time) for time, _ in self._looks])
-        faded_scores = scores * shares_left.repeat_interleave(counts)
-        in_view = torch.cat([scored.in_view for _, scored in self._looks])
+        shares_left = [keep ** (self._now - time) for time, _ in self._looks]
+        counts = np.array([count for _, count in self._looks], dtype=int)
+        share_of_box = np.repeat(shares_left, counts)
+        faded_scores = scores * torch.from_numpy(share_of_box).to(scores)
         return boxes[in_view], faded_scores[in_view]
 
     def _chance(self, score: float) -> float:
