@@ -123,11 +123,10 @@ def _looks_text(record: Record) -> str:
     headings = ["look", "at (x, y)", "shows", f"detections from score {CONFIDENT:g} on", "value", "s"]
     rows = [_look_row(record, look) for look in record]
     lines = [f"  {line}" for line in table_lines([headings, *rows])]
-    has_values = any(look.value is not None for look in record)
-    if has_values:
+    if any(look.value is not None for look in record):
         lines.append(f"  value: {record.words.value}")
-    lines += [_closer_line(record, number) for number in range(len(record.closer))]
     if record.closer:
+        lines += [_closer_line(record, number) for number in range(len(record.closer))]
         lines.append("  in the picture: by all looks so far, so also where that closer look shows nothing of it")
     return "\n".join(lines)
 

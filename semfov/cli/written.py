@@ -137,7 +137,12 @@ class PictureFiles:
         options = self.job.options
         written: list[object] = []
         if self._results is not None:
-            written += self._write_results(self._results, complete=complete)
+            self._results.write()
+            was_looked_at = any("error" not in row for row in self.rows.values())
+            if complete and was_looked_at:
+                self._results.print_judgement()
+            if self._results.path != STDOUT:
+                written.append(self._results.path)
         written += self._written
         if options.report is not None and self._episodes:
             episodes = [self._episodes[number] for number in sorted(self._episodes)]
@@ -145,11 +150,3 @@ class PictureFiles:
         written += [folder for folder in (options.crops, options.labels) if folder is not None]
         part = None if complete else f"{len(self.rows)} of {len(self.job.sources)}"
         tell_written(written, self.finished, part)
-
-    def _write_results(self, results: ResultsFile, *, complete: bool) -> list[Path]:
-        """Write the file of results, judge the objects of a complete one, and list it unless it is a stream."""
-        results.write()
-        was_looked_at = any("error" not in row for row in self.rows.values())
-        if complete and was_looked_at:
-            results.print_judgement()
-        return [] if results.path == STDOUT else [results.path]

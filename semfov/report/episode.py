@@ -186,10 +186,11 @@ def _about_data(scanpath: Scanpath, settings: Settings | None) -> Data:
     """Tell detector, sensor and decision in words; None for parts that were not kept."""
     if settings is None and scanpath.stimulus is not None:
         settings = scanpath.stimulus.settings
-    about: Data = {"detector": scanpath.detector, "sensor": None}
-    if settings is not None:
-        about = {"detector": settings["detector"]["name"], "sensor": _sensor_in_words(settings["sensor"])}
-    return {**about, "decision": _decision_in_words(scanpath)}
+    return {
+        "detector": scanpath.detector if settings is None else settings["detector"]["name"],
+        "sensor": None if settings is None else _sensor_in_words(settings["sensor"]),
+        "decision": _decision_in_words(scanpath),
+    }
 
 
 def _decision_in_words(scanpath: Scanpath) -> str:
