@@ -69,6 +69,7 @@ class ActivePerception(nn.Module):
         verification: probabilities after closer looks (`semfov.belief.Verification`); None searches without them.
         windows: evidence for windows (`semfov.zoom.GlimpseEvidence`); None looks at slices in the overview's order.
         grid: `(columns, rows)` of the belief, 1 to 200 each.
+        photographs: whether windows also suit photographs; where their evidence knows photographs, they always do.
 
     Raises:
         InputError: `grid` is out of range, or a model was fitted for another detector, sensor or grid.
@@ -91,11 +92,13 @@ class ActivePerception(nn.Module):
         verification: Verification | None = None,
         windows: GlimpseEvidence | None = None,
         grid: tuple[int, int] = (10, 10),
+        photographs: bool = False,
     ) -> None:
         super().__init__()
         self.eye = eye
         self.verification = verification
         self.windows = windows
+        self.photographs = photographs
         self.searching = Strategy(*search)
         self.exploring = Strategy(*explore)
         check_cells(grid)
@@ -196,6 +199,8 @@ class ActivePerception(nn.Module):
     def raw(cls, name: DetectorLike = "yolox-nano", *, sensor: str = "published", **options: Any) -> Self:
         """Make an agent for any detector, without fitted models: raw scores as likelihoods, and random exploration.
 
+        It looks at photographs by windows, too: raw scores of a fovea's looks make no probability.
+
         Args:
             name: name, path or model of the detector, as for `semfov.load_detector`.
             sensor: name of the sensor (`semfov.sensor.SENSORS`).
@@ -269,7 +274,7 @@ class ActivePerception(nn.Module):
     @property
     def zoom(self) -> ZoomAgent:
         """The part of the agent that looks at windows."""
-        return ZoomAgent(WindowEye(self.eye.detector), self.windows).train(self.training)
+        return ZoomAgent(WindowEye(self.eye.detector), self.windows, self.photographs).train(self.training)
 
     @property
     def head(self) -> HeadAgent:
@@ -303,7 +308,7 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the kind is unknown, or does not suit a scene.
         """
-        photographs = not foveal and self.windows is not None and self.windows.photograph is not None
+        photographs = not foveal and self.zoom.suits_photographs
         return OpenedPicture.of(picture).kind(how, self.eye.detector.input_size, every=every, photographs=photographs)
 
     @checked_keywords

@@ -66,8 +66,7 @@ class LivePerception(OtherWords):
         self._start = settings.start
         windows = parts.zoom
         self._canvas = windows.eye.detector.input_size
-        knows_photographs = windows.evidence is not None and windows.evidence.photograph is not None
-        self._photographs = knows_photographs and settings.start is None
+        self._photographs = windows.suits_photographs and settings.start is None
         # A kind of look that no frame can ask for is not made: it may refuse settings that suit the other.
         self._episodes = {}
         for name in self._possible_kinds():

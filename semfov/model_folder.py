@@ -238,6 +238,8 @@ class ModelFolder:
             "verification": self._models.get("verification") if self.used("search") else None,
             "windows": self._models.get("windows"),
             "grid": self.manifest.grid,
+            # Raw scores of a fovea's looks make no probability.
+            "photographs": not self.used("search"),
         }
 
     def _search_observer(self) -> Observer:

@@ -120,4 +120,5 @@ def raw_arguments(name: DetectorLike, /, sensor: str, **options: Any) -> dict[st
     """Make the arguments of the raw agent: raw scores as likelihoods, and random exploration."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)
-    return {"eye": eye, "search": (observer, Policy("non-predictive")), "explore": (observer, Policy("random"))}
+    search = (observer, Policy("non-predictive"))
+    return {"eye": eye, "search": search, "explore": (observer, Policy("random")), "photographs": True}

@@ -35,6 +35,7 @@ class ZoomAgent(nn.Module):
     Args:
         eye: resamples a window and detects in it.
         evidence: predicts from a look what closer looks will find; None for slices.
+        photographs: whether windows also suit photographs, which the detector sees whole, without evidence.
 
     Attributes:
         classes: names of the classes, background first.
@@ -51,7 +52,7 @@ class ZoomAgent(nn.Module):
         print(path.objects.boxes, path.passes)
     """
 
-    def __init__(self, eye: WindowEye, evidence: GlimpseEvidence | None = None) -> None:
+    def __init__(self, eye: WindowEye, evidence: GlimpseEvidence | None = None, photographs: bool = False) -> None:
         super().__init__()
         if evidence is not None:
             kinds = len(eye.detector.classes)
@@ -59,6 +60,13 @@ class ZoomAgent(nn.Module):
             evidence.check_compatible(eye.settings())
         self.eye, self.evidence = eye, evidence
         self.classes = ("background", *eye.detector.classes)
+        self._photographs = photographs
+
+    @property
+    def suits_photographs(self) -> bool:
+        """Whether a photograph is looked at by windows: if the evidence knows photographs, or if that was asked for."""
+        knows_photographs = self.evidence is not None and self.evidence.photograph is not None
+        return knows_photographs or self._photographs
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:

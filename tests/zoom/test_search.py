@@ -19,6 +19,7 @@ from semfov.settings import ExploreSettings, FindSettings, SearchSettings, Strea
 from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from tests.refusals import refused
+from tests.small import agent as foveal_agent
 from tests.zoom.test_closer import Fickle, evidence
 
 
@@ -362,17 +363,28 @@ def raw(detector):
     return agent
 
 
-def test_the_first_frame_decides_how_a_stream_is_looked_at(raw, picture):
+def test_the_first_frame_decides_how_a_stream_is_looked_at(detector, picture):
+    foveal = foveal_agent(detector)
     for size, how, kind in ((128, "fovea", "FoveaMoment"), (1024, "windows", "WindowMoment")):
-        live = raw.live("red")
+        live = foveal.live("red")
         assert live.how == "auto"
         moment = live.step(picture[:, :size, :size])
         assert (live.how, type(moment).__name__) == (how, kind)
         assert moment.describe().startswith("red: ") or "p(red)" in moment.describe()
-    assert type(raw.live("red", how="fovea").step(picture)).__name__ == "FoveaMoment"
-    small = raw.live(["red", "blue"]).step(picture[:, :128, :128])
+    assert type(foveal.live("red", how="fovea").step(picture)).__name__ == "FoveaMoment"
+    small = foveal.live(["red", "blue"]).step(picture[:, :128, :128])
     assert (type(small).__name__, small.targets) == ("WindowMoment", (1, 3))
-    assert raw.live(["red"]).describe() == "finding all “red”"
+    assert foveal.live(["red"]).describe() == "finding all “red”"
+
+
+def test_an_agent_with_raw_scores_looks_at_photographs_by_windows(raw, picture):
+    photograph = picture[:, :128, :128]
+    assert [raw.search(photograph, "red", **how).how for how in ({}, {"how": "fovea"})] == ["windows", "fovea"]
+    assert raw.search(photograph, "red", start=3).how == "fovea"
+    assert raw.explore(photograph).how == "windows"
+    live = raw.live("red")
+    live.step(photograph)
+    assert live.how == "windows"
 
 
 def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(raw, picture):
