@@ -64,7 +64,7 @@ class VerificationConfig(FitOnCellsConfig):
     max_target_area: Positive = 0.2
     looks: Annotated[int, Range(2, 10_000)] = 12
     place: Share = 0.4
-    stop_below: Share = 0.03
+    stop_below: Share = 0.012
     false_alarms: Share = 0.01
     folds: Annotated[int, Range(2, 1000)] = 5
 
