@@ -168,16 +168,17 @@ def test_yolov3_tiny_searches_with_the_numbers_of_yolox_nano():
     assert model.presence.thresholds == other.presence.thresholds
 
 
-def test_the_card_has_the_numbers_and_thresholds_of_true_cells():
-    model = semfov.FovealObservationModel.from_pretrained("yolox-nano-search")
-    card = (model.shipped / "README.md").read_text("utf-8")
-    offset, slope = model.presence.centre.tolist()
-    assert f"{offset:.2f} and {slope:.2f} (`presence.centre` in the file)" in card
-    thresholds = model.presence.thresholds
-    # The earlier thresholds were of the chain's own probabilities.
-    place, stop_below = model.presence.of_cells(torch.tensor([0.05, 0.002]), "box_centre").tolist()
-    assert (thresholds.place, thresholds.stop_below) == pytest.approx((place, stop_below), abs=0.005)
-    assert f"| {thresholds.place:.2f} | {thresholds.stop_below:.3f} |" in card
+@pytest.mark.parametrize(("name", "detector"), [("yolox-nano", "YOLOX-nano"), ("nanodet-plus-m-1.5x", "NanoDet-Plus")])
+def test_the_card_has_the_numbers_and_thresholds_of_true_cells(name, detector):
+    model = semfov.FovealObservationModel.from_pretrained(f"{name}-search")
+    card = " ".join((model.shipped / "README.md").read_text("utf-8").split())
+    presence = model.presence
+    offset, slope = presence.centre.tolist()
+    assert f"{offset:.2f} and {slope:.2f} for {detector}" in card
+    cell, score = presence.weight.tolist()
+    assert f"{cell:.2f} and {score:.2f} in `{name}-search`" in card
+    thresholds = presence.thresholds
+    assert f"| {thresholds.confirm:.2f} | {thresholds.place:.2f} | {thresholds.stop_below:.2f} |" in card
 
 
 @pytest.mark.parametrize("name", DETECTORS)
@@ -300,9 +301,8 @@ def test_the_file_of_one_model_takes_the_place_of_the_shipped_one(part, one_of_e
 
 @pytest.mark.parametrize("name", DETECTORS)
 def test_a_shipped_verification_was_fitted_to_the_cells_of_the_shipped_search(name):
-    """Those of NanoDet-Plus are as the belief has them."""
     search = FovealObservationModel.from_pretrained(f"{name}-search")
-    assert search.true_cells == (name != "nanodet-plus-m-1.5x")
+    assert search.true_cells
     Verification.from_pretrained(name).check_searching(search)
 
 
