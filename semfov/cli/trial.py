@@ -14,6 +14,7 @@ from semfov.detection.objects import SCORE_THRESHOLD, box_text
 from semfov.detection.onnx import OnnxDetector
 from semfov.detection.selection import suppress
 from semfov.observation.matching import box_iou
+from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import Window
 
 _SAME = 0.5  # overlap from which on a box that is listed is one that the bare detector shows
@@ -33,18 +34,17 @@ class Trial:
 
     @classmethod
     @torch.inference_mode()
-    def of(cls, agent: ActivePerception, photo: Path) -> "Trial":
+    def of(cls, detector: Detector, photo: Path) -> "Trial":
         """Run the bare detector: its best class of each box, and non-maximum suppression.
 
         Args:
-            agent: the agent, whose detector is run.
+            detector: the detector.
             photo: the photograph.
 
         Returns:
             What the detector shows.
         """
-        eye = agent.zoom.eye
-        detector = agent.eye.detector
+        eye = WindowEye(detector)
         view = eye.open(photo)
         overview = torch.tensor([Window.overview(view.lattice).fixation])
         canvas, frames = eye.glimpse(view, overview)
@@ -72,7 +72,7 @@ def try_detector(agent: ActivePerception, photo: Path) -> None:
         photo: the photograph.
     """
     detector = agent.eye.detector
-    bare = Trial.of(agent, photo)
+    bare = Trial.of(detector, photo)
     record = agent.find_all(photo, how="windows", passes=1, score_threshold=SCORE_THRESHOLD)
     rows = _rows(bare, record.objects, agent.classes)
     listed = sum("-" not in row[1:3] for row in rows)
@@ -83,7 +83,7 @@ def try_detector(agent: ActivePerception, photo: Path) -> None:
     )
     if rows:
         print("\n".join(table_lines([["class", "bare", record.words.measure, "box"], *rows])))
-    for word in (*_about_scores(bare, detector), *_about_colours(bare, agent, photo)):
+    for word in (*_about_scores(bare, detector), *_about_colours(bare, detector, photo)):
         print(f"note: {word}")
 
 
@@ -157,16 +157,15 @@ def _about_low_scores(confidence: Tensor) -> str:
     )
 
 
-def _about_colours(bare: Trial, agent: ActivePerception, photo: Path) -> list[str]:
+def _about_colours(bare: Trial, detector: Detector, photo: Path) -> list[str]:
     """Whether an ONNX file shows more with the other order of the channels."""
-    detector = agent.eye.detector
     if not isinstance(detector, OnnxDetector):
         return []
     usual = detector.preprocessing
     other: Literal["rgb", "bgr"] = "bgr" if usual.channels == "rgb" else "rgb"
     detector.preprocessing = replace(usual, channels=other)
     try:
-        swapped = Trial.of(agent, photo)
+        swapped = Trial.of(detector, photo)
     finally:
         detector.preprocessing = usual
     shows_more = float(swapped.scores.sum()) >= _MORE * float(bare.scores.sum())
