@@ -12,7 +12,7 @@ import pytest
 
 import semfov
 from semfov import ActivePerception, HeadAgent, ZoomAgent
-from semfov.cli.options import AgentOptions, GazeOptions
+from semfov.cli.options import DEFAULT_DETECTOR, AgentOptions, GazeOptions
 from semfov.detection import weights
 from semfov.detection.weights import _Address, _SourceDistribution, _Weights, fetch
 from semfov.envs.scenery import open_scenery
@@ -130,13 +130,16 @@ def test_one_detector_is_the_default_everywhere():
         HeadAgent.recommended,
         ZoomAgent.recommended,
         open_scenery,
-        AgentOptions,
         GazeOptions,
         DetectorConfig,
     ]
     for taker in takers:
         given = signature(taker).parameters
         assert (given.get("detector") or given["name"]).default == "yolox-nano", taker
+    assert (
+        signature(AgentOptions).parameters["detector"].default is None
+    )  # so that a default that is named is told from one that is not
+    assert DEFAULT_DETECTOR == "yolox-nano"
 
 
 def test_cache_folder(cache, monkeypatch):
