@@ -56,10 +56,10 @@ class Answer:
     """The answer of a search or a find.
 
     `result` says it in words, and `ended` why no further look was taken. `probability` is that the picture holds the
-    target of a search; where none was learned it is None, and `score` has the number that decided. `expected` has the
-    number of objects of each class that is expected in all, also where nobody looked, and `further` that of those which
-    are not listed yet: what further looks can bring. Both are None for a class whose number is not known, and empty for
-    a search, whose looks count nothing.
+    target of a search; where none was learned it is None, and `score` has the number of its belief, or the detector's.
+    `expected` has the number of objects of each class that is expected in all, also where nobody looked, and `further`
+    that of those which are not listed yet: what further looks can bring. Both are None for a class whose number is not
+    known, and empty for a search, whose looks count nothing.
     """
 
     result: str

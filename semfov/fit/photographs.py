@@ -10,11 +10,10 @@ from torch import Tensor
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
-from semfov.errors import DataError
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.protocols import choose_classes, numbers_drawn
 from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import fit_verification
+from semfov.fit.verification import OneKindError, fit_verification
 from semfov.fit.verification_report import NO_PLACES, verification_report
 from semfov.fit.windows_certainty import Exploration, fit_spread, left_out
 from semfov.fit.windows_settings import FitMosaicsConfig
@@ -305,7 +304,7 @@ def _fit_closer_looks(
     limits = Thresholds(1.0, config.stop_below, config.stop_below)
     try:
         fitted = fit_verification(searches, searches, _FOLDS, limits, _FALSE_ALARMS, config.surest, prior)
-    except DataError:
+    except OneKindError:
         return NO_PLACES
     evidence.verification = fitted.model
     pictures = f"{len({search.picture for search in searches})} photographs"

@@ -27,6 +27,10 @@ _LEAST_CHANCE = 0.01  # least probability of these places
 _RIDGE = 1e-4
 
 
+class OneKindError(DataError):
+    """There are only closer looks, or places, of one kind, to which nothing can be fitted."""
+
+
 class VerifiedSearch(NamedTuple):
     """A search in which all closer looks were made, whatever they showed.
 
@@ -117,7 +121,7 @@ def fit_in_folds(
         The model, with thresholds, and what its report is made of.
 
     Raises:
-        DataError: the closer looks are of one kind.
+        OneKindError: the closer looks are of one kind.
     """
     # The searches are made twice: all of them with their looks would not stay in memory.
     first = photograph_searches(photographs, searching, config.looks, "looking")
@@ -150,11 +154,13 @@ def fit_verification(
         The model, with thresholds, and what its report is made of.
 
     Raises:
-        DataError: the closer looks are of one kind.
+        OneKindError: the closer looks are of one kind.
     """
     closer_looks = examine(first, folds)
     if closer_looks.present.all() or not closer_looks.present.any():
-        raise DataError("data: expected closer looks in photographs that hold the target and in others, got one kind")
+        raise OneKindError(
+            "data: expected closer looks in photographs that hold the target and in others, got one kind"
+        )
     models = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(folds)]
     model = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
     return with_thresholds(model, models, closer_looks, again, limits, false_alarms, surest)
@@ -200,7 +206,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
         The closer looks.
 
     Raises:
-        DataError: no place is right, or none is wrong.
+        OneKindError: no place is right, or none is wrong.
     """
     features: list[Tensor] = []
     right: list[bool] = []
@@ -218,7 +224,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
             fold.append(search.picture % folds)
             known.append(with_prior(0.0, prior.share, prior.fitted))
     if len({*right}) < 2:
-        raise DataError("data: expected places that hold the target and places that do not, got only one kind")
+        raise OneKindError("data: expected places that hold the target and places that do not, got only one kind")
     answers = torch.tensor(right), torch.tensor(present)
     return CloserLooks(torch.stack(features), *answers, torch.tensor(fold), torch.tensor(known))
 
@@ -327,12 +333,14 @@ def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verifi
         The model, without thresholds.
 
     Raises:
-        DataError: fewer than two closer looks are chosen.
+        OneKindError: fewer than two closer looks are chosen.
     """
     features = closer_looks.features[chosen].double()
     known = closer_looks.known[chosen].double()
     if len(features) < 2:
-        raise DataError(f"data: expected closer looks in all folds but one, got {len(features)}; give more photographs")
+        raise OneKindError(
+            f"data: expected closer looks in all folds but one, got {len(features)}; give more photographs"
+        )
     mean = features.mean(0)
     scale = features.std(0).clamp(min=1e-6)  # of a feature that is always the same
     standardised = (features - mean) / scale

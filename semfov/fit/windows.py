@@ -286,10 +286,13 @@ class MosaicFit:
             searched: the searches by which the decisions were fitted.
             prior: centre of the prior of the parameters.
         """
-        report = fit_closer_looks(model, searched["searched"], searched["judged"], self.config, prior)
-        for searches in searched.values():
-            for search in searches:
-                search.source.save()
+        try:
+            report = fit_closer_looks(model, searched["searched"], searched["judged"], self.config, prior)
+        finally:
+            # Looks of a fit that was stopped are those of the next.
+            for searches in searched.values():
+                for search in searches:
+                    search.source.save()
         return ["Closer looks:", "", report]
 
     def fit_certainty(self, model: GlimpseEvidence) -> list[str]:

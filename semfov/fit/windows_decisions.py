@@ -12,12 +12,11 @@ from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.decision import SAME
 from semfov.detection.detections import Detections
-from semfov.errors import DataError
 from semfov.fit.protocols import choose_classes
 from semfov.fit.searches import TargetSearch
 from semfov.fit.thresholds import Bounds, choose_thresholds
 from semfov.fit.training import descend
-from semfov.fit.verification import examine, fit_to_closer_looks, with_thresholds
+from semfov.fit.verification import OneKindError, examine, fit_to_closer_looks, with_thresholds
 from semfov.fit.verification_report import NO_PLACES, verification_report
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks
@@ -243,7 +242,7 @@ def fit_closer_looks(
     try:
         training = examine(islice(searches, len(searched)))
         held_out = examine(searches)
-    except DataError:
+    except OneKindError:
         return NO_PLACES
     fitted = fit_to_closer_looks(training, training.fold == 0, prior)
     in_folds = with_thresholds(fitted, [fitted], held_out, judged, limits, config.false_alarms, config.surest)

@@ -16,6 +16,8 @@ from semfov.belief.verification import Verification
 from semfov.data import Annotation, Scene
 from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
+from semfov.errors import DataError
+from semfov.fit import windows_decisions
 from semfov.fit.folder import FolderFit
 from semfov.fit.looking import Looking
 from semfov.fit.photographs import _explored, fit_photographs
@@ -230,6 +232,16 @@ def test_without_right_and_wrong_places_there_is_no_verification():
     text = fit_closer_looks(model, [], [], FitZoomConfig(passes=8))
     assert text.startswith("None, since there are no places")
     assert model.verification is None
+
+
+def test_a_picture_that_cannot_be_read_ends_the_fit_of_closer_looks(monkeypatch):
+    def damaged(searches):
+        raise DataError("photograph.jpg: truncated")
+
+    monkeypatch.setattr(windows_decisions, "examine", damaged)
+    model = GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.01)).eval()
+    with pytest.raises(DataError, match="truncated"):
+        fit_closer_looks(model, [], [], FitZoomConfig(passes=8))
 
 
 @pytest.fixture(scope="module")

@@ -160,7 +160,7 @@ def _screen(path: Path, lines: Iterable[str], size: tuple[int, int] | None) -> _
         left, top, right, bottom = map(float, frame.groups())
         # The message has the first and the last pixel.
         stated_size = (round(right - left) + 1, round(bottom - top) + 1)
-        return left, top, *(size or stated_size)
+        return left, top, *(stated_size if size is None else size)
     if size is None:
         raise DataError(f"{path}: expected a message DISPLAY_COORDS, got none; give size=")
     return 0.0, 0.0, *size

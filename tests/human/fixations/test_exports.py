@@ -219,6 +219,12 @@ def test_what_is_no_recording_is_refused(tmp_path, content, said):
     unusable(said, read_eyelink, tmp_path / "a.asc")
 
 
+def test_a_size_may_be_an_array(tmp_path):
+    (tmp_path / "a.asc").write_text(HEAD + "MSG\t1 TRIALID 1 b.jpg\nEFIX L 1 2 1 5 5 5\n")
+    (record,) = read_eyelink(tmp_path / "a.asc", size=np.array([800, 600]))
+    assert record.size == (800, 600)
+
+
 def test_other_arguments_are_refused(tmp_path):
     (tmp_path / "a.asc").write_text(HEAD + "MSG\t1 TRIALID 1\nEFIX L 1 2 1 5 5 5\n")
     unusable("expected fixations of the right eye", read_eyelink, tmp_path / "a.asc", eye="right")
