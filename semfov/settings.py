@@ -196,8 +196,8 @@ class FindSettings(LookSettings):
         min_gain: least expected gain of another look; below it the episode ends. For windows it counts new objects
             (None: 0.01), for a head cells that are newly classified right (None: 0). A photograph is looked at wholly
             by windows, whatever it is.
-        score_threshold: score from which on an object is listed; in windows its probability, or its score in the whole
-            picture (None: 0.5 there).
+        score_threshold: probability from which on an object is listed in windows (None: 0.5); without fitted models and
+            otherwise its score (None: 0.3).
         batch: number of windows that are chosen jointly and pass the detector together.
 
     Raises:
@@ -220,8 +220,8 @@ class ExploreSettings(LookSettings, StartSettings):
         min_gain: least expected gain of another look; below it the episode ends. For a fovea with the semantic map
             it counts cells that are newly classified right (None: 0.1), for a head likewise (None: 0), for windows new
             objects (None: 0.01). 0 makes all looks. A photograph is looked at wholly by windows, whatever it is.
-        score_threshold: score from which on an object is listed; in windows its probability, or its score in the whole
-            picture (None: 0.5 there).
+        score_threshold: probability from which on an object is listed in windows (None: 0.5); without fitted models and
+            otherwise its score (None: 0.3).
         policy: `people` moves a fovea as people move their gaze (`semfov.gaze.Viewer`); None as the agent does.
 
     Raises:

@@ -157,6 +157,16 @@ def test_models_of_searches_say_what_they_were_fitted_to(name):
     assert metadata["data"]
 
 
+def test_the_words_of_other_libraries_for_files_are_refused_with_ours(tmp_path):
+    model = semfov.FovealObservationModel.identity(["cup"], [0.2])
+    with pytest.raises(AttributeError, match=r"no save_pretrained; use save\(FILE.safetensors\)"):
+        model.save_pretrained(tmp_path)
+    assert not hasattr(model, "missing")
+    torch.save(model.state_dict(), tmp_path / "alpha.pt")
+    with pytest.raises(semfov.InputError, match=r"a shipped observation model .*, got .*alpha.pt; load_state_dict"):
+        semfov.FovealObservationModel.from_pretrained(tmp_path / "alpha.pt")
+
+
 def test_yolov3_tiny_searches_with_the_numbers_of_yolox_nano():
     model, other = (
         semfov.FovealObservationModel.from_pretrained(f"{name}-search") for name in ("yolov3-tiny", "yolox-nano")

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
@@ -17,6 +17,7 @@ from semfov.io.storage import checksum, read, write_file
 from semfov.version import __version__
 
 _COMMON = ("kind", "version", "metadata")  # values of every record
+_PICKLED = (".pt", ".pth", ".bin", ".ckpt")  # suffixes of what torch saves, which may run code when it is read
 _STATED = ("classes", "edges", "epsilon", "layers")  # values that are compared where a state is loaded
 _METADATA = Object({"detector": Object(others=Json()), "sensor": Object(others=Json())}, Json())
 """Metadata of a model, which people and `semfov.io.compatibility` read."""
@@ -63,6 +64,12 @@ class Pretrained(StatedModule):
         record = {"kind": self.kind, "version": __version__, **self._record(), "metadata": self.metadata}
         write_file(path, self._tensors(), record)
 
+    def __getattr__(self, name: str) -> Any:
+        """Find a part of the module; the word of other libraries for `save` is refused with ours."""
+        if name == "save_pretrained":
+            raise AttributeError(f"a {self.title} has no save_pretrained; use save(FILE.safetensors)")
+        return super().__getattr__(name)
+
     def digest(self) -> str:
         """sha256 of everything that results depend on: tensors, and the values that are needed to make the model."""
         return checksum(self._tensors(), {"kind": self.kind, **self._record()})
@@ -82,6 +89,10 @@ class Pretrained(StatedModule):
             DataError: the file is missing, damaged or of another kind.
         """
         path = Path(name_or_path)
+        if path.suffix in _PICKLED:
+            expected = f"a shipped {cls.title} by name, or a .safetensors file that save() wrote"
+            remedy = "load_state_dict(torch.load(FILE, weights_only=True)) reads states of torch"
+            raise InputError(f"name_or_path: expected {expected}, got {path}; {remedy}")
         is_name = path.suffix != ".safetensors" and len(path.parts) < 2
         if is_name:
             names = sorted(file.stem for file in cls.shipped.glob("*.safetensors"))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.detection.objects import FAINTEST, Objects, merge_looks, survivors, unlike
+from semfov.detection.objects import FAINTEST, SCORE_THRESHOLD, Objects, merge_looks, survivors, unlike
 from semfov.observation.matching import box_iou
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.lattice import Lattice
@@ -70,8 +70,8 @@ def without_parts(
     """Leave out objects of enlarged looks that lie in a more confident object of their class, or around one.
 
     In an enlarged window a detector takes parts of an object, and several objects together, for one of its class. A
-    certainty that was fitted knows that; scores do not. What a look at the whole picture shows stays, so that all
-    objects are listed that the bare detector shows.
+    certainty that was fitted knows that; scores do not. What a look at the whole picture shows with `SCORE_THRESHOLD`
+    or more, or as surely as others, stays, so that all objects are listed that the bare detector shows.
 
     Args:
         objects: the objects, most confident first (`merge`).
@@ -85,8 +85,10 @@ def without_parts(
     """
     labels = objects.labels
     at_whole = merge([look for look in looks if look.window.is_overview], target)
-    is_shown = (box_iou(objects.boxes, at_whole.boxes) >= iou) & (labels[:, None] == at_whole.labels)
-    stays = is_shown.any(-1).numpy()
+    is_same = (box_iou(objects.boxes, at_whole.boxes) >= iou) & (labels[:, None] == at_whole.labels)
+    # A part that an enlarged look is sure of is often there faintly in the whole picture, too.
+    is_sure = at_whole.scores >= objects.scores[:, None].clamp(max=SCORE_THRESHOLD)
+    stays = (is_same & is_sure).any(-1).numpy()
     overlaps = Overlaps.among(objects.boxes.float().numpy())
     better = overlaps.first
     worse = overlaps.second

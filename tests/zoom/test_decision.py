@@ -307,13 +307,15 @@ def test_parts_of_surer_objects_are_left_out_unless_the_whole_picture_shows_them
         kept = without_parts(merged, looks)
         at_whole = merge([look for look in looks if look is whole])
         boxes, labels = merged.boxes.tolist(), merged.labels.tolist()
-        shown = list(zip(at_whole.boxes.tolist(), at_whole.labels.tolist(), strict=True))
+        shown = list(zip(at_whole.boxes.tolist(), at_whole.labels.tolist(), at_whole.scores.tolist(), strict=True))
+        scores = merged.scores.tolist()
         left = []
         for worse in range(len(merged)):
             box, label = boxes[worse], labels[worse]
             rivals = [boxes[better] for better in left if labels[better] == label]
             is_part = any(shared(box, rival) >= 0.8 * min(area(box), area(rival)) for rival in rivals)
-            is_shown = any(same == label and iou(box, seen) >= 0.5 for seen, same in shown)
+            enough = min(scores[worse], 0.3)
+            is_shown = any(same == label and iou(box, seen) >= 0.5 and score >= enough for seen, same, score in shown)
             if is_shown or not is_part:
                 left.append(worse)
         assert kept.boxes.tolist() == merged.boxes[left].tolist()
