@@ -24,7 +24,15 @@ from semfov.belief.observers import Observer, Semantic
 from semfov.belief.prior import Prior
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation
-from semfov.decision import MOST_CLOSER, CandidateCells, Verifier, cell_of, conclude, confirms, decide
+from semfov.decision import (
+    MOST_CLOSER,
+    CandidateCells,
+    Verifier,
+    cell_of,
+    confirms,
+    decide,
+    decision_without_closer_looks,
+)
 from semfov.detection.detections import Detections, highest_score
 from semfov.episode import Looks, Step, StoredLooks, rollout
 from semfov.episode.stopwatch import Stopwatch
@@ -271,12 +279,14 @@ class DecisionRun(ComparedLooking):
                     steps = _search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
                     last, path = steps[-1], torch.cat([step.cell for step in steps])
                     if verifier is not None:
-                        decision = verifier.conclude()
+                        decision = verifier.finish()
                     else:
                         # If a detection at the gaze has ended the search, the target's place is the fixated cell.
                         place = int(last.cell) if judge is at_the_gaze else None
                         visited = [step.detections for step in steps]
-                        decision = conclude(int(rule(last)), last.belief, visited, grid, target, place)
+                        decision = decision_without_closer_looks(
+                            int(rule(last)), last.belief, visited, grid, target, place
+                        )
                 closely = 0 if verifier is None else len(verifier.looks)
                 records.append(
                     {

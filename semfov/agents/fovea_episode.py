@@ -309,7 +309,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
         step = self._gaze.step
         assert step is not None
         criterion = self._gaze.criterion
-        criterion.conclude(self.limits.room(self.passes) if limit in (None, "passes") else 0)
+        criterion.end_search(self.limits.room(self.passes) if limit in (None, "passes") else 0)
         usual: Ending = "cells" if bool(step.visited.all()) else "shifts"
         self.ending = criterion.ending if criterion.outcome else limit or usual
 

@@ -331,7 +331,7 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
         # The choice after the overview asks for the first, and the record at the end for the second.
         source.meanwhile = lambda: (source.blank(), self._photograph)
         self._looks: list[LookAtWindow] = []
-        self._concluded: Decision | None = None
+        self._final_decision: Decision | None = None
 
     @property
     def looks(self) -> tuple[LookAtWindow, ...]:
@@ -343,7 +343,7 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
 
     @property
     def decision(self) -> Decision | None:
-        return self.session.decisions.decision if self._concluded is None else self._concluded
+        return self.session.decisions.decision if self._final_decision is None else self._final_decision
 
     @torch.inference_mode()
     def look(self) -> LookAtWindow | None:
@@ -360,8 +360,8 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
 
     def _end(self, limit: Ending | None) -> None:
         decisions = self.session.decisions
-        self._concluded = decisions.conclude()
-        is_found = self._concluded is not None and self._concluded.outcome == "found"
+        self._final_decision = decisions.decision_if_ended_now()
+        is_found = self._final_decision is not None and self._final_decision.outcome == "found"
         if is_found or decisions.outcome:
             self.ending = decisions.ending
         else:

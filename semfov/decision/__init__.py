@@ -33,11 +33,17 @@ does (`settle`):
     at a limit               closer looks that are due   it ends as it is            as a large picture
                              are made with the passes
                              that remain; it is over
+    compared by, with        `Verifier.outcome` of       `Verifier.outcome` of       `Verifier.outcome` of
+    closer looks             `CandidateCells`            `CandidateBoxes`            `PhotographPlaces`
+    compared by, without     `decide`                    `settle`, called by         as a large picture
+    closer looks                                         `DecisionsByPresence`
     outcome, if over         found with a place, or presence, from confirm on; else absent if presence < 1/2, else
                              undecided
     outcome, if not over     found on the same terms, else undecided
     ending of the record     "decision" if it is over or found; else the limit, or "cells" / "shifts" of a fovea and
                              "windows" where none is left
+
+Candidate boxes and places are in `semfov.zoom.closer`, decisions by presence in `semfov.zoom.decision`.
 
 Without fitted models a search has no probabilities: a detection whose score is at least `confirm` is `found`
 (ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.
@@ -55,9 +61,9 @@ from semfov.decision.rule import (
     Outcome,
     cell_of,
     check_thresholds,
-    conclude,
     confirms,
     decide,
+    decision_without_closer_looks,
     detects,
     final_outcome,
     found_at_once,
@@ -85,9 +91,9 @@ __all__ = [
     "Verifier",
     "cell_of",
     "check_thresholds",
-    "conclude",
     "confirms",
     "decide",
+    "decision_without_closer_looks",
     "detects",
     "final_outcome",
     "found_at_once",

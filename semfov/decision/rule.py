@@ -148,7 +148,7 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
     return (largest_fixated >= _NEARLY * largest) & (largest_fixated >= place)
 
 
-def conclude(
+def decision_without_closer_looks(
     outcome: int,
     belief: Belief,
     looks: Sequence[Detections],
@@ -188,7 +188,7 @@ def conclude(
 
 
 def _strongest_cell(probability: Tensor, evidence: Sequence[Tensor]) -> int:
-    """Find the cell with the strongest evidence of belief and detections (`conclude`).
+    """Find the cell with the strongest evidence of belief and detections (`decision_without_closer_looks`).
 
     Args:
         probability: `(X·Y,)`, of the target in each cell.

@@ -12,7 +12,16 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers.any_of import class_meant
 from semfov.data.inputs import FRAME
 from semfov.decision.candidates import CandidatePlace
-from semfov.decision.rule import FOUND, GO_ON, CloseUp, Decision, conclude, decide, detects, gains_less
+from semfov.decision.rule import (
+    FOUND,
+    GO_ON,
+    CloseUp,
+    Decision,
+    decide,
+    decision_without_closer_looks,
+    detects,
+    gains_less,
+)
 from semfov.decision.state import DecisionState
 from semfov.decision.verifier import Verifier
 from semfov.detection.detections import Detections
@@ -34,7 +43,7 @@ class StoppingCriterion(DecisionState):
     def see(self, step: Step) -> None:
         """Take in a fixation."""
 
-    def conclude(self, room: float = math.inf) -> None:
+    def end_search(self, room: float = math.inf) -> None:
         """End the search; closer looks that are due are made while passes remain."""
 
     def look(self) -> CloseUp:
@@ -112,7 +121,9 @@ class _ByBelief(StoppingCriterion):
         looks = [detections for _, detections in self._recent]
         belief = self._step.belief
         target = class_meant(belief, self.target)
-        return conclude(self.outcome, belief, looks, self.grid, target, self._cell(self._step), self._confirm)
+        return decision_without_closer_looks(
+            self.outcome, belief, looks, self.grid, target, self._cell(self._step), self._confirm
+        )
 
     def wait(self, passed: float = FRAME) -> None:
         self._now += passed
@@ -159,7 +170,7 @@ class ByCloserLooks(StoppingCriterion):
         self.verifier = verifier
         self.criterion = verifier.criterion
         self._has_looked = False
-        self._concluded: Decision | None = None
+        self._final_decision: Decision | None = None
 
     def see(self, step: Step) -> None:
         self._has_looked = True
@@ -188,12 +199,12 @@ class ByCloserLooks(StoppingCriterion):
     def decision(self) -> Decision | None:
         if not self._has_looked:
             return None
-        # Once the search is concluded, its decision stands, though verdicts may fade.
-        return self.verifier.decision() if self._concluded is None else self._concluded
+        # Once the search has ended, its decision stands, though verdicts may fade.
+        return self.verifier.decision() if self._final_decision is None else self._final_decision
 
-    def conclude(self, room: float = math.inf) -> None:
+    def end_search(self, room: float = math.inf) -> None:
         self.outcome = self.verifier.outcome()
-        self._concluded = self.verifier.conclude(room)
+        self._final_decision = self.verifier.finish(room)
 
     def found_class(self, belief: Belief, target: int) -> int:
         decision = self.decision

@@ -214,12 +214,12 @@ class Verifier(Generic[LookType]):
         """Make the decision as it stands. As long as the search goes on, it is `found` or `undecided`."""
         return self._decision(is_over=self.candidate is None and self.is_over)
 
-    def decision_at_end(self) -> Decision:
+    def decision_if_ended_now(self) -> Decision:
         """Make the decision of a search that ends as it is, also if a closer look is due."""
         return self._decision(is_over=self.is_over)
 
-    def conclude(self, room: float = math.inf) -> Decision:
-        """End the search: make the closer looks that are still due, and decide as if no look were worth a pass.
+    def finish(self, room: float = math.inf) -> Decision:
+        """Finish the search: make the closer looks that are still due, and decide as if no look were worth a pass.
 
         Args:
             room: number of passes that remain.

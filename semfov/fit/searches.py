@@ -12,7 +12,15 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import SemanticSearch
-from semfov.decision import FOUND, MOST_CLOSER, CandidateCells, CandidatePlaces, cell_of, conclude, decide
+from semfov.decision import (
+    FOUND,
+    MOST_CLOSER,
+    CandidateCells,
+    CandidatePlaces,
+    cell_of,
+    decide,
+    decision_without_closer_looks,
+)
 from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
@@ -190,7 +198,7 @@ class _PhotographSearch(TargetSearch[Step]):
             outcome = int(decide(step, self.target, self.thresholds))
             if outcome == FOUND:
                 looks = [earlier.detections for earlier in self.steps[: index + 1]]
-                decision = conclude(outcome, step.belief, looks, self.photograph.grid, self.target)
+                decision = decision_without_closer_looks(outcome, step.belief, looks, self.photograph.grid, self.target)
                 return SearchEnd(bool(self.search.goal[decision.cell]), index + 1)
             if outcome:
                 return SearchEnd(None, index + 1)

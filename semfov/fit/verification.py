@@ -289,7 +289,7 @@ def _verify_search(search: TargetSearch[LookType], model: Verification, limits: 
         spare=search.spare,
         places=tuple((look.place, search.right(look.box)) for look in verifier.looks),
         ends=() if places.exhaustive else tuple(ends),
-        presence=verifier.conclude(room=0).probability,
+        presence=verifier.finish(room=0).probability,
         looks=looks,
         unverified=search.unverified(),
     )

@@ -171,8 +171,8 @@ class WindowDecisions(DecisionState):
             room: number of passes that remain.
         """
 
-    def conclude(self) -> Decision | None:
-        """Make the decision of a search that ends."""
+    def decision_if_ended_now(self) -> Decision | None:
+        """Make the decision of a search that ends as it is, also if a closer look is due."""
         return self.decision
 
     def look(self) -> None:
@@ -331,8 +331,8 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def decision(self) -> Decision | None:
         return self.verifier.decision() if self.looks else super().decision
 
-    def conclude(self) -> Decision | None:
-        return self.verifier.decision_at_end() if self.looks else super().decision
+    def decision_if_ended_now(self) -> Decision | None:
+        return self.verifier.decision_if_ended_now() if self.looks else super().decision
 
     def wait(self, passed: float) -> None:
         self.verifier.wait(passed)

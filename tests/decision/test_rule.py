@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid
 from semfov.agents.fovea import _goal_cells
 from semfov.belief.observers import Look, Observer, Semantic
-from semfov.decision import Decision, conclude, decide
+from semfov.decision import Decision, decide, decision_without_closer_looks
 from semfov.gaze.policies import Policy
 from semfov.observation.thresholds import Thresholds
 from tests.refusals import refused
@@ -117,8 +117,8 @@ def test_a_decision_has_no_box_where_no_detection_overlaps_the_cell():
     far = Detections(torch.tensor([[[130.0, 100, 150, 110]]]), torch.full((1, 1, 4), 0.25), torch.ones(1, 1).bool())
     masked, belief = replace(far, mask=torch.zeros(1, 1).bool()), Known(torch.zeros(1, 12), torch.ones(1), None)
     for looks, cell in (([], 0), ([Detections.empty(1, 3)], 0), ([far], 0), ([masked], 11)):
-        assert conclude(1, belief, looks, Grid(4, 3, SIZE), 1, cell).box is None
-    assert conclude(1, belief, [far], Grid(4, 3, SIZE), 1, 11).box.tolist() == [130, 100, 150, 110]
+        assert decision_without_closer_looks(1, belief, looks, Grid(4, 3, SIZE), 1, cell).box is None
+    assert decision_without_closer_looks(1, belief, [far], Grid(4, 3, SIZE), 1, 11).box.tolist() == [130, 100, 150, 110]
 
 
 class Square(Coloured):
@@ -221,16 +221,18 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
                 score = float(weight[look, detection, cell] * looks.scores[look, detection, target])
                 if score > best * (1 + 1e-6):
                     best, expected = score, looks.boxes[look, detection].tolist()
-            made = conclude(1, belief, parts, grid, target, cell)
+            made = decision_without_closer_looks(1, belief, parts, grid, target, cell)
             assert (made.cell, made.box if made.box is None else made.box.tolist()) == (cell, expected)
             value.append(float(known[0, cell]) * best)
-        decision = conclude(1, belief, parts, grid, target)
+        decision = decision_without_closer_looks(1, belief, parts, grid, target)
         assert decision.cell == value.index(max(value))
-        assert torch.equal(decision.box, conclude(1, belief, parts, grid, target, decision.cell).box)
+        assert torch.equal(
+            decision.box, decision_without_closer_looks(1, belief, parts, grid, target, decision.cell).box
+        )
     assert decision.probability == 0.75
-    assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)
+    assert decision_without_closer_looks(2, belief, parts, grid, 2) == Decision("absent", 0.75)
     # Without detections the belief alone decides.
-    made = conclude(1, belief, [Detections.empty(1, 3)], grid, 2)
+    made = decision_without_closer_looks(1, belief, [Detections.empty(1, 3)], grid, 2)
     assert made == Decision("found", 0.75, int(known.argmax()), None, float(known.max()))
 
 

@@ -89,7 +89,7 @@ def test_a_sure_closer_look_ends_the_search_with_its_place():
     assert closer.cells == []
     last = step(1, {5: 0.6}, [0, 5], 0.9, look(5))
     assert int(judge(last)) == 1
-    decision = judge.conclude()
+    decision = judge.finish()
     assert (decision.outcome, decision.cell, closer.cells) == ("found", 5, [5])
     assert decision.place == pytest.approx(0.9)
     assert decision.box.tolist() == box_of(5)
@@ -103,7 +103,7 @@ def test_between_confirm_and_sure_the_search_goes_on_and_takes_the_best_place():
     last = step(1, {5: 0.6, 7: 0.5, 2: 0.45}, [5, 7, 2], 0.9)
     assert int(judge(last)) == 1  # after two closer looks no third one is needed
     assert closer.cells == [5, 7]
-    decision = judge.conclude()
+    decision = judge.finish()
     assert (decision.cell, decision.outcome) == (7, "found")
     assert [each.place for each in judge.looks] == pytest.approx([0.75, 0.8])
     assert [each.fixation for each in judge.looks] == [0, 1]
@@ -116,7 +116,7 @@ def test_without_a_confirmed_place_the_presence_decides(presence, outcome):
     # No other cell is worth a look.
     assert int(judge(last)) > 1
     assert closer.cells == [5]
-    decision = judge.conclude()
+    decision = judge.finish()
     assert decision.outcome == outcome
     assert (decision.cell, decision.box, decision.place) == (None, None, None)
     assert decision.probability == pytest.approx(judge.looks[0].presence)
@@ -127,12 +127,12 @@ def test_what_is_probable_enough_is_examined_even_if_not_fixated():
     last = step(0, {9: 0.4, 3: 0.2}, [0], 0.6, look(9, 3))
     assert int(judge(last)) == 1
     assert closer.cells == [9]
-    assert judge.conclude().cell == 9
+    assert judge.finish().cell == 9
     judge, closer = verifier({9: 0.95}, thresholds=Thresholds(0.7, 0.5, 0.41))
     last = step(0, {9: 0.4}, [9], 0.6, look(9))
     assert int(judge(last)) > 1
     assert closer.cells == []
-    assert judge.conclude().probability == pytest.approx(0.6)
+    assert judge.finish().probability == pytest.approx(0.6)
 
 
 def test_as_many_closer_looks_as_are_allowed_are_made_also_when_the_shifts_are_spent():
@@ -140,7 +140,7 @@ def test_as_many_closer_looks_as_are_allowed_are_made_also_when_the_shifts_are_s
     last = step(0, {5: 0.5, 7: 0.4}, [5], 0.8, look(5, 7))
     assert int(judge(last)) == 0
     assert closer.cells == [5]
-    assert judge.conclude().cell == 7
+    assert judge.finish().cell == 7
     assert closer.cells == [5, 7]
     for most in (1, 2):
         judge, closer = verifier({5: 0.1, 7: 0.1, 2: 0.1}, most=most)

@@ -11,7 +11,7 @@ from torchvision.ops import box_iou
 from eval.decide.run import DecideConfig, DecisionRun, landing, overlap, quarters, sharp_place
 from semfov import DataError, Detections, DirichletBelief, FovealObservationModel, Grid, InputError
 from semfov.belief.observers import Semantic, SemanticSearch
-from semfov.decision import OUTCOMES, conclude, decide
+from semfov.decision import OUTCOMES, decide, decision_without_closer_looks
 from semfov.episode import StoredLooks, rollout
 from semfov.fit.protocols import choose_classes
 from semfov.gaze.acquisition import TargetPosterior, Uniform
@@ -140,7 +140,9 @@ def test_records_match_searches_run_step_by_step(run):
             goal = grid.footprint(annotation.boxes)[annotation.labels == target].any(0)
             if record["outcome"] == "found":
                 parts = [detections[cell : cell + 1] for cell in seen]
-                decision = conclude(ended, belief, parts, grid, target, seen[-1] if at_the_gaze else None)
+                decision = decision_without_closer_looks(
+                    ended, belief, parts, grid, target, seen[-1] if at_the_gaze else None
+                )
                 assert record["right_place"] == bool(goal[decision.cell])
                 assert record["overlap"] == overlap(decision.box, annotation.boxes[annotation.labels == target])
             else:

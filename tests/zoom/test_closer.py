@@ -161,7 +161,7 @@ def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcom
     assert [each.index for each in judge.looks] == list(range(5, 5 + count))
     assert [round(each.place, 4) for each in judge.looks] == scores
     assert [round(each.probability, 4) for each in made] == [0.9] * count
-    assert OUTCOMES[judge.outcome()] == judge.decision_at_end().outcome == outcome
+    assert OUTCOMES[judge.outcome()] == judge.decision_if_ended_now().outcome == outcome
     assert judge.presence == pytest.approx(presence)
     assert judge.best.place == pytest.approx(max(scores))
 
@@ -183,7 +183,7 @@ def test_improbable_places_are_examined_only_at_the_end():
         judge.see(look(1, chance, 0.5, ONE, OTHER), last=over)
         assert len(judge.look_closely(9)) == count
         assert judge.outcome() == (2 if count else 0)
-        assert judge.decision_at_end().outcome == ("absent" if count else "undecided")
+        assert judge.decision_if_ended_now().outcome == ("absent" if count else "undecided")
     none_left = verifier(FromScore(), [0.1, 0.1])
     none_left.see(look(24, 0.9, 0.0, ONE))
     assert none_left.look_closely(0) == []
