@@ -234,7 +234,6 @@ class DecisionsByPresence(WindowDecisions):
         self.thresholds = thresholds
         self.prior = prior
         self.criterion = f"p is {thresholds.confirm:g} and a detection shows the target"
-        self._confirm = thresholds.confirm  # what `found` takes
         self._facts = SearchFacts(belief)
         self._is_large = belief.photograph is None
         self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
@@ -269,7 +268,7 @@ class DecisionsByPresence(WindowDecisions):
             return None
         outcome = OUTCOMES[self.outcome]
         box = self._facts.box if outcome == "found" else None
-        return Decision(outcome, self.prior(self._fitted_presence()), None, box, confirm=self._confirm)
+        return Decision(outcome, self.prior(self._fitted_presence()), None, box, confirm=self.thresholds.confirm)
 
     def follow(self, motion: Motion | None) -> None:
         looks = () if motion is None or self._step is None else self._step.looks
@@ -293,14 +292,11 @@ class DecisionsByPresence(WindowDecisions):
 class DecisionsByCloserLooks(DecisionsByPresence):
     """Decisions of a search by closer looks at the places that seem to hold the target (`semfov.decision.Verifier`)."""
 
-    def __init__(
-        self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior, verifier: Verifier[SearchLook]
-    ) -> None:
-        super().__init__(belief, thresholds, prior)
+    def __init__(self, belief: ZoomBelief, prior: Prior, verifier: Verifier[SearchLook]) -> None:
+        super().__init__(belief, verifier.thresholds, prior)
         self.frame = belief.lattice.size
         self.verifier = verifier
         self.criterion = verifier.criterion
-        self._confirm = verifier.thresholds.confirm
 
     def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""
@@ -385,7 +381,7 @@ def decisions_of(
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
     thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.stop_below)
     verifier = Verifier(verification, places, close_up, thresholds_of_places, most)
-    return DecisionsByCloserLooks(belief, thresholds, prior, verifier)
+    return DecisionsByCloserLooks(belief, prior, verifier)
 
 
 def _prior_of(prior: PriorLike, photograph: PhotographEvidence | None, target: int) -> Prior:
