@@ -17,7 +17,7 @@ from semfov.sensor import named_sensor
 
 
 @dataclass(frozen=True)
-class ScoreLook(semfov.observers.Look):
+class ScoreEvidence(semfov.observers.Evidence):
     """Evidence of looks: the largest score of each class in each cell."""
 
     scores: Tensor  # (B, X·Y, K+1)
@@ -50,18 +50,18 @@ class BestScore(semfov.observers.Observer):
 
     def weigh(
         self, detections: semfov.Detections, fixation: Tensor, grid: semfov.Grid, target: int | None = None
-    ) -> ScoreLook:
+    ) -> ScoreEvidence:
         """Compute the largest score among the boxes that overlap a cell."""
         covered = grid.footprint(detections.boxes) & detections.mask[..., None]  # (B, L, X·Y)
         scores = detections.scores.new_zeros(len(fixation), len(grid), self.components)
         for box in range(covered.shape[1]):
             scores = torch.maximum(scores, covered[:, box, :, None] * detections.scores[:, box, None])
-        return ScoreLook(scores, grid.distance(fixation))
+        return ScoreEvidence(scores, grid.distance(fixation))
 
-    def update(self, belief: semfov.Belief, look: semfov.observers.Look) -> ScoreBelief:
+    def update(self, belief: semfov.Belief, look: semfov.observers.Evidence) -> ScoreBelief:
         """Return the belief after one more look."""
         assert isinstance(belief, ScoreBelief)
-        assert isinstance(look, ScoreLook)
+        assert isinstance(look, ScoreEvidence)
         return ScoreBelief(torch.maximum(belief.scores, look.scores), torch.minimum(belief.closest, look.distance))
 
 

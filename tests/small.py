@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from semfov import ActivePerception, EmbeddedScenes, Eye, FovealObservationModel, Foveation, Grid, Scanpath
 from semfov.belief import Belief, DirichletBelief, Verification
-from semfov.belief.observers import Look, Semantic
+from semfov.belief.observers import Evidence, Semantic
 from semfov.data.scene import Annotation, Scene
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze.policies import Policy
@@ -171,11 +171,11 @@ def observing() -> Semantic:
 class FixedLook(Semantic):
     """An observer that returns a given look, whatever is detected."""
 
-    def __init__(self, look: Look) -> None:
+    def __init__(self, look: Evidence) -> None:
         super().__init__(4)
         self.look = look
 
-    def weigh(self, detections, fixation, grid, target=None) -> Look:
+    def weigh(self, detections, fixation, grid, target=None) -> Evidence:
         return self.look
 
 

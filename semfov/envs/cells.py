@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.belief.belief import Belief
-from semfov.belief.observers import Look, Observer, Semantic
+from semfov.belief.observers import Evidence, Observer, Semantic
 from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes, GazeSettings, SavedGazes, scene_number
 from semfov.envs.scenery import CellEpisode, Scenery
@@ -63,7 +63,7 @@ class _SceneLooks(Looks):
         self._observer = observer
         self._scenes: dict[int, StoredLooks] = {}
         self._first_rows: dict[int, _FirstRows] = {}
-        self._evidence: Look | None = None
+        self._evidence: Evidence | None = None
         self._detections: Detections | None = None
         self._evidence_row = torch.zeros(episodes, dtype=torch.int64)
         self._detections_row = torch.zeros(episodes, dtype=torch.int64)
@@ -109,7 +109,7 @@ class _SceneLooks(Looks):
         # Most steps need no detections, so that they are read only when they are asked for.
         return EpisodeLook(evidence, lambda: self._detections_table()[rows], watch.seconds)
 
-    def _evidence_table(self) -> Look:
+    def _evidence_table(self) -> Evidence:
         """Weigh the looks of all scenes that were entered."""
         if self._evidence is None:
             tables = [looks.weighed(self._observer) for looks in self._scenes.values()]

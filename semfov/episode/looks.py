@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.belief.observers.base import Look, Observer
+from semfov.belief.observers.base import Evidence, Observer
 from semfov.data.inputs import FRAME
 from semfov.detection.detections import Detections
 from semfov.episode.stopwatch import Stopwatch
@@ -27,14 +27,14 @@ class EpisodeLook:
         seconds: time by stage.
         passed: seconds since the look before, in a stream.
 
-    >>> from semfov.belief.observers.semantic import SemanticLook
-    >>> evidence = SemanticLook(torch.ones(1, 5, 3), torch.ones(1, 5, 4), torch.zeros(1, 4))
+    >>> from semfov.belief.observers.semantic import SemanticEvidence
+    >>> evidence = SemanticEvidence(torch.ones(1, 5, 3), torch.ones(1, 5, 4), torch.zeros(1, 4))
     >>> look = EpisodeLook(evidence, lambda: None, {"detect": 0.02})
     >>> look.seconds
     {'detect': 0.02}
     """
 
-    evidence: Look
+    evidence: Evidence
     detections: Callable[[], Detections]
     seconds: dict[str, float]
     passed: float = FRAME
@@ -140,7 +140,7 @@ class StoredLooks(Looks):
         self.grid = grid
         self.targets = targets
         self.like = detections.scores
-        self._weighed: dict[Observer, Look] = {}
+        self._weighed: dict[Observer, Evidence] = {}
         self._classes = [] if targets is None else targets.unique().tolist()
 
     def of(self, episodes: Tensor | slice) -> Self:
@@ -194,7 +194,7 @@ class StoredLooks(Looks):
         classes = len(self._classes) if by_target else 1
         return len(self.grid) * classes
 
-    def weighed(self, observer: Observer) -> Look:
+    def weighed(self, observer: Observer) -> Evidence:
         """Evidence of the looks from all cells, computed on the first call.
 
         Args:

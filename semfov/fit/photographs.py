@@ -22,7 +22,7 @@ from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.certainty import Certainty
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, SearchLook, look_closely
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, TargetFacts, look_closely
 from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.slices import usual_slices
@@ -41,7 +41,7 @@ _FALSE_ALARMS = 0.007  # maximum share of absent targets that may be reported as
 _AREA = 0.2  # classes that cover a larger share of a photograph are not searched for
 
 
-class _WholeSearch(TargetSearch[SearchLook]):
+class _WholeSearch(TargetSearch[TargetFacts]):
     """A search of a photograph after the look at the whole.
 
     Attributes:
@@ -79,10 +79,10 @@ class _WholeSearch(TargetSearch[SearchLook]):
     def __len__(self) -> int:
         return 1
 
-    def look(self, index: int, number: int) -> SearchLook:
+    def look(self, index: int, number: int) -> TargetFacts:
         """Return the look at the whole, with the probability after it."""
         presence = self.evidence.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
-        return SearchLook(self.whole.candidates, number, float(presence), self.best, 0.0)
+        return TargetFacts(self.whole.candidates, number, float(presence), self.best, 0.0)
 
     def candidates(self) -> PhotographPlaces:
         return PhotographPlaces(self.target, self.source.lattice, window=self.evidence.window)

@@ -26,7 +26,7 @@ from semfov.observation.matching import box_iou
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.runs.tables import table
-from semfov.zoom.closer import CandidateBoxes, SearchLook, look_closely
+from semfov.zoom.closer import CandidateBoxes, TargetFacts, look_closely
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import GlimpseEvidence
@@ -45,7 +45,7 @@ class _Known(NamedTuple):
     hit_chance: float
 
 
-class MosaicSearch(TargetSearch[SearchLook]):
+class MosaicSearch(TargetSearch[TargetFacts]):
     """A search of a large picture, without decisions and without closer looks.
 
     Attributes:
@@ -84,10 +84,10 @@ class MosaicSearch(TargetSearch[SearchLook]):
     def __len__(self) -> int:
         return len(self.known)
 
-    def look(self, index: int, number: int) -> SearchLook:
+    def look(self, index: int, number: int) -> TargetFacts:
         after = self.known[index]
         presence = self.model.anywhere(torch.tensor(after.best), after.case).sigmoid()
-        return SearchLook(after.look.detections, number, float(presence), after.best, after.hit_chance)
+        return TargetFacts(after.look.detections, number, float(presence), after.best, after.hit_chance)
 
     def candidates(self) -> CandidateBoxes:
         assert self.model.thresholds is not None

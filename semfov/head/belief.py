@@ -9,9 +9,9 @@ from torch import Tensor
 from semfov.belief.belief import Belief, pick
 from semfov.belief.grid import Grid
 from semfov.belief.observers import SemanticMap, SemanticSearch
-from semfov.belief.observers.base import Look, Observer, farther, own
-from semfov.belief.observers.semantic_map import CellLook
-from semfov.belief.observers.semantic_search import SearchLook
+from semfov.belief.observers.base import Evidence, Observer, farther, own
+from semfov.belief.observers.semantic_map import CellEvidence
+from semfov.belief.observers.semantic_search import SearchEvidence
 from semfov.detection.detections import Detections
 from semfov.errors import InputError, check
 from semfov.head.views import Views
@@ -20,20 +20,20 @@ _CERTAIN = 1e-6  # probabilities nearer to 0 or 1 fade as this one does
 
 
 @dataclass(frozen=True)
-class _SceneLook(Look):
+class _SceneEvidence(Evidence):
     """The evidence of a look about the cells of a view; the cell `(1,)` of the view and that of the scene, `gaze`.
 
     `target` is the class 1..K that is searched for, 0 in an exploration.
     """
 
     pose: int
-    inner: SearchLook | CellLook
+    inner: SearchEvidence | CellEvidence
     cell: Tensor
     gaze: Tensor
     target: int
 
     @classmethod
-    def join(cls, looks: object) -> "_SceneLook":
+    def join(cls, looks: object) -> "_SceneEvidence":
         """Raise an error, because looks from several poses cannot be joined."""
         raise InputError("looks: expected a single look; looks of a head cannot be joined, as their poses may differ")
 
@@ -101,7 +101,7 @@ class SceneObserver(Observer):
             views={},
         )
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _SceneEvidence:
         """Weigh a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
         height = self.views.world.size[1]
         pose = int((float(fixation[0, 1]) + 0.5) // height)
@@ -111,11 +111,11 @@ class SceneObserver(Observer):
         inner = self.inner.weigh(detections, point, self.views.view_grid)
         cell = self.views.view_grid.cell_of(point)
         gaze = self.views.gaze_cell[self.views.grid.cell_of(fixation)]
-        return _SceneLook(pose, inner, cell, gaze, target or 0)
+        return _SceneEvidence(pose, inner, cell, gaze, target or 0)
 
-    def update(self, belief: Belief, look: Look) -> SceneBelief:
+    def update(self, belief: Belief, look: Evidence) -> SceneBelief:
         belief = own(belief, SceneBelief, "belief")
-        look = own(look, _SceneLook, "look")
+        look = own(look, _SceneEvidence, "look")
         views = self.views
         pose = look.pose
         values = belief.values
@@ -144,7 +144,7 @@ class SceneObserver(Observer):
         examined = belief.examined.scatter(-1, look.gaze[:, None], True)
         return SceneBelief(values, closest, owner, examined, belief.looks + 1, {**belief.views, pose: view})
 
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> SceneBelief:
+    def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> SceneBelief:
         """Discount the evidence of the looks so far; all cells return towards what is believed of an unseen one.
 
         Args:
@@ -157,7 +157,7 @@ class SceneObserver(Observer):
             The faded belief.
         """
         belief = own(belief, SceneBelief, "belief")
-        look = own(look, _SceneLook, "look")
+        look = own(look, _SceneEvidence, "look")
         if keep == 1:
             return belief
         cells = self.views.cells

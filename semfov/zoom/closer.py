@@ -70,8 +70,8 @@ def look_closely(source: WindowLooks, box: Tensor, window: tuple[float, float] =
     return source.see([closer_window(source.lattice, box, window)], hints=source.lattice.levels == 1)[0]
 
 
-class SearchLook(NamedTuple):
-    """One look of a search, and what is known of the target after it, by the prior of the fit.
+class TargetFacts(NamedTuple):
+    """What is known of the target after one look of a search, by the prior of the fit, and what the look shows.
 
     Attributes:
         detections: what may hold the target (`WindowLook.candidates`).
@@ -105,7 +105,7 @@ class _Scored(NamedTuple):
         return _Scored(*(column[first:] for column in self)) if first else self
 
 
-class CandidateBoxes(CandidatePlaces[SearchLook]):
+class CandidateBoxes(CandidatePlaces[TargetFacts]):
     r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
 
     .. math:: \operatorname{logit} p = \operatorname{logit} P + \operatorname{logit} s - \operatorname{logit} s^*
@@ -134,9 +134,9 @@ class CandidateBoxes(CandidatePlaces[SearchLook]):
         self._next = 0
         self._scored = _Scored(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).bool())
 
-    _look: SearchLook
+    _look: TargetFacts
 
-    def see(self, look: SearchLook) -> None:
+    def see(self, look: TargetFacts) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
         self._change()
         self._look = look
@@ -271,7 +271,7 @@ class PhotographPlaces(CandidateBoxes):
         self._window = window
         self._shown: dict[Window, tuple[int, Detections]] = {}  # by window, the index of the look and what it shows
 
-    def see(self, look: SearchLook) -> None:
+    def see(self, look: TargetFacts) -> None:
         """Take in a look at the whole photograph."""
         super().see(look)
         self._shown[Window.overview(self._lattice)] = look.next_index - 1, look.detections

@@ -18,7 +18,7 @@ from semfov.observation.presence import EVEN
 from semfov.observation.thresholds import Thresholds
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, SearchLook
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, TargetFacts
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.hint_maps import features
@@ -292,7 +292,7 @@ class DecisionsByPresence(WindowDecisions):
 class DecisionsByCloserLooks(DecisionsByPresence):
     """Decisions of a search by closer looks at the places that seem to hold the target (`semfov.decision.Verifier`)."""
 
-    def __init__(self, belief: ZoomBelief, prior: Prior, verifier: Verifier[SearchLook]) -> None:
+    def __init__(self, belief: ZoomBelief, prior: Prior, verifier: Verifier[TargetFacts]) -> None:
         super().__init__(belief, verifier.thresholds, prior)
         self.frame = belief.lattice.size
         self.verifier = verifier
@@ -301,7 +301,7 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""
         candidates = step.look.candidates
-        look = SearchLook(candidates, number, self._fitted_presence(), self._facts.best, self._fitted_chance)
+        look = TargetFacts(candidates, number, self._fitted_presence(), self._facts.best, self._fitted_chance)
         self.verifier.see(look, last=last)
         self._examine_shown()
 

@@ -10,7 +10,7 @@ import torch
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief.association import one_of, refuted
 from semfov.belief.observers import AnyOf, SemanticSearch
-from semfov.belief.observers.semantic_search import SearchLook
+from semfov.belief.observers.semantic_search import SearchEvidence
 from semfov.belief.prior import Prior
 from semfov.fit.through_belief import SearchedLooks, fit_through_belief, landing_loss
 from semfov.gaze.policies import Policy
@@ -155,7 +155,7 @@ def test_looks_are_joined_and_fade(looks):
     seen = Detections(looks.boxes.float(), looks.scores.float(), looks.mask)
     said = observer.weigh(seen, FIXATIONS, GRID)
     few = observer.weigh(Detections(seen.boxes[:1, :2], seen.scores[:1, :2], seen.mask[:1, :2]), FIXATIONS[:1], GRID)
-    together = SearchLook.join([few, said[1:]])
+    together = SearchEvidence.join([few, said[1:]])
     belief = observer.update(observer.start(3, GRID, seen.scores), together)
     for row, part in enumerate((few, said[1:2], said[2:])):
         alone = observer.update(observer.start(1, GRID, seen.scores), part)

@@ -7,7 +7,7 @@ from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import fusion, likelihoods
 from semfov.belief.observers import AnyOf, Semantic, SemanticSearch
 from semfov.belief.observers.any_of import class_meant
-from semfov.belief.observers.semantic import SemanticLook
+from semfov.belief.observers.semantic import SemanticEvidence
 from semfov.gaze.policies import Policy
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
@@ -117,7 +117,7 @@ def test_looks_with_different_numbers_of_detections_can_be_joined(looks, footpri
         observer.weigh(Detections.empty(1, 3), FIXATIONS[:1], GRID),
     ]
     start = observer.start(3, GRID, looks.scores)
-    together = observer.update(start, SemanticLook.join(parts))
+    together = observer.update(start, SemanticEvidence.join(parts))
     for row, part in enumerate(parts):
         alone = observer.update(start[row : row + 1], part)
         assert torch.equal(together.beta[row], alone.beta[0])
@@ -128,7 +128,7 @@ def test_a_belief_keeps_its_dtype_and_a_look_has_that_of_the_scores(looks, dtype
     observer = Semantic(4, misses=MISSES)
     look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
     for given in (torch.float32, torch.float64):
-        said = SemanticLook(look.likelihood.to(given), look.footprint, look.distance.to(given))
+        said = SemanticEvidence(look.likelihood.to(given), look.footprint, look.distance.to(given))
         for other in (torch.float32, torch.float64):
             start = observer.start(1, GRID, torch.empty(0, dtype=other))
             assert observer.update(start, said).beta.dtype == other

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from semfov import ActivePerception, Belief, Detections, DirichletBelief, Eye, Foveation, Grid
 from semfov.agents.fovea import _goal_cells
-from semfov.belief.observers import Look, Observer, Semantic
+from semfov.belief.observers import Evidence, Observer, Semantic
 from semfov.decision import Decision, decide, decision_without_closer_looks
 from semfov.gaze.policies import Policy
 from semfov.observation.thresholds import Thresholds
@@ -129,7 +129,7 @@ class Square(Coloured):
 
 
 @dataclass(frozen=True)
-class Nothing(Look):
+class Nothing(Evidence):
     """A look without information; the observer counts the looks."""
 
     count: int

@@ -11,7 +11,7 @@ from eval.chance import random_search
 from eval.comparison.looking import Candidate
 from eval.explore.episodes import run_explorations
 from semfov import Detections, FovealObservationModel, Grid, fusion, policies
-from semfov.belief.observers.semantic import SemanticLook
+from semfov.belief.observers.semantic import SemanticEvidence
 from semfov.data import Annotation
 from semfov.episode import StoredLooks
 from semfov.fit.protocols import episodes_of, explorations_of, run_episodes
@@ -56,7 +56,7 @@ def look():
     """Likelihoods of four classes for three detections from each of 25 cells."""
     torch.manual_seed(0)
     likelihood = torch.rand(25, 3, 4) ** 3
-    return SemanticLook(likelihood, torch.rand(25, 3, 25) < 0.15, torch.zeros(25, 25))
+    return SemanticEvidence(likelihood, torch.rand(25, 3, 25) < 0.15, torch.zeros(25, 25))
 
 
 GRID = Grid(5, 5, (100, 100))
@@ -227,7 +227,7 @@ def shown():
     """Likelihoods of four classes for three detections from each of 12 cells."""
     torch.manual_seed(0)
     likelihood = torch.rand(12, 3, 4) ** 3
-    return SemanticLook(likelihood, torch.rand(12, 3, 12) < 0.25, torch.zeros(12, 12))
+    return SemanticEvidence(likelihood, torch.rand(12, 3, 12) < 0.25, torch.zeros(12, 12))
 
 
 @pytest.fixture
@@ -297,7 +297,7 @@ def explore_by_loop(episode, shown, model, answers, noise, shifts):
 @pytest.mark.parametrize("shifts", [5, 14])
 def test_exploration_equals_a_scalar_reference(shown, model, shifts, batch):
     # In float64, so that the reference finds the same ties.
-    double = SemanticLook(shown.likelihood.double(), shown.footprint, shown.distance.double())
+    double = SemanticEvidence(shown.likelihood.double(), shown.footprint, shown.distance.double())
     explorer = Candidate(Strategy(FixedLook(double), policies.Policy("kl", model.double())))
     looks = StoredLooks(Detections(NO_OBJECT.boxes.double(), NO_OBJECT.scores.double(), NO_OBJECT.mask), MAP)
     episodes, noise, progress = explored(explorer, starts=5, shifts=shifts, batch=batch, looks=looks)

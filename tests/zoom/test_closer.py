@@ -20,7 +20,7 @@ from semfov.observation.thresholds import Thresholds
 from semfov.settings import FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, Certainty
-from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, SearchLook, closer_window, look_closely
+from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, TargetFacts, closer_window, look_closely
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
 from semfov.zoom.slices import ranked, raw, usual_slices
@@ -108,7 +108,7 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
         seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]),
     ]
     for number, look in enumerate(looks, 1):
-        candidates.see(SearchLook(look.detections, number, 0.9, 0.95, 0.5))
+        candidates.see(TargetFacts(look.detections, number, 0.9, 0.95, 0.5))
 
     def close_up(box):
         closely.append(look_closely(source, box).detections)
@@ -138,7 +138,7 @@ def verifier(model, scores, most=2):
 
 def look(number, presence, left, *boxes):
     """A look of a search that shows the target in some boxes with a score of 0.8."""
-    return SearchLook(seen(list(boxes), [0.8] * len(boxes)).detections, number, presence, 0.8, left)
+    return TargetFacts(seen(list(boxes), [0.8] * len(boxes)).detections, number, presence, 0.8, left)
 
 
 ONE, OTHER = [100.0, 100, 140, 140], [500.0, 500, 540, 540]
@@ -383,7 +383,7 @@ def test_a_closer_look_is_due_when_it_is_worth_a_pass():
     boxes = torch.tensor([[[10.0, 10, 30, 30], [60.0, 60, 80, 80], [120.0, 100, 140, 120]]])
     scores = torch.tensor([[[0, 0.5, 0], [0, 0.02, 0], [0, 0.001, 0]]])
     places = PhotographPlaces(1, OVER)
-    places.see(SearchLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.8, 0.5, 0.0))
+    places.see(TargetFacts(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.8, 0.5, 0.0))
 
     def odds(p):
         return math.log(p / (1 - p))
@@ -409,7 +409,7 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     scores = torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]])
     places, looked = PhotographPlaces(1, OVER), []
     whole = Detections(boxes, scores, torch.ones(1, 2).bool())
-    places.see(SearchLook(whole, 1, 0.8, 0.5, 0.0))
+    places.see(TargetFacts(whole, 1, 0.8, 0.5, 0.0))
 
     def close_up(box):
         looked.append(box)
@@ -438,7 +438,7 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
         return closely
 
     judge = Verifier(Alike(), PhotographPlaces(1, OVER, Forgetting(rate)), close_up, AT, most=9)
-    judge.see(SearchLook(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
+    judge.see(TargetFacts(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
     judge.look()
     # The second place is due in the same frame, and needs no pass; in a later one of a scene that changes it does.
     assert judge.places.is_shown(judge.candidate)
@@ -458,7 +458,7 @@ def test_a_closer_look_is_not_at_an_object_that_was_examined():
     boxes = torch.tensor([[[10.0, 10, 30, 30], [18.0, 10, 38, 30]]])  # they overlap by 0.43
     places = PhotographPlaces(1, OVER)
     whole = Detections(boxes, torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
-    places.see(SearchLook(whole, 1, 0.8, 0.5, 0.0))
+    places.see(TargetFacts(whole, 1, 0.8, 0.5, 0.0))
     one = Detections(boxes[:, :1] + 1, torch.tensor([[[0, 0.9, 0]]]), torch.ones(1, 1).bool())
     _, box = places.examine(places.due(Thresholds(1.0, 0.1), last=True), lambda box: one)
     assert torch.equal(box, one.boxes[0, 0])
@@ -640,7 +640,7 @@ def test_a_place_that_leaves_the_frame_counts_again_when_it_comes_back():
     assert judge.decision().outcome == "found"
     out = Motion.similarity(shift=(-125, 0))  # the box reaches from 100 to 140, and its middle to the left of the frame
     judge.follow(out, LATTICE.size)
-    judge.see(SearchLook(seen([OTHER], [0.0]).detections, 2, 0.1, 0.8, 0.5))
+    judge.see(TargetFacts(seen([OTHER], [0.0]).detections, 2, 0.1, 0.8, 0.5))
     assert judge.looks == []
     assert judge.decision().outcome != "found"
     assert judge.presence == pytest.approx(0.1)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.belief.observers.base import Look, Observer, own
+from semfov.belief.observers.base import Evidence, Observer, own
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_number
 from semfov.observation.thresholds import Thresholds
@@ -18,10 +18,10 @@ TargetLike = str | int | Sequence[str | int] | Mapping[str, float] | Mapping[int
 
 
 @dataclass(frozen=True)
-class _AnyLook(Look):
+class _AnyEvidence(Evidence):
     """Looks of the inner observer: one for each class, or a single one about all classes."""
 
-    inner: tuple[Look, ...]
+    inner: tuple[Evidence, ...]
 
 
 @dataclass(frozen=True)
@@ -91,27 +91,27 @@ class AnyOf(Observer):
         inner = tuple(self.observer.start(batch, grid, like) for _ in self._targets)
         return _AnyBelief(inner, self.weights, inner[0].closest)
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _AnyLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> _AnyEvidence:
         """Weigh the evidence for each class; `target` is ignored."""
-        return _AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._targets))
+        return _AnyEvidence(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._targets))
 
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> _AnyBelief:
+    def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> _AnyBelief:
         """Fade the beliefs of the inner observer."""
 
-        def faded(inner: Belief, inner_look: Look) -> Belief:
+        def faded(inner: Belief, inner_look: Evidence) -> Belief:
             return self.observer.fade(inner, inner_look, keep, visited)
 
         return self._change(belief, look, faded)
 
-    def update(self, belief: Belief, look: Look) -> _AnyBelief:
+    def update(self, belief: Belief, look: Evidence) -> _AnyBelief:
         """Update the beliefs of the inner observer."""
         return self._change(belief, look, self.observer.update)
 
-    def _change(self, belief: Belief, look: Look, change: Callable[[Belief, Look], Belief]) -> _AnyBelief:
+    def _change(self, belief: Belief, look: Evidence, change: Callable[[Belief, Evidence], Belief]) -> _AnyBelief:
         """Change the beliefs of the inner observer by its looks."""
         any_belief = own(belief, _AnyBelief, "belief")
-        any_look = own(look, _AnyLook, "look")
-        inner = tuple(change(*pair) for pair in zip(any_belief.inner, any_look.inner, strict=True))
+        any_evidence = own(look, _AnyEvidence, "look")
+        inner = tuple(change(*pair) for pair in zip(any_belief.inner, any_evidence.inner, strict=True))
         return replace(any_belief, inner=inner, closest=inner[0].closest)
 
 

@@ -22,7 +22,7 @@ _Kind = TypeVar("_Kind")
 _REACH = 1 / 6  # distance, in longer sides of the image, over which a faded look counts as farther by a factor e
 
 
-class Look:
+class Evidence:
     """Base of the evidence of a batch of looks about the cells. `Observer.weigh` returns it, `Observer.update` uses it.
 
     A subclass is a dataclass of tensors `(B, ...)`, of other looks, also in tuples, and of values that all looks share.
@@ -31,9 +31,9 @@ class Look:
     Attributes:
         by_detection: names of tensors `(B, L, D)` with a row for each detection, which are padded to be joined.
 
-    >>> from semfov.belief.observers.semantic import SemanticLook
-    >>> look = SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
-    >>> SemanticLook.join([look[:1], look]).distance.shape
+    >>> from semfov.belief.observers.semantic import SemanticEvidence
+    >>> look = SemanticEvidence(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
+    >>> SemanticEvidence.join([look[:1], look]).distance.shape
     torch.Size([3, 4])
     """
 
@@ -41,7 +41,7 @@ class Look:
 
     def __getitem__(self, index: Tensor | slice) -> Self:
         """Select looks of the batch."""
-        return with_fields(self, lambda value: value[index] if isinstance(value, Tensor | Look) else value)
+        return with_fields(self, lambda value: value[index] if isinstance(value, Tensor | Evidence) else value)
 
     @classmethod
     def join(cls, looks: Sequence[Self]) -> Self:
@@ -58,7 +58,7 @@ class Look:
             first = values[0]
             if isinstance(first, Tensor):
                 return torch.cat(list(values))
-            if isinstance(first, Look):
+            if isinstance(first, Evidence):
                 return type(first).join(values)
             if isinstance(first, tuple):
                 return tuple(joined(part) for part in zip(*values, strict=True))
@@ -116,7 +116,7 @@ class Observer(nn.Module, ABC):
         """
 
     @abstractmethod
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> Look:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> Evidence:
         """Weigh the evidence of looks about the cells.
 
         Args:
@@ -130,7 +130,7 @@ class Observer(nn.Module, ABC):
         """
 
     @abstractmethod
-    def update(self, belief: Belief, look: Look) -> Belief:
+    def update(self, belief: Belief, look: Evidence) -> Belief:
         """Update the belief with one more look in each episode.
 
         Args:
@@ -141,7 +141,7 @@ class Observer(nn.Module, ABC):
             The new belief.
         """
 
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
+    def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> Belief:
         r"""Discount the evidence of past looks before the next look at a changing scene.
 
         .. math:: e \leftarrow e_0 + k \, (e - e_0)

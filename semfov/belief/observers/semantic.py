@@ -10,7 +10,7 @@ from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.fusion import RULES, fuse_scaled, scale_covering
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, likelihoods
-from semfov.belief.observers.base import Look, Observer, farther, own
+from semfov.belief.observers.base import Evidence, Observer, farther, own
 from semfov.detection.detections import Detections
 from semfov.errors import check, lookup
 from semfov.observation.foveal import FovealObservationModel
@@ -19,7 +19,7 @@ CellMemory = Literal["all", "closest"]
 
 
 @dataclass(frozen=True)
-class SemanticLook(Look):
+class SemanticEvidence(Evidence):
     """Likelihoods of a batch of looks.
 
     Attributes:
@@ -101,15 +101,17 @@ class Semantic(Observer):
         """Begin with the prior in every cell."""
         return DirichletBelief(like.new_full((batch, len(grid), self.components), self.prior))
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SemanticLook:
+    def weigh(
+        self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None
+    ) -> SemanticEvidence:
         """Compute the likelihoods of the detections (`likelihoods`), the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.observation, tempering=self.tempering)
         cells = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
-        return SemanticLook(scale_covering(likelihood, cells), cells, grid.distance(fixation).to(likelihood))
+        return SemanticEvidence(scale_covering(likelihood, cells), cells, grid.distance(fixation).to(likelihood))
 
-    def update(self, belief: Belief, look: Look) -> DirichletBelief:
+    def update(self, belief: Belief, look: Evidence) -> DirichletBelief:
         """Fuse one more look in each episode."""
-        semantic = own(look, SemanticLook, "look")
+        semantic = own(look, SemanticEvidence, "look")
         old = dirichlet_belief(belief)
         nearest = torch.minimum(old.closest, semantic.distance)
         if self.memory == "all":
@@ -119,7 +121,7 @@ class Semantic(Observer):
         is_closer = (semantic.distance < old.closest)[..., None]
         return replace(old, beta=torch.where(is_closer, fused, old.beta), closest=nearest)
 
-    def _fuse(self, before: Tensor, look: SemanticLook) -> Tensor:
+    def _fuse(self, before: Tensor, look: SemanticEvidence) -> Tensor:
         """Fuse the detections one after another, and misses in cells without any.
 
         Args:
@@ -136,7 +138,7 @@ class Semantic(Observer):
         missed = RULES[self.fusion](fused, self.misses.miss_likelihood(look.distance).to(before.dtype))
         return torch.where(empty[..., None], missed, fused)
 
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
+    def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> DirichletBelief:
         r"""Move the Dirichlet parameters towards the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
 
         The closest look counts as one from farther away.

@@ -9,7 +9,7 @@ from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.fusion import RULES
 from semfov.belief.grid import Grid
 from semfov.belief.likelihood import likelihoods
-from semfov.belief.observers.base import Look, Observer, farther, own
+from semfov.belief.observers.base import Evidence, Observer, farther, own
 from semfov.detection.detections import Detections
 from semfov.observation.foveal import FovealObservationModel
 
@@ -18,7 +18,7 @@ _WEAK = 1e-5  # ε, the Dirichlet parameter of a prior that one look outweighs
 
 
 @dataclass(frozen=True)
-class CellLook(Look):
+class CellEvidence(Evidence):
     """What looks say about whole cells.
 
     Attributes:
@@ -69,18 +69,18 @@ class SemanticMap(Observer):
         """Begin with the same small parameter for every class in every cell."""
         return DirichletBelief(like.new_full((batch, len(grid), self.components), _WEAK))
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> CellLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> CellEvidence:
         """Sum what the detections in each cell say, the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.model)
         ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
         covered = grid.footprint(detections.boxes) * detections.mask[..., None]
-        return CellLook(covered.to(ratio).mT @ ratio, grid.distance(fixation).to(ratio))
+        return CellEvidence(covered.to(ratio).mT @ ratio, grid.distance(fixation).to(ratio))
 
     def log_likelihood(self, ratio: Tensor) -> Tensor:
         """Compute the logarithm of the likelihood of every class in a cell.
 
         Args:
-            ratio: `(..., K+1)`, sums of its detections (`CellLook`).
+            ratio: `(..., K+1)`, sums of its detections (`CellEvidence`).
 
         Returns:
             `(..., K+1)`, ln λ; differentiable in the numbers of the model.
@@ -101,10 +101,10 @@ class SemanticMap(Observer):
         """
         return self.log_likelihood(like.new_zeros(self.components)).softmax(-1)
 
-    def update(self, belief: Belief, look: Look) -> DirichletBelief:
+    def update(self, belief: Belief, look: Evidence) -> DirichletBelief:
         """Take the likelihood of cells to which the look is closer than all before."""
         old = dirichlet_belief(belief)
-        cells = own(look, CellLook, "look")
+        cells = own(look, CellEvidence, "look")
         prior = torch.full_like(old.beta, _WEAK)
         fused = RULES["kaplan"](prior, self.log_likelihood(cells.ratio.to(prior)).softmax(-1))
         is_closer = (cells.distance < old.closest)[..., None]
@@ -114,7 +114,7 @@ class SemanticMap(Observer):
             closest=torch.minimum(cells.distance, old.closest),
         )
 
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
+    def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> DirichletBelief:
         r"""Move the Dirichlet parameters towards the prior, and the closest looks away.
 
         .. math:: \beta \leftarrow \beta_0 + k (\beta - \beta_0)

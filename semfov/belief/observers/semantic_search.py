@@ -11,7 +11,7 @@ from semfov.belief.belief import Belief, DirichletBelief, pick
 from semfov.belief.fusion import RULES
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import likelihoods
-from semfov.belief.observers.base import Look, Observer, farther, own
+from semfov.belief.observers.base import Evidence, Observer, farther, own
 from semfov.belief.prior import Prior, PriorLike, with_prior
 from semfov.detection.detections import Detections, highest_score
 from semfov.errors import check
@@ -24,7 +24,7 @@ _WEAK = 1e-5  # ε, the Dirichlet parameter of a prior that one look outweighs
 
 
 @dataclass(frozen=True)
-class SearchLook(Look):
+class SearchEvidence(Evidence):
     """Likelihoods of a batch of looks, of which one detection may show the object of a cell.
 
     Attributes:
@@ -200,7 +200,7 @@ class SemanticSearch(Observer):
             prior=self.prior,
         )
 
-    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SearchLook:
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SearchEvidence:
         """Compute the likelihoods of the detections, relative to background, the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.model)
         ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
@@ -209,7 +209,7 @@ class SemanticSearch(Observer):
         if self.footprint != "overlap":
             weight = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
         highest = highest_score(detections, torch.arange(self.components)).to(ratio)
-        return SearchLook(
+        return SearchEvidence(
             ratio,
             weight,
             covered,
@@ -233,10 +233,10 @@ class SemanticSearch(Observer):
             return probability
         return self.model.presence.of_cells(probability, self.footprint)
 
-    def update(self, belief: Belief, look: Look) -> SearchBelief:
+    def update(self, belief: Belief, look: Evidence) -> SearchBelief:
         """Fuse a look in each episode: given the looks alone, and for the next fixation."""
         old = own(belief, SearchBelief, "belief")
-        seen = own(look, SearchLook, "look")
+        seen = own(look, SearchEvidence, "look")
         visited = old.visited.scatter(1, seen.fixated[:, None], True)
         weight = seen.weight.to(old.beta)
         share = self.model.refutation.clamp(0, 1).to(old.beta)
@@ -255,7 +255,7 @@ class SemanticSearch(Observer):
             calibration=self.model.presence,
         )
 
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> SearchBelief:
+    def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> SearchBelief:
         r"""Move the Dirichlet parameters towards the prior, and the closest looks away.
 
         .. math:: \beta \leftarrow \beta_0 + k (\beta - \beta_0)
@@ -274,7 +274,7 @@ class SemanticSearch(Observer):
         )
 
 
-def _fusion(look: SearchLook, weight: Tensor, odds: Tensor) -> Tensor:
+def _fusion(look: SearchEvidence, weight: Tensor, odds: Tensor) -> Tensor:
     """Fuse the prior with a look, in which all detections and a miss are alternatives.
 
     Args:
