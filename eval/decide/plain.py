@@ -9,11 +9,11 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.verification import closer_features
-from semfov.decision import SAME, cell_of
+from semfov.decision import cell_of
 from semfov.detection.detections import Detections
 from semfov.eye import Eye
 from semfov.fit.logistic import logistic_regression
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.runs.results import ResultRecord
 
 PLAIN = {
@@ -39,7 +39,7 @@ def plain_looks(
         score, box = float(scores[place]), boxes[place]
         facts, found = closer_features(score, score, score, eye.close_up(image, box), box, target)
         looks.append({"facts": facts[2:].tolist(), "right": bool(goal[cell_of(found, grid)])})
-        scores = scores.masked_fill(box_iou(boxes, torch.stack([box, found])).amax(-1) >= SAME, 0)
+        scores = scores.masked_fill(box_iou(boxes, torch.stack([box, found])).amax(-1) >= SAME_OBJECT_IOU, 0)
     return looks
 
 

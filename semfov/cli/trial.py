@@ -13,11 +13,10 @@ from semfov.detection import Candidates, Detector, Objects, score_vectors
 from semfov.detection.objects import SCORE_THRESHOLD, box_text
 from semfov.detection.onnx import OnnxDetector
 from semfov.detection.selection import suppress
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import Window
 
-_SAME = 0.5  # overlap from which on a box that is listed is one that the bare detector shows
 _MORE = 1.25  # factor of the sum of scores from which on the other order of the channels suits a detector better
 _FEW = 16  # number of different scores up to which an export has lost them
 _ENOUGH = 100  # number of scores from which on they must differ
@@ -114,7 +113,7 @@ def _rows(bare: Trial, objects: Objects, classes: tuple[str, ...]) -> list[list[
     for number, (box, score, label) in enumerate(zip(bare.boxes, bare.scores, bare.labels, strict=True)):
         best = int(overlap[number].argmax()) if len(objects) else 0
         listed_score = "-"
-        is_same = best in unmatched and float(overlap[number, best]) >= _SAME
+        is_same = best in unmatched and float(overlap[number, best]) >= SAME_OBJECT_IOU
         if is_same:
             unmatched.remove(best)
             listed_score = f"{objects.scores[best]:.2f}"

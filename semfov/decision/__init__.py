@@ -49,7 +49,7 @@ Without fitted models a search has no probabilities: a detection whose score is 
 (ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.
 """
 
-from semfov.decision.candidates import SAME, CandidateCells, CandidatePlace, CandidatePlaces
+from semfov.decision.candidates import CandidateCells, CandidatePlace, CandidatePlaces
 from semfov.decision.rule import (
     ABSENT,
     FOUND,
@@ -80,7 +80,6 @@ __all__ = [
     "GO_ON",
     "MOST_CLOSER",
     "OUTCOMES",
-    "SAME",
     "UNDECIDED",
     "CandidateCells",
     "CandidatePlace",

@@ -17,10 +17,9 @@ from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.motion import Motion
-from semfov.observation.matching import box_iou, inside_frame
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
 
-SAME = 0.5  # boxes with at least this overlap (intersection over union) are of the same object
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
 _MOST_LOOKS = 1000  # largest number of looks at a stream whose detections are kept
 LookType = TypeVar("LookType")  # a look of a search, with what is known after it
@@ -230,7 +229,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
     def _are_examined(self, boxes: Tensor) -> Tensor:
         """Tell which of boxes `(N, 4)` are of places that were examined, `(N,)` boolean."""
         examined = torch.cat([boxes.new_zeros(0, 4), *(place.boxes for place in self._examined)])
-        return (box_iou(boxes, examined) >= SAME).any(-1)
+        return (box_iou(boxes, examined) >= SAME_OBJECT_IOU).any(-1)
 
     @abstractmethod
     def probability(self, look: CloseUp) -> float:

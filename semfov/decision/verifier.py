@@ -10,12 +10,12 @@ from torch import Tensor
 
 from semfov.belief.verification import Verification, follow_target
 from semfov.data.inputs import FRAME
-from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces, LookAt, LookType
+from semfov.decision.candidates import CandidatePlace, CandidatePlaces, LookAt, LookType
 from semfov.decision.rule import FOUND, GO_ON, OUTCOMES, CloseUp, Decision, final_outcome, found_at_once
 from semfov.episode import Step
 from semfov.errors import check, check_whole
 from semfov.motion import Motion
-from semfov.observation.matching import box_iou, inside_frame
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
 
 MOST_CLOSER = 2
@@ -301,7 +301,7 @@ class Verifier(Generic[LookType]):
             return False
         in_its_cell = verdict.look.cell == look.cell
         overlap = box_iou(verdict.look.box[None], look.box[None])
-        return in_its_cell or float(overlap) >= SAME
+        return in_its_cell or float(overlap) >= SAME_OBJECT_IOU
 
     def _place(self, verdict: _Verdict) -> float:
         """Probability that the target is still at the place of a closer look."""

@@ -11,7 +11,7 @@ from semfov.data.scene import Annotation, Scenes
 from semfov.errors import DataError
 from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.ranges import Range, Seed, Side, Whole
-from semfov.observation.matching import SAME_OBJECT, box_iou
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, make_scenes
@@ -104,5 +104,7 @@ def found_in(looks: Sequence[WindowLook], annotation: Annotation, target: int | 
         `(M,)` boolean.
     """
     objects = merge(looks, target, score=DETECTION_SCORE)
-    hits = (box_iou(objects.boxes, annotation.boxes) >= SAME_OBJECT) & (objects.labels[:, None] == annotation.labels)
+    hits = (box_iou(objects.boxes, annotation.boxes) >= SAME_OBJECT_IOU) & (
+        objects.labels[:, None] == annotation.labels
+    )
     return hits.any(0)

@@ -10,7 +10,6 @@ from torch.nn import functional as F
 
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
-from semfov.decision import SAME
 from semfov.detection.detections import Detections
 from semfov.fit.protocols import choose_classes
 from semfov.fit.searches import TargetSearch
@@ -22,7 +21,7 @@ from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
 from semfov.runs.tables import table
@@ -98,7 +97,7 @@ class MosaicSearch(TargetSearch[TargetFacts]):
 
     def right(self, box: Tensor) -> bool:
         """Tell whether a box `(4,)` is that of an annotated object of the class."""
-        return self.present and float(box_iou(box[None], self.objects).max()) >= SAME
+        return self.present and float(box_iou(box[None], self.objects).max()) >= SAME_OBJECT_IOU
 
 
 @torch.inference_mode()

@@ -8,7 +8,7 @@ from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.errors import check_shape
 
-SAME_OBJECT = 0.5
+SAME_OBJECT_IOU = 0.5
 """Overlap (IoU) from which on boxes are of the same object, and share of a box in a crowd from which on it is of it."""
 
 
@@ -93,9 +93,9 @@ def right_boxes(objects: Objects, annotation: Annotation) -> Tensor:
         single = annotation.boxes[is_label & ~annotation.crowd]
         crowds = annotation.boxes[is_label & annotation.crowd]
         of_one_class = torch.ones(len(single)).long()
-        hits = (match(boxes, single.to(boxes), of_one_class, iou=SAME_OBJECT) > 0).long()
+        hits = (match(boxes, single.to(boxes), of_one_class, iou=SAME_OBJECT_IOU) > 0).long()
         if len(crowds):
-            in_crowd = (_share_inside(boxes, crowds) >= SAME_OBJECT).any(-1)
+            in_crowd = (_share_inside(boxes, crowds) >= SAME_OBJECT_IOU).any(-1)
             hits[in_crowd & (hits == 0)] = -1
         verdicts[numbers] = hits
     return verdicts

@@ -14,12 +14,12 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.belief.prior import Prior, check_share
 from semfov.data.classes import known_class
-from semfov.decision import SAME, CloseUp, Decision
+from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import NO_TRACK, SCORE_THRESHOLD, Objects
 from semfov.errors import InputError, check, check_whole
 from semfov.kinds import LookKind
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
 from semfov.paths.merging import distances_to, merge_fixations
@@ -394,7 +394,7 @@ class _Listing:
             return None
         overlap = box_iou(self.boxes, box)[:, 0].masked_fill(self.labels != label, 0)
         row = overlap.argmax()[None]
-        return row if bool(overlap[row] >= SAME) else None
+        return row if bool(overlap[row] >= SAME_OBJECT_IOU) else None
 
     def _append(self, box: Tensor, probability: Tensor, place: _ConfirmedPlace) -> Tensor:
         """Add a place that no candidate has, and return its row `(1,)`."""

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from semfov.belief.prior import Prior
 from semfov.data.inputs import FRAME
-from semfov.decision import SAME, CandidatePlace, CandidatePlaces, CloseUp
+from semfov.decision import CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.motion import Motion
-from semfov.observation.matching import box_iou, inside_frame
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
 from semfov.sensor.glimpse import window_around
 from semfov.zoom.hints import DETECTION_SCORE
@@ -226,7 +226,7 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         boxes, scores = self._scored_boxes
         if not len(scores):
             return self._chance(0.0)
-        overlaps = box_iou(boxes, look.box[None])[:, 0] >= SAME
+        overlaps = box_iou(boxes, look.box[None])[:, 0] >= SAME_OBJECT_IOU
         return self._chance(float((scores * overlaps).max()))
 
     @cached_property

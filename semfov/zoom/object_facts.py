@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.detection.objects import intersection, neighbours
+from semfov.observation.matching import SAME_OBJECT_IOU
 from semfov.zoom.certainty import FACTS
-
-SAME = 0.5  # intersection over union from which on two boxes are the same object
 
 _PART = 0.8  # share of the area of a cut box from which on it shows the object that it lies in
 _LEAST = 0.01  # scores below, and above the next one, count as these
@@ -161,7 +160,7 @@ def object_facts(
     of_object = object_of[first]  # the object of the first box of each pair, or -1
     same_class = labels[first] == labels[second]
     alike = (of_object >= 0) & same_class
-    same = alike & (iou >= SAME)
+    same = alike & (iou >= SAME_OBJECT_IOU)
     part = alike & cut[second] & (overlaps.share_of(second) >= _PART) & (looks[first] != looks[second])
     shows = same | part
 

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, SCORE_THRESHOLD, Objects, merge_looks, survivors, unlike
-from semfov.observation.matching import box_iou
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import WindowLook
-from semfov.zoom.object_facts import SAME, DetectedBoxes, Overlaps, object_facts, object_of_box
+from semfov.zoom.object_facts import DetectedBoxes, Overlaps, object_facts, object_of_box
 
 _INSIDE = 0.5
 """Share of the area of a cut box from which on it is the same object as a box of another look that it lies in."""
@@ -163,7 +163,7 @@ def _fused(index: Tensor, detected: DetectedBoxes) -> Tensor:
     object_of = object_of_box(chosen, len(detected.boxes))
     is_of_object = object_of[first] >= 0
     are_whole = is_whole[first] & is_whole[second]
-    are_alike = (labels[first] == labels[second]) & (overlaps.shared >= SAME * overlaps.union)
+    are_alike = (labels[first] == labels[second]) & (overlaps.shared >= SAME_OBJECT_IOU * overlaps.union)
     counts = is_of_object & are_whole & are_alike
     objects = object_of[first[counts]]
     others = second[counts]
