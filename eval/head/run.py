@@ -26,7 +26,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.closer import CloserLooks
 from semfov.head.episode import Detect, HeadStep, live, look_around
-from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, ExploreGain, LookGain, PerSecond, SearchGain
+from semfov.head.gain import FORESIGHT, UNSEEN, UNSEEN_CHANCE, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.panoramas import Panoramas
 from semfov.head.scenes import Flat, Panorama, World
 from semfov.head.speeds import Speeds
@@ -91,7 +91,7 @@ class HeadConfig(WorkConfig):
     speeds: Speeds = field(default_factory=Speeds)
     dwell: Count = 2
     foresight: Weight = FORESIGHT
-    prior: Share = PRIOR
+    prior: Share = UNSEEN_CHANCE
     unseen: Weight = UNSEEN
     seed: Seed = 0
     out: Path = Path("runs/head")
@@ -207,7 +207,7 @@ class HeadRun(SceneRun):
         config, records = self.config, list[ResultRecord]()
         places, labels = self.places(index), self.scenes.annotation(index).labels
         gain = SearchGain(views, config.foresight)
-        observer = SceneObserver(SemanticSearch(self.searching, footprint="overlap"), views, prior=config.prior)
+        observer = SceneObserver(SemanticSearch(self.searching, footprint="overlap"), views, unseen_chance=config.prior)
         for target in self.targets(index):
             target_places, start = places[labels == target], self.start(index, views, target)
             if bool(_rests_on(views, start, target_places).any()):

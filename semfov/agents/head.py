@@ -20,7 +20,7 @@ from semfov.head.belief import SceneObserver
 from semfov.head.camera import SceneLike, open_scene
 from semfov.head.closer import CloserLooks
 from semfov.head.episode import HeadStep, live, look_around
-from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, LookGain, PerSecond, SearchGain
+from semfov.head.gain import FORESIGHT, UNSEEN_CHANCE, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
 from semfov.io.compatibility import searching_for, trained_for
 from semfov.io.pretrained import shipped_model
@@ -109,7 +109,7 @@ class HeadAgent(nn.Module):
         settings: SearchSettings | None = None,
         *,
         foresight: float = FORESIGHT,
-        chance: float = PRIOR,
+        chance: float = UNSEEN_CHANCE,
         color: Color = "rgb",
     ) -> HeadPath:
         """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerSecond`).
@@ -147,7 +147,7 @@ class HeadAgent(nn.Module):
         inner = SemanticSearch(model, footprint="overlap").with_prior(settings.prior, index)
         never_seen = inner.prior(chance)
         gain = SearchGain(views, foresight)
-        observer = SceneObserver(inner, views, prior=never_seen)
+        observer = SceneObserver(inner, views, unseen_chance=never_seen)
         confirm = _CONFIRM if settings.confirm is None else settings.confirm
         stop_below = never_seen if settings.stop_below is None else settings.stop_below
         thresholds = Thresholds(confirm, stop_below, place=confirm)

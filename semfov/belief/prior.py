@@ -111,7 +111,7 @@ class Prior:
             return torch.where(is_certain, presence, with_prior(log_odds, self.share, self.fitted).sigmoid())
         return _changed(self, presence)
 
-    def place(self, place: _Odds, presence: _Odds) -> _Odds:
+    def at_place(self, place: _Odds, presence: _Odds) -> _Odds:
         r"""Change the probability of a place, whose share of that of the picture stays.
 
         .. math:: P'(\text{place}) = P(\text{place}) \frac{P'}{P}

@@ -169,7 +169,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         fitted = self.prior.inverse
         features, box = closer_features(
             fitted(self.presence),
-            fitted.place(candidate.probability, self.presence),
+            fitted.at_place(candidate.probability, self.presence),
             candidate.evidence,
             self.look_at(candidate, close_up),
             candidate.box,

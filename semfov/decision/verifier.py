@@ -169,7 +169,7 @@ class Verifier(Generic[LookType]):
         with torch.no_grad():
             fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
         prior = self.places.prior
-        look = self.places.record(box, prior.place(fitted_place, fitted_presence), prior(fitted_presence))
+        look = self.places.record(box, prior.at_place(fitted_place, fitted_presence), prior(fitted_presence))
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [verdict for verdict in self.verdicts if not self._is_replaced(verdict, look)]
         self.verdicts.append(_Verdict(look))

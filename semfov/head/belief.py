@@ -79,12 +79,15 @@ class SceneObserver(Observer):
 
     by_target = True
 
-    def __init__(self, inner: SemanticSearch | SemanticMap, views: Views, *, prior: float | None = None) -> None:
+    def __init__(
+        self, inner: SemanticSearch | SemanticMap, views: Views, *, unseen_chance: float | None = None
+    ) -> None:
         super().__init__()
-        check(prior is None or 0 < prior < 1, "prior", "a probability between 0 and 1", prior)
+        is_chance = unseen_chance is None or 0 < unseen_chance < 1
+        check(is_chance, "unseen_chance", "a probability between 0 and 1", unseen_chance)
         self.inner = inner
         self.views = views
-        self.prior = prior
+        self.unseen_chance = unseen_chance
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> SceneBelief:
         """Make the belief before the first look; `grid` is the strip of all views."""
@@ -192,7 +195,7 @@ class SceneObserver(Observer):
         """Compute the values `(1, S, C)` of cells that were never seen."""
         if not self._searches:
             return self.inner.unseen(like).expand_as(like).clone()
-        probability = self.inner.unseen(like)[target] if self.prior is None else self.prior
+        probability = self.inner.unseen(like)[target] if self.unseen_chance is None else self.unseen_chance
         return torch.full_like(like, float(probability))
 
 

@@ -20,7 +20,7 @@ from semfov.head.views import Views
 FORESIGHT = 0.5  # weight of the gain in sharpness over the cells of a view (`SearchGain`)
 
 
-PRIOR = 0.03  # prior probability that a cell that was never seen holds the target of a search
+UNSEEN_CHANCE = 0.03  # prior probability that a cell that was never seen holds the target of a search
 UNSEEN = 1.0  # expected fraction of cells that an exploration classifies correctly when it first fixates them
 OUT = -1e6  # value of actions that must not be chosen
 

@@ -29,13 +29,13 @@ from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.survey import STEPS
-from semfov.zoom.window_sums import CellBox, Cells, Place, WindowSums, extent
+from semfov.zoom.window_sums import CellBox, Cells, CellSlices, WindowSums, extent
 
 _CLEAR = 0.1  # expected number of objects from which on a cell clearly promises one
 
-_EVERYWHERE: Place = (slice(None), slice(None))
+_EVERYWHERE: CellSlices = (slice(None), slice(None))
 
-_CellQuantity = Callable[[int, Place], Cells]
+_CellQuantity = Callable[[int, CellSlices], Cells]
 """Gives a number for each cell by level, in some rows and columns."""
 
 
@@ -220,22 +220,22 @@ class ZoomBelief:
         clear = float(expected[expected >= _CLEAR].sum())
         return clear, float(expected.sum()) - clear
 
-    def expected(self, level: int, place: Place = _EVERYWHERE) -> Cells:
+    def expected(self, level: int, slices: CellSlices = _EVERYWHERE) -> Cells:
         """Compute how many objects looks of a level are expected to find, :math:`n_k(x)`.
 
         Args:
             level: k.
-            place: rows and columns of the cells.
+            slices: rows and columns of the cells.
 
         Returns:
             The number of objects in each of these cells.
         """
         self._predict()
-        return self._rate[level, *place] * self.unexplored.numpy()[place]
+        return self._rate[level, *slices] * self.unexplored.numpy()[slices]
 
-    def _expected_closer(self, level: int, place: Place) -> Cells:
+    def _expected_closer(self, level: int, slices: CellSlices) -> Cells:
         """Compute what looks one level closer are expected to find, in cells that no look of this level has shown."""
-        return self.expected(level + 1, place) * (self.closest_level.numpy()[place] < level)
+        return self.expected(level + 1, slices) * (self.closest_level.numpy()[slices] < level)
 
     def value(self, level: int, foresight: float) -> Cells:
         """Value the windows of a level for finding objects (`semfov.zoom.policy.best_find`).

@@ -154,7 +154,7 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     @property
     def hit_chance(self) -> float:
         """Chance that the best window that was not looked at shows the target."""
-        return self.prior.place(self._look.hit_chance, self._look.presence)
+        return self.prior.at_place(self._look.hit_chance, self._look.presence)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Take the most evident box, if it is as likely as what is found, or at the end probable enough."""
@@ -246,7 +246,7 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         logits = torch.tensor([presence, score, self._look.best]).logit(_SMALLEST)
         of_picture, of_score, of_best_score = logits
         chance = float((of_picture + of_score - of_best_score).sigmoid())
-        return self.prior.place(chance, presence)
+        return self.prior.at_place(chance, presence)
 
 
 class PhotographPlaces(CandidateBoxes):

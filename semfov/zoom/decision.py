@@ -286,7 +286,7 @@ class DecisionsByPresence(WindowDecisions):
         """Chance that the best remaining window shows the target."""
         if self.prior.changes_nothing:
             return self._fitted_chance  # without the presence, which takes time
-        return self.prior.place(self._fitted_chance, self._fitted_presence())
+        return self.prior.at_place(self._fitted_chance, self._fitted_presence())
 
 
 class DecisionsByCloserLooks(DecisionsByPresence):

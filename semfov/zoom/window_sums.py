@@ -18,8 +18,8 @@ Cells = NDArray[np.float32]
 CellBox = tuple[int, int, int, int]
 """Cells `(x1, y1, x2, y2)`: the first column and row, and those after the last."""
 
-Place = tuple[slice, slice]
-"""Rows and columns of an array."""
+CellSlices = tuple[slice, slice]
+"""Rows and columns of cells, as slices of an array."""
 
 
 def extent(marked: NDArray[np.bool_]) -> CellBox:
@@ -64,7 +64,7 @@ class WindowSums:
         changed: cells that may have changed since the sums were computed; None for none.
     """
 
-    def __init__(self, weight: Cells, shape: tuple[int, int], read_cells: Callable[[Place], Cells]) -> None:
+    def __init__(self, weight: Cells, shape: tuple[int, int], read_cells: Callable[[CellSlices], Cells]) -> None:
         """Prepare the sums; nothing is summed yet.
 
         Args:

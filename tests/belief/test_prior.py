@@ -43,12 +43,12 @@ def test_a_place_keeps_its_share_of_the_picture(place, presence, fitted, share):
     prior = Prior(share, fitted)
     assert prior(presence) == pytest.approx(bayes((presence / fitted, (1 - presence) / (1 - fitted)), share), abs=1e-9)
     whole = max(place, presence)
-    assert prior.place(place, presence) == pytest.approx(place / whole * prior(whole))
-    assert prior.place(place, presence) <= prior(whole) + 1e-12
+    assert prior.at_place(place, presence) == pytest.approx(place / whole * prior(whole))
+    assert prior.at_place(place, presence) <= prior(whole) + 1e-12
     exact = torch.tensor([place, presence], dtype=torch.float64)
-    assert prior.place(place, presence) == float(prior.place(exact[0], exact[1]))
+    assert prior.at_place(place, presence) == float(prior.at_place(exact[0], exact[1]))
     assert prior.inverse(prior(presence)) == pytest.approx(presence, rel=1e-6)
-    assert prior.inverse.place(prior.place(place, whole), prior(whole)) == pytest.approx(place, rel=1e-6)
+    assert prior.inverse.at_place(prior.at_place(place, whole), prior(whole)) == pytest.approx(place, rel=1e-6)
 
 
 def test_the_share_of_the_fit_changes_nothing_and_without_one_half_is_assumed():
@@ -57,7 +57,7 @@ def test_the_share_of_the_fit_changes_nothing_and_without_one_half_is_assumed():
     fitted = Prior.of("fit", 0.75)
     for prior in (Prior(), Prior(0.3, 0.3), fitted, *unknown):
         assert prior(chances) is chances
-        assert prior.place(chances, chances) is chances
+        assert prior.at_place(chances, chances) is chances
     assert (fitted.assumed, [prior.assumed for prior in unknown]) == (0.75, [None, None])
     assert Prior.of(0.2, 0.75) == Prior.of(0.2, 0.75, 0.3) == Prior(0.2, 0.75)
     assert Prior.of("fit", 0.5, 0.3) == Prior(0.3, 0.5)
@@ -68,7 +68,7 @@ def test_the_share_of_the_fit_changes_nothing_and_without_one_half_is_assumed():
 
 def test_certain_probabilities_stay():
     prior = Prior(0.1, 0.7)
-    assert [prior(0.0), prior(1.0), prior.place(0.0, 0.0)] == [0.0, 1.0, 0.0]
+    assert [prior(0.0), prior(1.0), prior.at_place(0.0, 0.0)] == [0.0, 1.0, 0.0]
 
 
 def test_bad_input():

@@ -99,7 +99,9 @@ def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
 
 def test_cells_that_were_never_seen_have_the_prior(views, eye, models):
     pose = pose_ahead(views)
-    belief = episode(views, eye, SceneObserver(SemanticSearch(models[0]), views, prior=0.07), [pose * 100 + 55], 1)[0]
+    belief = episode(
+        views, eye, SceneObserver(SemanticSearch(models[0]), views, unseen_chance=0.07), [pose * 100 + 55], 1
+    )[0]
     unseen = belief.owner[0] < 0
     assert unseen.any()
     assert (belief.probability(1)[0, unseen] == 0.07).all()
@@ -150,7 +152,7 @@ def test_search_gain_equals_brute_force(views, eye, models):
 def test_the_gaze_leaves_an_object_whose_most_probable_cell_was_fixated(views, models):
     """And goes on to a neighbour that is more probable than what was fixated; also across the seam."""
     gain = SearchGain(views, 0.0)
-    start = SceneObserver(SemanticSearch(models[0]), views, prior=0.01).start(1, views.grid, torch.zeros(1))
+    start = SceneObserver(SemanticSearch(models[0]), views, unseen_chance=0.01).start(1, views.grid, torch.zeros(1))
     for cell in (60 * 15 + 30, 60 * 15):
         blob = neighbours(views, cell)
         values = torch.full_like(start.values, 0.01)
@@ -231,7 +233,7 @@ def test_what_was_seen_fades_by_the_seconds_that_pass(views, eye, models, model)
     views.world.rate = 0.2
     speeds = views.world.speeds
     inner = SemanticSearch(models[0]) if model == 0 else SemanticMap(models[1])
-    observer = SceneObserver(inner, views, prior=None if model else 0.03)
+    observer = SceneObserver(inner, views, unseen_chance=None if model else 0.03)
     order = [pose_ahead(views), views.tiling[1][5]]
     steps = look_around(
         views, live(eye, views), observer, lambda action: Scan(_NoGain(views), order, 1, action),
@@ -441,7 +443,7 @@ def test_windows_beyond_a_picture_and_several_episodes_are_refused(views, models
     refused("fields: expected", Views, flat, (30.0, 20.0))
     observer = SceneObserver(SemanticSearch(models[0]), views)
     refused("batch: expected 1, as a head has one episode at a time", observer.start, 2, views.grid, torch.zeros(1))
-    refused("prior: expected a probability", SceneObserver, SemanticSearch(models[0]), views, prior=1.5)
+    refused("unseen_chance: expected a probability", SceneObserver, SemanticSearch(models[0]), views, unseen_chance=1.5)
     nothing = Detections.empty(1, 3)
     refused("target: expected a class to search for, got None", observer.weigh, nothing, torch.zeros(1, 2), views.grid)
 

@@ -100,7 +100,7 @@ def test_a_box_is_shown_by_the_narrowest_field_that_has_room_for_it(speck, model
     """By hand: three times the longer side; boxes that fill a third of the widest view get no closer look."""
     views = Views(Panorama(speck, fields=FIELDS))
     action, gain = views.ahead, SearchGain(views)
-    belief = SceneObserver(SemanticSearch(models[0]), views, prior=0.03).start(1, views.grid, torch.zeros(1))
+    belief = SceneObserver(SemanticSearch(models[0]), views, unseen_chance=0.03).start(1, views.grid, torch.zeros(1))
     sizes = (5.0, 12.0, 40.0, 200.0)
     detections = boxes_in_view(*sizes)
     _, actions, values = offered(views, detections, belief, gain, 1, action)
@@ -138,7 +138,7 @@ def test_offers_that_are_not_taken_leave_no_poses_behind(speck, models):
     """At each look there are other places; one offer in three is taken."""
     views = Views(Panorama(speck, fields=FIELDS))
     gain = SearchGain(views)
-    observer = SceneObserver(SemanticSearch(models[0]), views, prior=0.1)
+    observer = SceneObserver(SemanticSearch(models[0]), views, unseen_chance=0.1)
     closer = CloserLooks(gain, Speeds(), 1)
     nothing = Detections.empty(1, 4)
     point = views.grid.centres[views.ahead][None]

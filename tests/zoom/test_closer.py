@@ -577,7 +577,7 @@ def test_closer_looks_read_the_probabilities_of_the_fit_and_give_those_of_the_pr
     for before, after in zip(usual.closer, rare.closer, strict=True):
         assert torch.equal(before.box, after.box)
         assert after.presence == pytest.approx(prior(before.presence), rel=1e-5)
-        assert after.place == pytest.approx(prior.place(before.place, before.presence), rel=1e-5)
+        assert after.place == pytest.approx(prior.at_place(before.place, before.presence), rel=1e-5)
     assert rare.decision.probability < usual.decision.probability
 
 

@@ -73,7 +73,7 @@ class SearchBelief(DirichletBelief):
         fitted = self._true(super().probability(target))
         if self.prior.changes_nothing:
             return fitted
-        return self.prior.place(fitted, self._fitted_presence(target)[:, None])
+        return self.prior.at_place(fitted, self._fitted_presence(target)[:, None])
 
     def chance(self, target: int | Tensor) -> Tensor:
         fitted = pick(self.following, target) / self.following.sum(-1)
