@@ -48,7 +48,7 @@ MOST_PASSES = 1_000_000
 
 FirstCell = Annotated[int | tuple[int, int], Form("a cell", "as column,row (5,5) or as its number (47)")]
 Passes = Annotated[int, Range(1, MOST_PASSES)]
-CloserLooks = Annotated[int, Range(0, 100)]
+MostCloserLooks = Annotated[int, Range(0, 100)]
 PriorShare = Annotated[float | Literal["fit"], Range(above=0, below=1, noun="a share, such as 0.15,", word="fit")]
 Rate = Annotated[float, Range(0, 100)]
 
@@ -158,7 +158,7 @@ class DecisionSettings(CheckedSettings):
 
     confirm: Probability | None = None
     stop_below: Probability | None = None
-    closer: CloserLooks | None = field(default=None, metadata=_only_for("fovea", "windows", instead="confirm"))
+    closer: MostCloserLooks | None = field(default=None, metadata=_only_for("fovea", "windows", instead="confirm"))
     prior: PriorShare | None = None
 
     @property

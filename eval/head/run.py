@@ -24,7 +24,7 @@ from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import DataError, check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
-from semfov.head.closer import CloserLooks
+from semfov.head.closer import CloserLookOffers
 from semfov.head.episode import Detect, HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, UNSEEN, UNSEEN_CHANCE, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.panoramas import Panoramas
@@ -235,9 +235,10 @@ class HeadRun(SceneRun):
                 )
         return records
 
-    def _closer(self, way: str, gain: LookGain, target: int | None) -> CloserLooks | None:
+    def _closer(self, way: str, gain: LookGain, target: int | None) -> CloserLookOffers | None:
         """Make what offers closer looks to our own way where the head zooms."""
-        return CloserLooks(gain, self.config.speeds, target) if way == OURS and len(gain.views.fields) > 1 else None
+        zooms = len(gain.views.fields) > 1
+        return CloserLookOffers(gain, self.config.speeds, target) if way == OURS and zooms else None
 
     def _steps(self, views, looks, observer, acquire, start, target, index, closer):  # type: ignore[no-untyped-def]
         config = self.config

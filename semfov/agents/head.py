@@ -18,7 +18,7 @@ from semfov.errors import InputError, check_number, check_whole
 from semfov.eye import Eye
 from semfov.head.belief import SceneObserver
 from semfov.head.camera import SceneLike, open_scene
-from semfov.head.closer import CloserLooks
+from semfov.head.closer import CloserLookOffers
 from semfov.head.episode import HeadStep, live, look_around
 from semfov.head.gain import FORESIGHT, UNSEEN_CHANCE, ExploreGain, LookGain, PerSecond, SearchGain
 from semfov.head.views import Views
@@ -300,7 +300,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
             lambda action: PerSecond(gain, speeds, action),
             first,
             target=self.goal.target,
-            closer=CloserLooks(gain, speeds, self.goal.target) if zooms else None,
+            closer=CloserLookOffers(gain, speeds, self.goal.target) if zooms else None,
             passes=MOST_PASSES,
             duration=duration,
             min_gain=min_gain,

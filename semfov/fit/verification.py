@@ -67,7 +67,7 @@ class VerifiedSearch(NamedTuple):
         return SearchEnd(right, self.looks)
 
 
-class CloserLooks(NamedTuple):
+class CloserLookSamples(NamedTuple):
     """Closer looks at N places that seemed to hold a target.
 
     Attributes:
@@ -97,7 +97,7 @@ class VerificationInFolds(NamedTuple):
 
     model: Verification
     folds: list[Verification]
-    closer_looks: CloserLooks
+    closer_looks: CloserLookSamples
     searches: list[VerifiedSearch]
 
 
@@ -169,7 +169,7 @@ def fit_verification(
 def with_thresholds(
     model: Verification,
     folds: list[Verification],
-    closer_looks: CloserLooks,
+    closer_looks: CloserLookSamples,
     searches: Iterable[TargetSearch[LookType]],
     limits: Thresholds,
     false_alarms: float,
@@ -195,7 +195,7 @@ def with_thresholds(
 
 
 @torch.inference_mode()
-def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> CloserLooks:
+def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> CloserLookSamples:
     """Look closely at the most evident places of every search.
 
     Args:
@@ -226,7 +226,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
     if len({*right}) < 2:
         raise OneKindError("data: expected places that hold the target and places that do not, got only one kind")
     answers = torch.tensor(right), torch.tensor(present)
-    return CloserLooks(torch.stack(features), *answers, torch.tensor(fold), torch.tensor(known))
+    return CloserLookSamples(torch.stack(features), *answers, torch.tensor(fold), torch.tensor(known))
 
 
 def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:
@@ -314,7 +314,9 @@ def choose_confirm(searches: Sequence[VerifiedSearch], false_alarms: float, sure
     return surest
 
 
-def fit_to_closer_looks(closer_looks: CloserLooks, chosen: Tensor, prior: Verification | None = None) -> Verification:
+def fit_to_closer_looks(
+    closer_looks: CloserLookSamples, chosen: Tensor, prior: Verification | None = None
+) -> Verification:
     r"""Fit both logistic regressions by penalised maximum likelihood, or maximum a posteriori.
 
     .. math:: \min_{w, b} \; \frac1N \sum_i \mathrm{BCE}(w^\top \phi_i + b + r_i, y_i) + \lambda |w'|^2,

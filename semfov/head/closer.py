@@ -23,7 +23,7 @@ class _Place(NamedTuple):
     field: float
 
 
-class CloserLooks:
+class CloserLookOffers:
     """Offers closer looks at the boxes of the looks so far, a few for each look.
 
     The narrowest field of view that is three times as wide as a box shows it, if no look at its cell of the scene had

@@ -20,7 +20,7 @@ from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.head.belief import SceneBelief, SceneObserver
-from semfov.head.closer import CloserLooks
+from semfov.head.closer import CloserLookOffers
 from semfov.head.gain import OUT
 from semfov.head.scenes import World
 from semfov.head.views import Views
@@ -126,7 +126,7 @@ def look_around(
     start: int,
     *,
     target: int | None = None,
-    closer: CloserLooks | None = None,
+    closer: CloserLookOffers | None = None,
     passes: int = 100,
     duration: float = math.inf,
     min_gain: float = 0.0,

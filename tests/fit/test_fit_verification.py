@@ -19,7 +19,7 @@ from semfov.fit.settings import VerificationConfig
 from semfov.fit.verification import (
     _LEVELS,
     _STRENGTH,
-    CloserLooks,
+    CloserLookSamples,
     VerifiedSearch,
     choose_confirm,
     examine,
@@ -43,7 +43,7 @@ def examined(count=200, seed=0):
     features = 2 * torch.randn(count, 7, generator=generator)
     noise = torch.randn(2, count, generator=generator)
     right, present = features[:, 3] + noise[0] > 0.5, features[:, 0] + noise[1] > -1
-    return CloserLooks(features, right, present, torch.arange(count) % 4, torch.randn(count, generator=generator))
+    return CloserLookSamples(features, right, present, torch.arange(count) % 4, torch.randn(count, generator=generator))
 
 
 @pytest.mark.parametrize("count", [200, 60])

@@ -8,7 +8,7 @@ from semfov.belief.observers import SemanticMap, SemanticSearch
 from semfov.errors import InputError
 from semfov.head import ExploreGain, PanTiltCamera, PerSecond, SearchGain, Speeds
 from semfov.head.belief import SceneObserver
-from semfov.head.closer import CloserLooks
+from semfov.head.closer import CloserLookOffers
 from semfov.head.gain import OUT
 from semfov.head.scenes import Sphere
 from semfov.head.views import Views
@@ -81,7 +81,7 @@ def test_a_narrow_field_is_aimed_at_a_point_as_nearly_as_the_limits_allow(kind, 
 
 
 def offered(views, detections, belief, gain, target, action):
-    closer = CloserLooks(gain, Speeds(), target)
+    closer = CloserLookOffers(gain, Speeds(), target)
     closer.see(action, detections)
     values = closer.values(belief, action)
     return closer, [int(number) for number in (values > OUT).nonzero()[:, 0]], values
@@ -139,7 +139,7 @@ def test_offers_that_are_not_taken_leave_no_poses_behind(speck, models):
     views = Views(Panorama(speck, fields=FIELDS))
     gain = SearchGain(views)
     observer = SceneObserver(SemanticSearch(models[0]), views, unseen_chance=0.1)
-    closer = CloserLooks(gain, Speeds(), 1)
+    closer = CloserLookOffers(gain, Speeds(), 1)
     nothing = Detections.empty(1, 4)
     point = views.grid.centres[views.ahead][None]
     belief = observer(observer.start(1, views.grid, views.poses), boxes_in_view(6.0), point, views.grid, target=1)
