@@ -1,12 +1,39 @@
 """Decisions of searches: is the target there, and where; when a search ends, and how.
 
-Three numbers describe a search after each look, with one name each everywhere:
+The numbers of a search, with one name each everywhere:
 
-- `presence`: the probability that the picture holds the target;
-- `place`: the probability that the target is at one place, after a closer look at it;
-- `hit_chance`: the chance that the best remaining look shows the target, if no look so far has.
+    word         what it is                    where it is defined          with fitted models, and without
+    -----------  ----------------------------  ---------------------------  ----------------------------------------
+    score        the number of a detection     `Detections.scores`          the detector's in both; without models
+                 for a class                                                it decides
+    presence     probability that the picture  `Belief.presence`, after     with: calibrated; without: a fovea has
+                 holds the target              closer looks                 that of its most probable cell by raw
+                                               `Verifier.presence`; by      scores, windows have none; a head has
+                                               windows `SearchFacts`        that of its most probable cell in both
+    place        probability that the target   `CloseUp.place`              with: by the verification; without:
+                 is at one place, after a                                   there are no closer looks
+                 closer look at it
+    hit_chance   chance that the best          `Belief.chance`; by windows  with: calibrated; without: it is not
+                 remaining look shows the      `WindowStep.next_value`      asked for
+                 target, if no look so far has
+    probability  of a cell: that the target    `Belief.probability`         with: calibrated; without: by raw scores
+                 is in it
+                 of a candidate: that the      `CandidatePlace`             with: before its closer look; without:
+                 target is there                                            there are no candidates
 
-What is compared with what, by what is looked at. With closer looks (`Verifier`) places decide, without them presence
+A `Decision` has two of them:
+
+    field        outcome    with closer looks          by the belief alone        without fitted models
+    -----------  ---------  -------------------------  -------------------------  ------------------------------
+    probability  found      presence, or the place     presence                   a fovea: presence; windows:
+                            where it is larger                                    score of the detection found
+                 otherwise  presence                   presence                   a fovea: presence; windows:
+                                                                                  best score so far
+    place        found      place of the best closer   a fovea: probability of    a fovea: probability of the
+                            look                       the cell; windows: None    cell; windows: None
+                 otherwise  None                       None                       None
+
+What is compared with what, by the kind of look. With closer looks (`Verifier`) places decide, without them presence
 does (`settle`):
 
     what                     fovea                       large picture               photograph by windows
@@ -45,7 +72,7 @@ does (`settle`):
 
 Candidate boxes and places are in `semfov.zoom.closer`, decisions by presence in `semfov.zoom.decision`.
 
-Without fitted models a search has no probabilities: a detection whose score is at least `confirm` is `found`
+Without fitted models no probability decides: a detection whose score is at least `confirm` is `found`
 (ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.
 """
 

@@ -32,7 +32,7 @@ class Decision(OtherWords):
 
     Attributes:
         outcome: `found`, `absent`, or `undecided`.
-        probability: that the picture holds the target; without fitted models the best score of a detection.
+        probability: that the picture holds the target; of windows without fitted models the best score of a detection.
         cell: cell of the found target, where places are cells.
         box: box `(4,)` of the found target, if a detection shows it.
         place: probability that the target is there; None where only its presence was judged.
