@@ -26,7 +26,7 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection import SCORE_THRESHOLD, Detections, Objects
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check
-from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
+from semfov.motion import CameraMotion, CameraStep, KnownPoses, LostScene, Motion
 from semfov.observation.matching import inside_frame
 from semfov.paths import Ending, WindowMoment, ZoomPath
 from semfov.paths.conversion import Values
@@ -130,6 +130,7 @@ class WindowSession:
         self._certainty = None if evidence is None else evidence.certainty_in(source.lattice)
         self.tracker = None if self._stands_still or evidence is None else Tracker()
         self._closer_looks: list[KeptLook] = []  # those that count
+        self._lost_looks: LostScene[KeptLook] = LostScene()  # closer looks at a scene that may be found again
         self._steps = self._chosen_steps() if steps is None else steps
 
     @property
@@ -212,13 +213,11 @@ class WindowSession:
         if self.tracker is not None:
             self.tracker.see(seen_by(look, self.source.lattice, self.task.goal.sought))
 
-    def follow(self, motion: Motion | None) -> None:
-        """Carry closer looks along with the camera, or drop them where a frame fits none before."""
-        if motion is None:
-            self._closer_looks = []
-        else:
-            carry_along(self._closer_looks, motion, self.source.lattice)
-        self.decisions.follow(motion)
+    def follow(self, camera: CameraStep) -> None:
+        """Carry closer looks along with the camera, or set them aside where a frame fits none before."""
+        carry = partial(carry_along, lattice=self.source.lattice)
+        self._closer_looks = self._lost_looks.follow(self._closer_looks, camera, carry)
+        self.decisions.follow(camera)
 
     @property
     def next_window(self) -> Window:
@@ -520,7 +519,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
         session.source.show(view, passed, camera)
         self._is_lost = camera.motion is None and camera.recovered is None
         if not camera.is_still:
-            session.follow(camera.motion)
+            session.follow(camera)
 
     def _made(self, session: WindowSession, view: WindowView) -> WindowMoment:
         """Make the record of the present frame, after its look."""

@@ -16,7 +16,7 @@ from semfov.data.inputs import FRAME
 from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
-from semfov.motion import Motion
+from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
 
@@ -102,6 +102,9 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._looks: list[tuple[float, Any]] = []  # time, and what a kind of places keeps of a look
         self._examined: list[ExaminedPlace] = []
         self._places: list[_CloserPlace] = []  # of the closer looks
+        self._lost_looks: LostScene[tuple[float, Any]] = LostScene()
+        self._lost_examined: LostScene[ExaminedPlace] = LostScene()
+        self._lost_places: LostScene[_CloserPlace] = LostScene()
 
     @abstractmethod
     def see(self, look: LookType) -> None:
@@ -186,41 +189,19 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._examined = [place for place in self._examined if place.time >= oldest]
         self._places = [place for place in self._places if place.time >= oldest]
 
-    def follow(self, motion: Motion | None, size: tuple[int, int]) -> None:
+    def follow(self, camera: CameraStep, size: tuple[int, int]) -> None:
         """Carry examined places along with the camera.
 
-        All are forgotten where a frame fits none before, and those that are behind the camera now.
+        Those that are behind the camera now are forgotten. Where a frame fits none before, all are set aside, until the
+        scene is found again or given up.
 
         Args:
-            motion: how the camera moved.
+            camera: how the camera moved.
             size: `(width, height)` of the frames.
         """
-        if motion is None:
-            self._looks = []
-            self._examined = []
-            self._places = []
-            return
-        self._places = self._moved_places(motion, size)
-        self._examined = self._moved_examined(motion)
-
-    def _moved_places(self, motion: Motion, size: tuple[int, int]) -> list[_CloserPlace]:
-        """Move the places of closer looks with the camera, and note which of them the frame shows."""
-        if not self._places:
-            return []
-        boxes = motion.boxes(torch.stack([place.box for place in self._places]))
-        in_view = inside_frame(boxes, size).tolist()
-        moved = zip(self._places, boxes, in_view, strict=True)
-        return [place._replace(box=box, in_view=is_in_view) for place, box, is_in_view in moved]
-
-    def _moved_examined(self, motion: Motion) -> list[ExaminedPlace]:
-        """Move the examined places with the camera, without those that are behind it now."""
-        if not self._examined:
-            return []
-        boxes = torch.stack([place.boxes for place in self._examined])  # (places, 2, 4)
-        moved_boxes, boxes_ahead = motion.boxes_ahead(boxes)
-        are_ahead = boxes_ahead.all(-1).tolist()
-        moved = zip(self._examined, moved_boxes, are_ahead, strict=True)
-        return [place._replace(boxes=boxes_of_place) for place, boxes_of_place, is_ahead in moved if is_ahead]
+        self._looks = self._lost_looks.follow(self._looks, camera, lambda looks, _: looks)
+        self._places = self._lost_places.follow(self._places, camera, partial(_moved_places, size=size))
+        self._examined = self._lost_examined.follow(self._examined, camera, _moved_examined)
 
     def cell(self, box: Tensor) -> int | None:
         """Find the cell that a box `(4,)` covers most; None where places are no cells."""
@@ -234,6 +215,27 @@ class CandidatePlaces(ABC, Generic[LookType]):
     @abstractmethod
     def probability(self, look: CloseUp) -> float:
         """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
+
+
+def _moved_places(places: list[_CloserPlace], motion: Motion, size: tuple[int, int]) -> list[_CloserPlace]:
+    """Move the places of closer looks with the camera, and note which of them the frame shows."""
+    if not places:
+        return []
+    boxes = motion.boxes(torch.stack([place.box for place in places]))
+    in_view = inside_frame(boxes, size).tolist()
+    moved = zip(places, boxes, in_view, strict=True)
+    return [place._replace(box=box, in_view=is_in_view) for place, box, is_in_view in moved]
+
+
+def _moved_examined(places: list[ExaminedPlace], motion: Motion) -> list[ExaminedPlace]:
+    """Move examined places with the camera, without those that are behind it now."""
+    if not places:
+        return []
+    boxes = torch.stack([place.boxes for place in places])  # (places, 2, 4)
+    moved_boxes, boxes_ahead = motion.boxes_ahead(boxes)
+    are_ahead = boxes_ahead.all(-1).tolist()
+    moved = zip(places, moved_boxes, are_ahead, strict=True)
+    return [place._replace(boxes=boxes_of_place) for place, boxes_of_place, is_ahead in moved if is_ahead]
 
 
 class _LookAtCells(NamedTuple):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Generic, NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ from semfov.decision.candidates import CandidatePlace, CandidatePlaces, LookAt, 
 from semfov.decision.rule import FOUND, GO_ON, OUTCOMES, CloseUp, Decision, final_outcome, found_at_once
 from semfov.episode import Step
 from semfov.errors import check, check_whole
-from semfov.motion import Motion
+from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
 
@@ -87,6 +88,7 @@ class Verifier(Generic[LookType]):
         self.most = most
         self.criterion = f"a closer look gives p {thresholds.confirm:g} there"
         self.verdicts: list[_Verdict] = []
+        self._lost: LostScene[_Verdict] = LostScene()
         self.candidate: CandidatePlace | None = None
         self._is_last = False  # whether no look of the search follows the last one
         self._judged: list[_JudgedPlace] | None = None  # computed when it is asked for after a change
@@ -99,27 +101,30 @@ class Verifier(Generic[LookType]):
         """Let seconds pass. In a stream, call it before every frame."""
         self._judged = None
         self.places.wait(passed)
-        aged = (verdict._replace(age=verdict.age + passed) for verdict in self.verdicts)
-        self.verdicts = [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
+        self.verdicts = self._aged(self.verdicts, passed)
+        if self._lost.things is not None:
+            self._lost.things = self._aged(self._lost.things, passed)
 
-    def follow(self, motion: Motion | None, size: tuple[int, int]) -> None:
+    def _aged(self, verdicts: list[_Verdict], passed: float) -> list[_Verdict]:
+        """Let seconds pass since the verdicts, without those that are forgotten."""
+        aged = (verdict._replace(age=verdict.age + passed) for verdict in verdicts)
+        return [verdict for verdict in aged if verdict.age <= _SPANS * self.places.forgetting.span]
+
+    def follow(self, camera: CameraStep, size: tuple[int, int]) -> None:
         """Carry the candidate and examined places along.
 
-        All are forgotten where a frame fits none before, and those that are behind the camera now. What has left the
-        frame is no reason for a decision until it comes back.
+        Those that are behind the camera now are forgotten. Where a frame fits none before, no place is a candidate, and
+        examined places are set aside, until the scene is found again or given up (`semfov.motion.LostScene`). What has
+        left the frame is no reason for a decision until it comes back.
 
         Args:
-            motion: how the camera moved.
+            camera: how the camera moved.
             size: `(width, height)` of the frames.
         """
         self._judged = None
-        self.places.follow(motion, size)
-        if motion is None:
-            self.candidate = None
-            self.verdicts = []
-            return
-        self.candidate = self._moved_candidate(motion)
-        self.verdicts = self._moved_verdicts(motion, size)
+        self.places.follow(camera, size)
+        self.candidate = None if camera.motion is None else self._moved_candidate(camera.motion)
+        self.verdicts = self._lost.follow(self.verdicts, camera, partial(_moved_verdicts, size=size))
 
     def _moved_candidate(self, motion: Motion) -> CandidatePlace | None:
         """Move the candidate with the camera; None if it is behind the camera now, or there is none."""
@@ -129,21 +134,6 @@ class Verifier(Generic[LookType]):
         # The closer look that is due is made in the next frame, wherever the camera has turned.
         moved_box, is_ahead = motion.boxes_ahead(candidate.box)
         return candidate._replace(box=moved_box) if bool(is_ahead) else None
-
-    def _moved_verdicts(self, motion: Motion, size: tuple[int, int]) -> list[_Verdict]:
-        """Move the places of the verdicts with the camera, without those that are behind it now."""
-        if not self.verdicts:
-            return []
-        boxes = torch.stack([verdict.look.box for verdict in self.verdicts])
-        moved_boxes, boxes_ahead = motion.boxes_ahead(boxes)
-        ahead = boxes_ahead.tolist()
-        in_view = inside_frame(moved_boxes, size).tolist()
-        moved_verdicts = []
-        for number, verdict in enumerate(self.verdicts):
-            if ahead[number]:
-                look = replace(verdict.look, box=moved_boxes[number])
-                moved_verdicts.append(verdict._replace(look=look, in_view=in_view[number]))
-        return moved_verdicts
 
     def see(self, look: LookType, *, last: bool = False) -> None:
         """Take in a look of the search, and choose the place that is to be looked at closely."""
@@ -327,6 +317,22 @@ class Verifier(Generic[LookType]):
             return fresh
         logit = weight * _log_odds(fresh) + (1 - weight) * _log_odds(without)
         return 1 / (1 + math.exp(-logit))
+
+
+def _moved_verdicts(verdicts: list[_Verdict], motion: Motion, size: tuple[int, int]) -> list[_Verdict]:
+    """Move the places of verdicts with the camera, without those that are behind it now."""
+    if not verdicts:
+        return []
+    boxes = torch.stack([verdict.look.box for verdict in verdicts])
+    moved_boxes, boxes_ahead = motion.boxes_ahead(boxes)
+    ahead = boxes_ahead.tolist()
+    in_view = inside_frame(moved_boxes, size).tolist()
+    moved_verdicts = []
+    for number, verdict in enumerate(verdicts):
+        if ahead[number]:
+            look = replace(verdict.look, box=moved_boxes[number])
+            moved_verdicts.append(verdict._replace(look=look, in_view=in_view[number]))
+    return moved_verdicts
 
 
 def _probability(judged: _JudgedPlace) -> float:

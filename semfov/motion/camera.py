@@ -46,6 +46,7 @@ class CameraStep(NamedTuple):
         motion: maps pixels of the last frame to those of this one; None where the two do not fit together.
         recovered: maps pixels of the last frame before a disturbance to those of this one, once the two fit.
         waits: whether frames before a disturbance may still be found again.
+        gives_up: whether they are no longer looked for, as none of the frames up to this one fits them.
 
     >>> CameraStep(Motion.similarity(shift=(3, 0))).is_still
     False
@@ -54,11 +55,14 @@ class CameraStep(NamedTuple):
     motion: Motion | None
     recovered: Motion | None = None
     waits: bool = False
+    gives_up: bool = False
 
     @property
     def is_still(self) -> bool:
-        """Whether nothing has moved, and nothing was lost."""
-        return self.motion is not None and self.recovered is None and self.motion.is_still
+        """Whether nothing has moved, and nothing was lost, found again or given up."""
+        if self.recovered is not None or self.gives_up:
+            return False
+        return self.motion is not None and self.motion.is_still
 
 
 class KnownPoses:
@@ -189,7 +193,8 @@ class CameraMotion:
         if self._lost is None:
             return CameraStep(motion)
         recovered = self._recover(self._lost, present)
-        return CameraStep(motion, recovered, waits=self._lost is not None)
+        waits = self._lost is not None
+        return CameraStep(motion, recovered, waits=waits, gives_up=recovered is None and not waits)
 
     def _recover(self, lost: _LostFrame, present: GreyFrame) -> Motion | None:
         """Compare the present frame with what was seen before a disturbance, which is given up after a while."""

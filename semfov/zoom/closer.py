@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from semfov.decision import CandidatePlace, CandidatePlaces, CloseUp
 from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
-from semfov.motion import Motion
+from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
 from semfov.sensor.glimpse import window_around
@@ -104,6 +104,13 @@ class _Scored(NamedTuple):
         first = len(self.boxes) - count
         return _Scored(*(column[first:] for column in self)) if first else self
 
+    def moved(self, motion: Motion, size: tuple[int, int]) -> "_Scored":
+        """Move the boxes with the camera; those that come to lie behind it count no more."""
+        if not len(self.boxes):
+            return self
+        boxes, are_ahead = motion.boxes_ahead(self.boxes)
+        return _Scored(boxes, self.scores * are_ahead.to(self.scores.device), inside_frame(boxes, size))
+
 
 class CandidateBoxes(CandidatePlaces[TargetFacts]):
     r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
@@ -133,6 +140,7 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         self.likely = likely
         self._next = 0
         self._scored = _Scored(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).bool())
+        self._lost_boxes: LostScene[_Scored] = LostScene()
 
     _look: TargetFacts
 
@@ -203,16 +211,14 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         """Forget the boxes of looks that are forgotten, which are the oldest."""
         self._scored = self._scored.last(sum(count for _, count in self._looks))
 
-    def follow(self, motion: Motion | None, size: tuple[int, int]) -> None:
-        """Carry the boxes of the target along, too; those that come to lie behind the camera count no more."""
+    def follow(self, camera: CameraStep, size: tuple[int, int]) -> None:
+        """Carry the boxes of the target along, too."""
         self._change()
-        super().follow(motion, size)
-        self._forget_boxes()
-        boxes, scores, _ = self._scored
-        if motion is None or not len(boxes):
-            return
-        moved, is_ahead = motion.boxes_ahead(boxes)
-        self._scored = _Scored(moved, scores * is_ahead.to(scores.device), inside_frame(moved, size))
+        super().follow(camera, size)
+        scenes = self._lost_boxes.follow(
+            [self._scored], camera, lambda scenes, motion: [boxes.moved(motion, size) for boxes in scenes]
+        )
+        self._scored = reduce(_Scored.joined, scenes, self._scored.last(0))
 
     def probability(self, look: CloseUp) -> float:
         """Compute the present probability that the target is at the place of a closer look.

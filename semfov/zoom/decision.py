@@ -12,7 +12,7 @@ from semfov.decision import FOUND, GO_ON, OUTCOMES, CandidatePlace, CloseUp, Dec
 from semfov.decision.candidates import LookAt
 from semfov.decision.state import DecisionState
 from semfov.episode import Forgetting
-from semfov.motion import Motion
+from semfov.motion import CameraStep
 from semfov.observation.matching import inside_frame
 from semfov.observation.presence import EVEN
 from semfov.observation.thresholds import Thresholds
@@ -181,8 +181,8 @@ class WindowDecisions(DecisionState):
     def wait(self, passed: float) -> None:
         """Let seconds pass. In a stream, call it before every frame."""
 
-    def follow(self, motion: Motion | None) -> None:
-        """Carry examined places along with the camera, or forget them where a frame fits none before."""
+    def follow(self, camera: CameraStep) -> None:
+        """Carry examined places along with the camera, or set them aside where a frame fits none before."""
 
 
 class DecisionsByScore(WindowDecisions):
@@ -270,8 +270,8 @@ class DecisionsByPresence(WindowDecisions):
         box = self._facts.box if outcome == "found" else None
         return Decision(outcome, self.prior(self._fitted_presence()), None, box, confirm=self.thresholds.confirm)
 
-    def follow(self, motion: Motion | None) -> None:
-        looks = () if motion is None or self._step is None else self._step.looks
+    def follow(self, camera: CameraStep) -> None:
+        looks = () if camera.motion is None or self._step is None else self._step.looks
         if looks:
             self._facts.see(looks)
             self._presence = None
@@ -333,14 +333,14 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def wait(self, passed: float) -> None:
         self.verifier.wait(passed)
 
-    def follow(self, motion: Motion | None) -> None:
-        self.verifier.follow(motion, self.frame)
+    def follow(self, camera: CameraStep) -> None:
+        self.verifier.follow(camera, self.frame)
         candidate = self.candidate
         if candidate is not None and not bool(inside_frame(candidate.box, self.frame)):
             self.verifier.candidate = None  # a closer look would show another place
         if self.candidate is None:
             return  # the look that follows has facts of its own
-        super().follow(motion)
+        super().follow(camera)
         if self._facts.looks:
             self.verifier.places.presence = self.prior(self._fitted_presence())
 

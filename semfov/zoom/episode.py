@@ -6,7 +6,7 @@ from functools import cached_property, partial
 from typing import Generic, TypeVar
 
 from semfov.episode import Forgetting
-from semfov.motion import CameraStep, Motion
+from semfov.motion import CameraStep, LostScene, Motion
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.carrying import carried, share_left, share_shown
 from semfov.zoom.evidence import GlimpseEvidence
@@ -62,18 +62,22 @@ class KeptLook:
         return self._motion
 
 
-def carry_along(looks: Sequence[KeptLook], motion: Motion, lattice: Lattice) -> None:
+def carry_along(looks: list[KeptLook], motion: Motion, lattice: Lattice) -> list[KeptLook]:
     """Carry looks along with the camera, to the next frame.
 
     Args:
         looks: the looks.
         motion: how the camera moved.
         lattice: lattice of the frames.
+
+    Returns:
+        The same looks.
     """
     motions = [look.moved(motion) for look in looks]
     for look, current in zip(looks, carried([look.original for look in looks], motions, lattice), strict=True):
         look.current = current
         look.in_view = share_left(current.window, lattice) >= _LEAST_LEFT
+    return looks
 
 
 class WindowStep(Generic[_StepBelief_co]):
@@ -131,7 +135,7 @@ class _Recent(Generic[_Belief]):
     """The looks of an episode that count, the overview first, and the belief of them.
 
     Invariant: `belief` holds the looks of `kept`, where they lie in the present frame, and nothing else; `windows` are
-    their windows. `aside` has the looks of a scene that the camera has lost and may find again. `lacks_overview` tells
+    their windows. `lost` has the looks of a scene that the camera has lost and may find again. `lacks_overview` tells
     whether the overview is too old, or shows too little of the frame; it is made anew then. `step` is the last step.
     """
 
@@ -140,7 +144,7 @@ class _Recent(Generic[_Belief]):
         self.source = source
         self.forgetting = forgetting
         self.kept: list[KeptLook] = []
-        self.aside: list[KeptLook] = []
+        self.lost: LostScene[KeptLook] = LostScene()
         self.windows: set[Window] = set()
         self.lacks_overview = False
         self.step: WindowStep[_Belief] | None = None
@@ -167,16 +171,7 @@ class _Recent(Generic[_Belief]):
 
     def follow(self, camera: CameraStep) -> None:
         """Carry the looks along with the camera, or set them aside where the frame fits none before."""
-        if camera.motion is not None:
-            carry_along(self.kept, camera.motion, self.source.lattice)
-        else:
-            self.aside = self.aside or self.kept
-            self.kept = []
-        if camera.recovered is not None:
-            carry_along(self.aside, camera.recovered, self.source.lattice)
-            self.kept = [*self.aside, *self.kept]
-        if camera.recovered is not None or not camera.waits:
-            self.aside = []
+        self.kept = self.lost.follow(self.kept, camera, partial(carry_along, lattice=self.source.lattice))
         self._believe_anew()
         if self.step is not None:
             self.step.choose_anew()

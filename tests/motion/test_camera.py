@@ -173,6 +173,16 @@ def test_a_disturbance_that_lasts_ends_the_wait():
         False,
         False,
     ]
+    assert [step.gives_up for step in steps] == [False, False, True, False]
+
+
+def test_a_frame_that_gives_up_is_not_still_though_the_camera_stands():
+    camera = CameraMotion(patience=3)
+    camera.step(view(scene(), 700, 700)[0])
+    other = view(scene(9), 600, 600)[0]
+    steps = [camera.step(other) for _ in range(4)]
+    assert [step.motion is not None and step.motion.is_still for step in steps] == [False, True, True, True]
+    assert [step.is_still for step in steps] == [False, True, False, True]
 
 
 def blinds():

@@ -15,7 +15,7 @@ from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Verifier
 from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
-from semfov.motion import Motion
+from semfov.motion import CameraStep, Motion
 from semfov.observation.thresholds import Thresholds
 from semfov.settings import FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
@@ -200,7 +200,7 @@ def test_what_the_camera_turns_away_from_is_forgotten_and_found_anew(looks):
     for _ in range(looks):
         judge.look()
     for _ in range(3):
-        judge.follow(motion, (240, 240))
+        judge.follow(CameraStep(motion), (240, 240))
         assert judge.candidate is None
         assert not judge.verdicts
     judge.see(look(5, 0.9, 0.5, ONE))
@@ -639,12 +639,12 @@ def test_a_place_that_leaves_the_frame_counts_again_when_it_comes_back():
     judge.look()
     assert judge.decision().outcome == "found"
     out = Motion.similarity(shift=(-125, 0))  # the box reaches from 100 to 140, and its middle to the left of the frame
-    judge.follow(out, LATTICE.size)
+    judge.follow(CameraStep(out), LATTICE.size)
     judge.see(TargetFacts(seen([OTHER], [0.0]).detections, 2, 0.1, 0.8, 0.5))
     assert judge.looks == []
     assert judge.decision().outcome != "found"
     assert judge.presence == pytest.approx(0.1)
-    judge.follow(out.inverse(), LATTICE.size)
+    judge.follow(CameraStep(out.inverse()), LATTICE.size)
     decision = judge.decision()
     assert decision.outcome == "found"
     torch.testing.assert_close(decision.box, judge.looks[0].box)
