@@ -15,6 +15,7 @@ class LostScene(Generic[_Thing]):
     Attributes:
         things: what was known; None while the camera has lost no scene that it may find again.
 
+    >>> import torch
     >>> lost = LostScene()
     >>> shift = lambda boxes, motion: [motion.boxes(box) for box in boxes]
     >>> lost.follow([torch.tensor([20.0, 10.0, 40.0, 60.0])], CameraStep(None, waits=True), shift)
