@@ -131,8 +131,8 @@ class Csv(ResultsFormat):
         return _table(list(columns), lines)
 
 
-_EXPECTED = ("expected", "expected_error")
-"""Numbers of the whole picture that stand in the lines of each class."""
+_EXPECTED = ("expected", "expected_error", "expected_guessed")
+"""What is known of the number in the whole picture, which stands in the lines of each class."""
 
 
 def _object_lines(picture: Values) -> list[Values]:

@@ -23,7 +23,7 @@ from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import held_outputs
 from semfov.cli.sources import EXAMPLE
 from semfov.cli.written import PictureFiles
-from semfov.data.classes import counted
+from semfov.data.classes import amount, counted
 from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
 from semfov.paths.conversion import Values
 from semfov.paths.words import number_with_error
@@ -263,12 +263,21 @@ def _expected_in_all(rows: Iterable[Values]) -> str:
     target = _only({name for row in looked_at for name in row["targets"]})
     if target is None:
         return ""
-    means = [row["expected"].get(target) for row in looked_at]
-    errors = [row["expected_error"].get(target) for row in looked_at]
     # A sum without the pictures of which no number is expected would be too small.
-    if None in means or None in errors:
+    if any(row["expected"].get(target) is None for row in looked_at):
         return ""
-    return f"expect {number_with_error(sum(means), math.hypot(*errors))} in all"
+    text = f"expect {_sum_with_error(looked_at, target)} in all"
+    guesses = [row for row in looked_at if row["expected_guessed"][target]]
+    if not guesses:
+        return text
+    return f"{text}, of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
+
+
+def _sum_with_error(rows: Sequence[Values], target: str) -> str:
+    """Write the sum of the expected numbers of a class in some pictures, with its error."""
+    mean = sum(row["expected"][target] for row in rows)
+    error = math.hypot(*(row["expected_error"][target] for row in rows))
+    return number_with_error(mean, error)
 
 
 def _only(values: set[_Value]) -> _Value | None:

@@ -150,6 +150,7 @@ class Conversion(Outcome, OtherWords):
             "score_threshold": self.score_threshold,
             "expected": _without_nan(self.expected),
             "expected_error": _without_nan(self.expected_error),
+            "expected_guessed": self.expected_guessed,
             "passes": self.passes,
             "summary": self.summary(),
             "objects": self.object_rows(),

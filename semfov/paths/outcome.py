@@ -257,6 +257,15 @@ class Outcome(ABC):
         """
         return NumberByClass({name: variance**0.5 for name, (_, variance) in self._claimed().items()})
 
+    @property
+    def expected_guessed(self) -> dict[str, bool]:
+        """Whether the expected number of objects is a guess, by the name of their class.
+
+        It is where the words of the record say `at a guess`: the detector hardly reacts to the class
+        (`semfov.paths.ZoomPath.reacts`), and an object of it is listed, or at least one half is expected.
+        """
+        return dict.fromkeys(self._claimed(), False)
+
     def _claimed(self) -> dict[str, tuple[float, float]]:
         """Estimate mean and variance of the number of objects of each class; NaN for those without one."""
         labels = self.sought or tuple(Counter(self.objects.labels.tolist()))

@@ -156,9 +156,7 @@ class WindowWords(Words):
         if record.unseen is None:
             return ""
         mean, variance = record._numbers().get(label, (math.nan, math.nan))
-        are_listed = len(record.objects.of([label])) > 0
-        is_said = mean >= (0.0 if are_listed else _LEAST_SAID)  # never of NaN
-        if not is_said:
+        if not record._is_said(label, mean):
             return ""
         guess = "" if record._reacts_to([label]) else "at a guess "
         return f"{guess}{number_with_error(mean, variance**0.5)}"
@@ -322,6 +320,21 @@ class ZoomPath(Record):
 
     def _reacts_to(self, labels: Sequence[int]) -> bool:
         return len(self._shown_objects[0].of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
+
+    @property
+    def expected_guessed(self) -> dict[str, bool]:
+        """Whether the expected number of objects is a guess, by the name of their class (`semfov.paths.Record`)."""
+        if self.unseen is None:
+            return super().expected_guessed
+        guessed = {}
+        for label, (mean, _) in self._numbers().items():
+            guessed[self.classes[label]] = self._is_said(label, mean) and not self._reacts_to([label])
+        return guessed
+
+    def _is_said(self, label: int, mean: float) -> bool:
+        """Tell whether the words say the expected number of a class: one is listed, or half of one expected."""
+        are_listed = len(self.objects.of([label])) > 0
+        return mean >= (0.0 if are_listed else _LEAST_SAID)  # never of NaN
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
         """Mean and variance of the number of objects of each class; NaN where none is estimated."""

@@ -18,6 +18,7 @@ from pycocotools.coco import COCO
 
 from semfov import read_image
 from semfov.belief import Verification
+from semfov.cli.formats import Csv
 from semfov.cli.options import FindOptions, SearchOptions
 from semfov.cli.search import with_target
 from semfov.cli.sources import picture_sources
@@ -476,9 +477,19 @@ def test_a_survey_tells_nothing_from_what_was_not_looked_at(run, folder, tmp_pat
     assert counts["red"].tolist() == [1, 1, 1, 0]
     assert counts["wine glass"].tolist() == [0, 0, 0, 0]
     assert table[["expected", "expected_error"]].isna().all(axis=None)  # a score tells no number in all
+    assert set(table.expected_guessed[table.error.isna()]) == {False}
     assert run("find", folder / "d.png", "--out", tmp_path / "none.csv")[0] == 0
     none = pd.read_csv(tmp_path / "none.csv")
     assert (none.columns.tolist(), len(none)) == (table.columns.tolist(), 1)
+
+
+def test_a_table_tells_which_expected_numbers_are_guesses():
+    objects = [{"class": "cup", "object": number} for number in range(2)]
+    numbers = {"expected": {"cup": 9.0, "cat": 2.0}, "expected_error": {"cup": 11.0, "cat": 0.5}}
+    picture = {"picture": "a.jpg", "width": 8, "height": 6, "targets": ["cup", "cat"], "objects": objects, **numbers}
+    guessed = {**picture, "expected_guessed": {"cup": True, "cat": False}}
+    table = pd.read_csv(io.StringIO(Csv().text([{"picture": guessed}])))
+    assert table[["class", "expected_guessed"]].to_numpy().tolist() == [["cup", True], ["cup", True], ["cat", False]]
 
 
 def test_lines_of_json_are_written_as_pictures_are_done(run, folder, tmp_path):

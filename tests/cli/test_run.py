@@ -321,8 +321,9 @@ def test_a_terminal_that_closes_ends_a_command_in_good_order(capsys):
 
 
 def test_the_sum_of_what_is_expected_has_the_error_of_independent_pictures():
-    def row(target, mean, error):
-        return {"targets": [target], "expected": {target: mean}, "expected_error": {target: error}}
+    def row(target, mean, error, *, guessed=False):
+        numbers = {"expected": {target: mean}, "expected_error": {target: error}}
+        return {"targets": [target], **numbers, "expected_guessed": {target: guessed}}
 
     skipped = {"picture": "c.jpg", "error": "not an image"}
     two = [row("person", 12.0, 6.0), skipped, row("person", 11.0, 8.0)]
@@ -330,3 +331,6 @@ def test_the_sum_of_what_is_expected_has_the_error_of_independent_pictures():
     assert _expected_in_all([row("person", 0.5, 0.3), row("person", 0.25, 0.4)]) == "expect 0.8 ± 0.5 in all"
     assert _expected_in_all([*two, row("person", None, None)]) == ""
     assert _expected_in_all([*two, row("cup", 1.0, 1.0)]) == ""
+    guesses = [row("person", 3.0, 24.0, guessed=True), row("person", 8.0, 7.0, guessed=True)]  # 7, 24, 25
+    assert _expected_in_all([*two, guesses[0]]) == "expect 26 ± 26 in all, of which 3 ± 24 at a guess in 1 picture"
+    assert _expected_in_all([*two, *guesses]) == "expect 34 ± 27 in all, of which 11 ± 25 at a guess in 2 pictures"
