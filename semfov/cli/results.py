@@ -13,6 +13,7 @@ from semfov.cli.formats import FORMATS, CocoResults, JsonLines, ResultsFormat, R
 from semfov.cli.options import FIGURES
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
+from semfov.data.classes import amount
 from semfov.errors import DataError, check
 from semfov.io.code import package_digest
 from semfov.io.files import write_text, written_alone
@@ -141,10 +142,33 @@ def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[P
 
     Returns:
         The outcomes that were kept.
+
+    Raises:
+        DataError: another command was stopped, and what it has finished is kept there.
     """
     key = digest_of([depends_on, package_digest()])[:32]
     versions = [json.dumps(source.version()) for source in sources]
-    return SceneResults(file.with_name(f"{file.name}.unfinished"), key, versions.__getitem__)
+    finished = SceneResults(file.with_name(f"{file.name}.unfinished"), key, versions.__getitem__)
+    # It would be removed with the outcomes of this command when that has ended.
+    count = _finished_by_another(finished, len(sources))
+    if count:
+        raise DataError(
+            f"cannot write {file}: a command with other options, models or pictures, or of another version was stopped "
+            f"after {amount(count, 'picture')}, which are kept in {finished.path.parent}; name another output, or "
+            "delete that folder"
+        )
+    return finished
+
+
+def _finished_by_another(finished: SceneResults, scenes: int) -> int:
+    """Count the pictures beside these outcomes, or in their place, that a command with another key or others has."""
+    count = 0
+    for path in finished.path.parent.glob("*.sqlite"):
+        if path != finished.path:
+            count += len(SceneResults(path.parent, path.stem, str))
+    # Where one picture is as before, others have changed since the same command was stopped.
+    is_of_other_pictures = len(finished) > 0 and not finished.finished(scenes)
+    return count + (len(finished) if is_of_other_pictures else 0)
 
 
 def tell_written(files: Sequence[object], finished: SceneResults | None, part: str | None) -> None:

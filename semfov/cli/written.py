@@ -57,10 +57,12 @@ class PictureFiles:
             file = out
             # Beside a file, figures have a folder of its name: found.coco.json and found/.
             self._folder = out.with_name(out.name.partition(".")[0])
+        # What was written to a stream is gone.
+        if out != STDOUT:
+            finished = unfinished(file, job.depends_on(), job.sources)
+            if job.several:  # one picture takes seconds
+                self.finished = finished
         self._results = ResultsFile(file, form, stream)
-        # One picture takes seconds, and what was written to a stream is gone.
-        if job.several and out != STDOUT:
-            self.finished = unfinished(file, job.depends_on(), job.sources)
 
     def finished_before(self) -> dict[int, PictureOutcome]:
         """Read the outcomes of an interrupted command with the same options and models, by number."""

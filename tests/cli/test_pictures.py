@@ -575,7 +575,7 @@ def test_a_folder_that_was_interrupted_continues(run, folder, tmp_path, agent, m
 
 
 def test_only_what_is_as_before_counts_as_finished(run, folder, tmp_path, agent, monkeypatch):
-    """With other options, and after a picture has changed, it is looked at again."""
+    """After a picture has changed, it is looked at again; other options are those of another command."""
     find_all, calls = agent.find_all, []
 
     def stopping(picture, *arguments, **options):
@@ -586,14 +586,47 @@ def test_only_what_is_as_before_counts_as_finished(run, folder, tmp_path, agent,
 
     monkeypatch.setattr(agent, "find_all", stopping)
     command = ("find", folder, "--out", tmp_path / "boxes.json")
-    for more, seen in (((), "abc"), ((), "c"), (("--passes", 1), "abc"), (("--passes", 1, "--workers", 1), "c")):
+    for more, seen in (((), "abc"), ((), "c"), (("--workers", 1), "c")):
         calls.clear()
         assert run(*command, *more)[0] == 130
         assert [name[-5] for name in calls] == list(seen)
     (folder / "a.png").write_bytes((folder / "b.png").read_bytes())
     calls.clear()
-    assert run(*command, "--passes", 1)[0] == 130
+    assert run(*command)[0] == 130
     assert [name[-5] for name in calls] == ["a", "c"]
+
+
+def test_what_another_command_has_finished_is_not_lost(run, folder, photo, tmp_path, agent, monkeypatch):
+    """A command that was stopped keeps its pictures until it has ended, whatever would write the same file."""
+    find_all, calls, last = agent.find_all, [], "a.png"
+
+    def stopping(picture, *arguments, **options):
+        calls.append(picture)
+        if picture.endswith(last):
+            raise KeyboardInterrupt
+        return find_all(picture, *arguments, **options)
+
+    monkeypatch.setattr(agent, "find_all", stopping)
+    out, kept = tmp_path / "boxes.jsonl", tmp_path / "boxes.jsonl.unfinished"
+    assert run("find", folder, "--target", "wine glass", "--out", out)[0] == 130
+    last = "c.png"
+    command = ("find", folder, "--target", "red", "--out", out)
+    assert run(*command)[0] == 130  # of the first one nothing was done
+    before = out.read_text()
+    elsewhere = shutil.copytree(folder, tmp_path / "others")
+    calls.clear()
+    for words in ((folder, "--target", "wine glass"), (elsewhere, "--target", "red"), (photo, "--target", "red")):
+        code, printed = run("find", *words, "--out", out)
+        assert code == 1
+        assert f"cannot write {out}: a command with other options, models or pictures" in printed.err
+        assert f"2 pictures, which are kept in {kept}; name another output, or delete that folder" in printed.err
+    assert (calls, out.read_text()) == ([], before)
+    last = "none"
+    assert run(*command)[0] == 0
+    assert calls == [str(folder / "c.png")]
+    assert run("find", folder, "--target", "wine glass", "--out", out)[0] == 0  # a file that is finished is replaced
+    assert out.read_text() != before
+    assert not kept.exists()
 
 
 def test_outcomes_of_another_model_are_not_continued(folder, tmp_path, capsys, monkeypatch):
@@ -604,6 +637,7 @@ def test_outcomes_of_another_model_are_not_continued(folder, tmp_path, capsys, m
     home = tmp_path / "home"
     home.mkdir()
     network, out, calls = home / "colours.onnx", tmp_path / "boxes.json", []
+    kept = tmp_path / "boxes.json.unfinished"
 
     def counted(self, picture, *arguments, **options):
         calls.append(picture)
@@ -638,10 +672,13 @@ def test_outcomes_of_another_model_are_not_continued(folder, tmp_path, capsys, m
     stopped = False
     assert pictures("find_all", *find) == (0, 3)
     first = untimed(out)
-    for bias in (-4.0, -2.0):
-        write_network(network, bias)
-        stopped = True
-        assert pictures("find_all", *find) == (130, 3)
+    stopped = True
+    write_network(network, -4.0)
+    assert pictures("find_all", *find) == (130, 3)
+    write_network(network, -2.0)
+    assert pictures("find_all", *find) == (1, 0)
+    shutil.rmtree(kept)
+    assert pictures("find_all", *find) == (130, 3)
     stopped = False
     assert pictures("find_all", *find) == (0, 1)
     continued = untimed(out)
@@ -656,10 +693,10 @@ def test_outcomes_of_another_model_are_not_continued(folder, tmp_path, capsys, m
         "--embeddings",
         vectors,
     )
-    for line in ("crimson 1 0.9", "crimson 0.9 1"):
+    stopped = True
+    for line, ending in (("crimson 1 0.9", (130, 3)), ("crimson 0.9 1", (1, 0))):
         vectors.write_text(f"red 1 0.8\ngreen 0.8 1\nblue 0 1\n{line}\n")
-        stopped = True
-        assert pictures("search", *described) == (130, 3)
+        assert pictures("search", *described) == ending
 
 
 @pytest.mark.slow
