@@ -111,8 +111,7 @@ usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
 {_AGENT}
 {_LOOKS}
   --min-gain N         in a large picture stop when the next look should show fewer new objects than this (default 0.01)
-  --score-threshold P  objects are listed from this probability on (default 0.5), without fitted models from this score
-                       (default 0.3)
+  --score-threshold P  objects are listed from this probability on (default 0.5; without fitted models a score, 0.3)
   --batch N            windows that are looked at together
 {_OUTPUT}
 """,

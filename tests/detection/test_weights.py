@@ -130,16 +130,15 @@ def test_one_detector_is_the_default_everywhere():
         HeadAgent.recommended,
         ZoomAgent.recommended,
         open_scenery,
-        GazeOptions,
         DetectorConfig,
     ]
     for taker in takers:
         given = signature(taker).parameters
         assert (given.get("detector") or given["name"]).default == "yolox-nano", taker
-    assert (
-        signature(AgentOptions).parameters["detector"].default is None
-    )  # so that a default that is named is told from one that is not
     assert DEFAULT_DETECTOR == "yolox-nano"
+    for options in (AgentOptions, GazeOptions):
+        # So that a default that is named is told from one that is not.
+        assert signature(options).parameters["detector"].default is None
 
 
 def test_cache_folder(cache, monkeypatch):
