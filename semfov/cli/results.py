@@ -144,31 +144,39 @@ def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[P
         The outcomes that were kept.
 
     Raises:
-        DataError: another command was stopped, and what it has finished is kept there.
+        DataError: another command was stopped, and what it has finished is kept there (`check_nothing_kept`).
     """
     key = digest_of([depends_on, package_digest()])[:32]
     versions = [json.dumps(source.version()) for source in sources]
-    finished = SceneResults(file.with_name(f"{file.name}.unfinished"), key, versions.__getitem__)
-    # It would be removed with the outcomes of this command when that has ended.
-    count = _finished_by_another(finished, len(sources))
-    if count:
-        raise DataError(
-            f"cannot write {file}: a command with other options, models or pictures, or of another version was stopped "
-            f"after {amount(count, 'picture')}, which are kept in {finished.path.parent}; name another output, or "
-            "delete that folder"
-        )
+    finished = SceneResults(_kept_folder(file), key, versions.__getitem__)
+    # Where one picture is as before, others have changed since the same command was stopped.
+    is_of_other_pictures = len(finished) > 0 and not finished.finished(len(sources))
+    check_nothing_kept(file, None if is_of_other_pictures else finished.path)
     return finished
 
 
-def _finished_by_another(finished: SceneResults, scenes: int) -> int:
-    """Count the pictures beside these outcomes, or in their place, that a command with another key or others has."""
-    count = 0
-    for path in finished.path.parent.glob("*.sqlite"):
-        if path != finished.path:
-            count += len(SceneResults(path.parent, path.stem, str))
-    # Where one picture is as before, others have changed since the same command was stopped.
-    is_of_other_pictures = len(finished) > 0 and not finished.finished(scenes)
-    return count + (len(finished) if is_of_other_pictures else 0)
+def check_nothing_kept(file: Path, own: Path | None = None) -> None:
+    """Raise `DataError` where the outcomes of another command that was stopped are kept beside its file of results.
+
+    They would be removed with those of this command when that has ended.
+
+    Args:
+        file: the file of results.
+        own: the outcomes of this command, which it continues.
+    """
+    folder = _kept_folder(file)
+    others = [path for path in folder.glob("*.sqlite") if path != own]
+    count = sum(len(SceneResults(folder, path.stem, str)) for path in others)
+    if count:
+        raise DataError(
+            f"cannot write {file}: a command with other options, models or pictures, or of another version was stopped "
+            f"after {amount(count, 'picture')}, which are kept in {folder}; name another output, or delete that folder"
+        )
+
+
+def _kept_folder(file: Path) -> Path:
+    """Name the folder beside a file of results in which a command keeps what it has finished."""
+    return file.with_name(f"{file.name}.unfinished")
 
 
 def tell_written(files: Sequence[object], finished: SceneResults | None, part: str | None) -> None:

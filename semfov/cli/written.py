@@ -6,7 +6,15 @@ from typing import TextIO
 from semfov.cli.jobs import PictureJob
 from semfov.cli.options import PictureOptions
 from semfov.cli.outcome import PictureOutcome
-from semfov.cli.results import STDOUT, ResultsFile, kind_of, results_format, tell_written, unfinished
+from semfov.cli.results import (
+    STDOUT,
+    ResultsFile,
+    check_nothing_kept,
+    kind_of,
+    results_format,
+    tell_written,
+    unfinished,
+)
 from semfov.errors import SemfovError
 from semfov.io.files import check_apart, plain_name, write_bytes
 from semfov.paths.conversion import Values
@@ -57,11 +65,11 @@ class PictureFiles:
             file = out
             # Beside a file, figures have a folder of its name: found.coco.json and found/.
             self._folder = out.with_name(out.name.partition(".")[0])
-        # What was written to a stream is gone.
-        if out != STDOUT:
-            finished = unfinished(file, job.depends_on(), job.sources)
-            if job.several:  # one picture takes seconds
-                self.finished = finished
+        # One picture takes seconds, and what was written to a stream is gone.
+        if job.several and out != STDOUT:
+            self.finished = unfinished(file, job.depends_on(), job.sources)
+        elif out != STDOUT:
+            check_nothing_kept(file)
         self._results = ResultsFile(file, form, stream)
 
     def finished_before(self) -> dict[int, PictureOutcome]:

@@ -341,15 +341,15 @@ def test_an_overview_is_on_the_first_screen_and_leads_to_each_picture(
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
         for row, chosen in ((0, "cup.jpg"), (1, "nothing-0.jpg")):
             rows.nth(row).locator("a").click()
-            page.wait_for_function(f"document.querySelector('.large:not([hidden]) h3').textContent === '{chosen}'")
+            page.locator(".large:not([hidden]) h3", has_text=chosen).wait_for()
             assert page.locator("#viewer").bounding_box()["y"] == pytest.approx(0, abs=2)
             assert page.locator("#episode option:checked").inner_text().startswith(f"{chosen}: ")
         page.go_back()
-        page.wait_for_function("document.querySelector('.large:not([hidden]) h3').textContent === 'cup.jpg'")
+        page.locator(".large:not([hidden]) h3", has_text="cup.jpg").wait_for()
         page.locator("#episode").select_option(index=3)
         assert page.locator(".large:visible h3").first.inner_text() == "nothing-3.jpg"
         rows.first.locator("a").click()  # the address of the page is that one already
-        page.wait_for_function("document.querySelector('.large:not([hidden]) h3').textContent === 'cup.jpg'")
+        page.locator(".large:not([hidden]) h3", has_text="cup.jpg").wait_for()
         assert page.locator("#viewer").bounding_box()["y"] == pytest.approx(0, abs=2)
     with watched(chromium, path.parent / path.name) as page:
         page.goto(f"{path.as_uri()}#large-30")

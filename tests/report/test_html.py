@@ -26,7 +26,7 @@ from semfov.report.markup import table_html
 from semfov.report.template import write_html
 from tests import small
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
-from tests.report.test_browser import axe, chromium, pytestmark, watched  # noqa: F401
+from tests.report.test_browser import axe, chromium, playwright, pytestmark, watched  # noqa: F401
 from tests.small import rand
 
 
@@ -303,8 +303,8 @@ def test_several_pictures_begin_with_an_overview_that_leads_to_each(opened, host
     assert rows.locator("a").all_inner_texts() == names
     assert rows.first.locator("ellipse").count() == 3
     rows.nth(1).locator("a").click()
-    opened.wait_for_function("document.getElementById('picture').value === '1'")
-    assert opened.locator("#image").get_attribute("alt") == "b.png"
+    playwright.expect(opened.locator("#image")).to_have_attribute("alt", "b.png")
+    assert opened.locator("#picture").input_value() == "1"
     opened.locator("#overview .sort").first.click()
     assert opened.locator("#overview [aria-sort=ascending]").inner_text() == "picture"
     assert sorted(rows.locator("a").all_inner_texts()) == sorted(names)
