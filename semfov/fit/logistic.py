@@ -63,8 +63,11 @@ def logistic_regression(
     for _ in range(steps):
         chance = (given + inputs @ coefficients).sigmoid()
         gradient = inputs.T @ (weight * (answers - chance)) - precision * (coefficients - centre)
+        if float(gradient.abs().max()) < _CONVERGED:
+            break
         curvature = inputs.T @ (inputs * (weight * chance * (1 - chance))[:, None]) + precision.diag()
-        step = torch.linalg.solve(curvature, gradient)
+        # Where facts separate the cases, and nothing holds the weights, the curvature vanishes.
+        step = torch.linalg.pinv(curvature, hermitian=True) @ gradient
         # A shorter step keeps its direction, in which the loss falls.
         step = step * min(1.0, _LONGEST_STEP / max(float(step.abs().max()), _CONVERGED))
         coefficients = coefficients + _not_above(loss, coefficients, step)

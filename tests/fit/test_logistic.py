@@ -34,3 +34,11 @@ def test_the_least_loss_is_found_also_for_few_cases(count, spread):
         cases = (facts, right, known, 1e-2)
         best = scipy.optimize.minimize(penalised_loss, np.zeros(8), cases, method="BFGS", options={"gtol": 1e-7})
         assert penalised_loss(fitted, *cases) <= best.fun + 1e-6
+
+
+def test_facts_that_separate_the_cases_give_finite_coefficients():
+    facts = torch.tensor([[-2.0], [-1.0], [1.0], [2.0]], dtype=torch.float64)
+    for ridge in (0.0, 1e-12):
+        offset, slope = logistic_regression(facts, facts[:, 0] > 0, ridge=ridge)
+        assert np.isfinite([offset, slope]).all()
+        assert slope > 10
