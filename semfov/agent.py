@@ -11,7 +11,7 @@ from semfov.agents.fovea import FoveaAgent
 from semfov.agents.head import HeadAgent
 from semfov.agents.kinds import KINDS_OF_LOOK, KindOfLook
 from semfov.agents.picture import OpenedPicture, PictureLike, check_order
-from semfov.agents.windows import ZoomAgent
+from semfov.agents.windows import ZoomAgent, knows_photographs
 from semfov.belief.grid import check_cells
 from semfov.belief.observers import Observer, SemanticMap, SemanticSearch
 from semfov.belief.observers.any_of import TargetLike
@@ -308,7 +308,7 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the kind is unknown, or does not suit a scene.
         """
-        photographs = not foveal and self.zoom.suits_photographs
+        photographs = not foveal and (self.photographs or knows_photographs(self.windows))
         return OpenedPicture.of(picture).kind(how, self.eye.detector.input_size, every=every, photographs=photographs)
 
     @checked_keywords

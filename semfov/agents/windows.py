@@ -24,6 +24,11 @@ RATE = 0.75  # default rate at which looks are forgotten in a stream, per second
 _Picture = LargePicture | ImageLike
 
 
+def knows_photographs(evidence: GlimpseEvidence | None) -> bool:
+    """Tell whether there is evidence, and for photographs, too."""
+    return evidence is not None and evidence.photograph is not None
+
+
 class ZoomAgent(nn.Module):
     """Search and explore pictures that are larger than the detector's input.
 
@@ -65,8 +70,7 @@ class ZoomAgent(nn.Module):
     @property
     def suits_photographs(self) -> bool:
         """Whether a photograph is looked at by windows: if the evidence knows photographs, or if that was asked for."""
-        knows_photographs = self.evidence is not None and self.evidence.photograph is not None
-        return knows_photographs or self._photographs
+        return self._photographs or knows_photographs(self.evidence)
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
