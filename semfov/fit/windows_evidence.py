@@ -69,6 +69,29 @@ class _WindowCounts(NamedTuple):
     new: Tensor
 
 
+def _is_predicted(look: Gist, window: Window) -> bool:
+    """Tell whether a look predicts a closer one: that inside it, or any if it is an overview."""
+    if look.level == 0:
+        return True
+    rows, columns = look.scores.shape[:2]
+    left, top = look.first
+    x1, y1, x2, y2 = window.cells  # of the lattice
+    is_within_columns = x1 >= left and x2 <= left + columns * look.scale
+    is_within_rows = y1 >= top and y2 <= top + rows * look.scale
+    return is_within_columns and is_within_rows
+
+
+def _cells_shown(look: Gist, window: Window) -> tuple[int, int, int]:
+    """Find the first row and column of a look's cells that a closer window shows, and their number along a side."""
+    left, top = look.first
+    x1, y1, x2, _ = window.cells
+    row = (y1 - top) // look.scale
+    column = (x1 - left) // look.scale
+    # Cells that the window shows in part count.
+    after = -(-(x2 - left) // look.scale)
+    return row, column, after - column
+
+
 class LookCounts(NamedTuple):
     """A look, and how many new objects each of the closer looks inside it found.
 
@@ -93,21 +116,12 @@ class LookCounts(NamedTuple):
         Returns:
             The look with the numbers.
         """
-        rows, columns = look.scores.shape[:2]
-        height = rows * look.scale
-        width = columns * look.scale
-        left, top = look.first
         by_size: dict[tuple[int, int], list[tuple[int, int, Tensor]]] = defaultdict(list)
         for closer in results:
             steps = closer.window.level - look.level
-            # In cells of the lattice, from the corner of the look.
-            x1, y1, x2, y2 = closer.window.cells
-            is_inside = x1 >= left and y1 >= top and x2 <= left + width and y2 <= top + height
-            if 1 <= steps <= STEPS and (is_inside or look.level == 0):
-                # Cells that a window shows in part count.
-                first_column = (x1 - left) // look.scale
-                span = -(-(x2 - left) // look.scale) - first_column
-                by_size[steps, span].append(((y1 - top) // look.scale, first_column, closer.found & ~earlier))
+            if 1 <= steps <= STEPS and _is_predicted(look, closer.window):
+                row, column, span = _cells_shown(look, closer.window)
+                by_size[steps, span].append((row, column, closer.found & ~earlier))
         counts = {}
         for size, windows in by_size.items():
             first_rows, first_columns, found = zip(*windows, strict=True)
