@@ -42,7 +42,6 @@ from semfov.io.files import write_text
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
 from semfov.zoom.closer import USUAL_WINDOW, PhotographPlaces
-from semfov.zoom.eye import _PHOTOGRAPH_BORDER
 
 ROOT = Path(__file__).parents[1]
 
@@ -84,7 +83,6 @@ CODE: dict[str, float] = {
     "likely": LIKELY,
     "candidates of photographs": PhotographPlaces.least,
     "window of photographs": USUAL_WINDOW[0],
-    "border of photographs": _PHOTOGRAPH_BORDER,
     "opset": OPSET,
     "confirm of a head": _CONFIRM,
     "milliseconds of a saccade": 1000 * _SPEEDS.eye_start,

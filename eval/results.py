@@ -31,13 +31,11 @@ from eval.page.findings import findings
 from eval.page.origin import END, PLACE, missing, origin
 from eval.page.tables import (
     Runs,
-    agreement,
     beside_paper,
     by_samples,
     markdown_table,
     photographs,
     published,
-    readings,
     sensitivity,
 )
 from eval.page.thresholds import by_threshold, verdicts, words_of_verdicts
@@ -125,7 +123,6 @@ _WHOLE = {
     "verdicts-words": _PageTable(AT_THRESHOLDS, words_of_verdicts),
     "thresholds": _PageTable(AT_THRESHOLDS, by_threshold),
     "photographs": _PageTable(_SEARCHES[:1], photographs),
-    "readings": _PageTable(_SEARCHES[:1], readings),
     "sensitivity": _PageTable(tuple(f"sensitivity {setting}" for setting in SENSITIVITY), sensitivity),
 }
 """Tables of the pages that are not of a single experiment."""
@@ -146,7 +143,6 @@ _TABLES: dict[str, Callable[[Path], list[str]]] = {
     "search": partial(markdown_table, "summary.md", 0, columns=_SEARCHED),
     "explore": partial(markdown_table, "summary.md", 0, columns=_EXPLORED),
     "explore-objects": partial(markdown_table, "summary.md", 1, columns=_EXPLORED),
-    "agreement": agreement,
     "presence": partial(markdown_table, "decisions.md", 0),
     "decisions": partial(markdown_table, "decisions.md", 1),
     "samples-search": partial(by_samples, shifts=(1, 5, 15, 30)),

@@ -85,16 +85,6 @@ _BEYOND = (
 )
 """Search policies with semfov's own sensor and models."""
 
-_BEYOND_EXPLORATION = (
-    "random-raw",
-    "kl-raw",
-    "closer-look-raw",
-    "random-calibrated",
-    "kl-calibrated",
-    "closer-look-calibrated",
-)
-"""Exploration policies with fused scores, with semfov's own models."""
-
 _SCORES: tuple[Scores, ...] = ("raw", "calibrated")
 
 _EXPECTED = tuple(PolicyConfig("predictive", scores, samples=samples) for scores in _SCORES for samples in (None, 64))
@@ -228,7 +218,7 @@ def _beyond(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
     """Yield the experiments beyond the paper, with YOLOX-nano."""
     settings = detector("nano", config)
     common, few = _common(settings, config)
-    seek, tour = partial(SearchConfig, **common), partial(ExploreConfig, **common)
+    seek = partial(SearchConfig, **common)
     sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
     yield "proposed-nano", seek(sensor=sensor, belief=belief, policies=_PROPOSED)
     # One start: an expectation takes ten times as long as the published decision.
@@ -238,9 +228,6 @@ def _beyond(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
     yield "expected-explore", ExploreConfig(**options, protocol=once, policies=_EXPECTED_EXPLORATION)
     yield "beyond-search-nano", seek(policies=_BEYOND)
     yield "decide-nano", DecideConfig(**common)
-    yield "beyond-explore-nano", tour(policies=_BEYOND_EXPLORATION)
-    belief = BeliefConfig(model=f"{settings.name}-sharp")
-    yield "beyond-explore-published-nano", tour(policies=_BEYOND_EXPLORATION, sensor=sensor, belief=belief)
 
 
 def at_threshold(kind: str, threshold: float, name: str) -> str:

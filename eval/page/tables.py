@@ -6,16 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.chance import random_search
 from eval.page import paper
 from eval.page.curves import averaged, paired_difference, points, policies_of, records_of
 from eval.page.experiments import DETECTORS, FOVEAE, SENSITIVITY, SENSITIVITY_POLICY, Experiment
 from semfov.runs.tables import percent, table
 
 Runs = dict[str, Experiment]
-
-_LARGER = 11
-"""Number of target cells with which random gaze finds about as much as the paper measured."""
 
 _SENSITIVITY_SHIFTS = (1, 5, 15, 30)
 """Gaze shifts after which the study of settings is shown."""
@@ -60,21 +56,6 @@ def _largest_error(folder: Path, policy: str) -> str:
     return f"{100 * curve.over_repetitions.max():.3f}"
 
 
-def readings(runs: Runs) -> list[str]:
-    """Compute expected performance of random gaze for the commonest class, for both readings of n in the paper."""
-    folder = runs["search-published-nano"].out
-    rows = [["random gaze, by formula", *(f"CP@{n}" for n in paper.TABLE_SHIFTS)]]
-    rows.append(["paper, measured", *(f"{figure:.2f}" for figure in paper.TABLE_II["random"][:-1])])
-    goals = [len(r["goal"]) for r in records_of(folder, "random", commonest=True) if r["repetition"] == 0]
-    curve = np.mean([random_search(count, max(paper.TABLE_SHIFTS)) for count in goals], axis=0)
-    first = {"n gaze shifts (the reading of this page)": 0, "n fixations, the first among them": 1}
-    for reading, less in first.items():
-        rows.append([reading, *(f"{100 * curve[n - less]:.1f}" for n in paper.TABLE_SHIFTS)])
-    larger = random_search(_LARGER, max(paper.TABLE_SHIFTS))
-    title = f"n gaze shifts, if the target held {_LARGER} cells of every image"
-    return table([*rows, [title, *(f"{100 * larger[n]:.1f}" for n in paper.TABLE_SHIFTS)]])
-
-
 def sensitivity(runs: Runs) -> list[str]:
     """Write a row for each setting of the study of settings: curves over all targets."""
     rows = [["setting", *(f"CP@{n}" for n in _SENSITIVITY_SHIFTS)]]
@@ -110,18 +91,6 @@ def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> lis
         plain, _, drawn = policy.partition(", samples ")
         if drawn:
             rows.append([policy, *points(*paired_difference(folder, policy, plain, max(shifts), field), shifts)])
-    return table(rows)
-
-
-def agreement(folder: Path) -> list[str]:
-    """How often predictive and non-predictive search make the same first gaze shift, and need the same number."""
-    rows = [["scores", "same first gaze shift", "found after as many shifts"]]
-    for mode in ("raw", "calibrated"):
-        names = [f"{kind}-{mode}" for kind in ("non-predictive", "predictive")]
-        pairs = list(zip(*(records_of(folder, name) for name in names), strict=True))
-        first = [a["cells"][1] == b["cells"][1] for a, b in pairs]
-        lengths = [a["found_at"] == b["found_at"] for a, b in pairs]
-        rows.append([mode, *(f"{100 * np.mean(same):.1f} %" for same in (first, lengths))])
     return table(rows)
 
 
