@@ -11,7 +11,7 @@ import sys
 import time
 
 from docs.site.llms import contents
-from docs.site.search_index import put_members_into_classes
+from docs.site.search_index import put_pages_first
 from docs.site.stage import ROOT, Stage
 from docs.site.tutorials import tutorials
 
@@ -44,7 +44,7 @@ def build(*, run: bool) -> None:
     output = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr)
     if done.returncode or _COMPLAINT.search(output):
         raise ValueError(f"expected the site to build without warnings, got\n{output}")
-    put_members_into_classes(SITE / "search.json")
+    put_pages_first(SITE / "search.json")
     print(f"written: {SITE / 'index.html'}, {time.monotonic() - began:.0f} s in all")
 
 

@@ -5,11 +5,11 @@ import re
 from pathlib import Path
 
 
-def put_members_into_classes(index: Path) -> None:
-    """Make the entries of methods and properties part of the entry of their class.
+def put_pages_first(index: Path) -> None:
+    """Make members part of the entry of their class, and leave out source files.
 
-    A member such as `thresholds` has one word for a title, which no page about thresholds outranks. Its text, and so
-    each of its words, leads to its class.
+    A member such as `thresholds`, or a file such as `examples/ros_node.py`, has a word for a title, which no page about
+    thresholds or ROS outranks. The words of a member lead to its class, and those of a file to the pages that link it.
 
     Args:
         index: the file of the index, whose entries follow the order of the pages; it is written anew.
@@ -19,6 +19,8 @@ def put_members_into_classes(index: Path) -> None:
     for item in found["items"]:
         name = re.sub(r"\s*<.*", "", str(item["title"]))
         is_member = str(item["location"]).startswith("api/") and "#" in str(item["location"]) and "." not in name
+        if str(item["location"]).endswith(".py.html"):
+            continue
         if is_member:
             items[-1]["text"] = f"{items[-1]['text']}<p>{name}</p>{item['text']}"
         else:

@@ -18,7 +18,7 @@ from docs.api import entries
 from docs.site.docstrings import markdown as docstring
 from docs.site.formulas import mathml
 from docs.site.names import Names
-from docs.site.search_index import put_members_into_classes
+from docs.site.search_index import put_pages_first
 from docs.site.stage import Stage, place_of
 from docs.site.tutorials import execute, page
 
@@ -262,7 +262,7 @@ def test_docstrings_of_classes_are_complete(thing):
         check_function(function, inspect.getdoc(function))
 
 
-def test_members_are_found_in_the_entry_of_their_class(tmp_path):
+def test_members_are_found_in_the_entry_of_their_class_and_source_files_by_their_pages(tmp_path):
     entries = [
         ("tasks/find.html#threshold", "Threshold", "when"),
         ("api/semfov.paths.html", "semfov.paths", ""),
@@ -273,11 +273,12 @@ def test_members_are_found_in_the_entry_of_their_class(tmp_path):
             "from",
         ),
         ("api/semfov.paths.html#semfov.paths.open", "semfov.paths.open", "opens"),
+        ("repository/examples/ros_node.py.html", "examples/ros_node.py", "import rclpy"),
     ]
     index = tmp_path / "search.json"
     items = [{"location": place, "title": title, "text": text} for place, title, text in entries]
     index.write_text(json.dumps({"config": {"lang": ["en"]}, "items": items}))
-    put_members_into_classes(index)
+    put_pages_first(index)
     written = json.loads(index.read_text(encoding="utf-8"))
     assert written["config"] == {"lang": ["en"]}
     assert written["items"] == [*items[:2], {**items[2], "text": "words<p>threshold</p>from"}, items[4]]

@@ -168,11 +168,16 @@ ASKED = {
     "camera": "tasks/camera",
     "video": "tasks/video",
     "heat map": "tasks/poster",
+    "heatmap": "tasks/poster",
     "gpu": "tasks/running",
     "label": "tasks/count",
     "count": "tasks/count",
     "onnx": "#an-onnx-model-of-your-own",
     "offline": "install",
+    "ros": "guides/robots",
+    "calibration": "guides/evaluation",
+    "license": "LICENSE",
+    "batch": "tasks/running",
 }
 """Words that a reader may ask for, and a page that is among the first three answers."""
 ANSWERS = """() => {
