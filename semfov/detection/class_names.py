@@ -31,6 +31,9 @@ _PLACEHOLDERS = ("", "n/a", "none", "null", "background", "__background__", "no 
 """Names of outputs that do not stand for a class, in lower case: gaps in COCO's category ids, and background."""
 
 
+NAMING = "give them by classes=cat,dog, or in classes.txt beside the file"
+"""How names are given to a model that has none."""
+
 _Name = TypeVar("_Name")
 
 

@@ -25,7 +25,8 @@ from semfov.detection.feature_maps import choose_layers, landmarks
 from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_check import check_file, places_of_weights
 from semfov.detection.onnx_file import OnnxSettings, check_canvas, names_beside, read_settings, with_input_size
-from semfov.detection.onnx_heads import HEADS, explain_misplacement, recognise
+from semfov.detection.onnx_heads import HEADS
+from semfov.detection.onnx_recognition import MISFITS, explain_misplacement, recognise, remedy_of_head
 from semfov.detection.onnx_session import OnnxSession, Provider
 from semfov.detection.onnx_signature import Signature
 from semfov.detection.preprocessing import Preprocessing, check_bytes
@@ -229,7 +230,7 @@ class OnnxDetector(Detector):
                 self._check_logits(output, "softmax or sigmoid", "export the model without it")
         if self.logits:
             self._check_logits(candidates.classes, "sigmoid", "set logits=False")
-        reason = explain_misplacement(candidates.boxes, size)
+        reason = explain_misplacement(candidates.boxes, size, lambda: remedy_of_head(outputs, size, self._scores))
         expected = f"boxes on a canvas of {size[0]} x {size[1]} px with head {self.head!r}"
         check_data(reason is None, self.name, expected, reason)
 
@@ -472,7 +473,9 @@ def _score_count(head: str, outputs: Mapping[str, Tensor], size: Canvas, names: 
     """Count the scores of a box by decoding outputs of one canvas; raises `InputError` where the head does not fit."""
     try:
         candidates = HEADS[head].decode(outputs, size, None if names is None else len(names))
-    except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
+    except InputError:
+        raise
+    except MISFITS as error:
         listed = ", ".join(f"{name} {tuple(output.shape)}" for name, output in outputs.items())
         raise InputError(
             f"head: expected the model's head, got {head!r}, which does not fit the outputs {listed[:_MOST_LISTED]}"
@@ -499,7 +502,8 @@ def _canvas_size(session: OnnxSession, input_size: int | Sequence[int] | None) -
     height, width = session.shape[2:]
     if input_size is None:
         if height is None or width is None:
-            raise InputError(f"input_size: expected (width, height), as {session.path.name} takes any size, got None")
+            expected = f"(width, height), as {session.path.name} takes any size"
+            raise InputError(f"input_size: expected {expected}, got None; give that of its training, as input_size=640")
         check_canvas(session.path.name, (width, height))
         return width, height
     size = _sides(input_size)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from semfov.detection.class_names import NAMING
 from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_signature import selected_outputs
 from semfov.detection.scores import Candidates
@@ -125,7 +126,7 @@ def decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
     """
     if classes is None:
         expected = "the names of the model's classes, which its rows only number"
-        raise InputError(f"classes: expected {expected}, got None; give them by classes=cat,dog")
+        raise InputError(f"classes: expected {expected}, got None; {NAMING}")
     check_shape(rows, "rows", None, None, 6)
     scores = rows[..., 4]
     numbers = rows[..., 5]

@@ -8,7 +8,7 @@ between pixels (0 is the left edge of the canvas).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -29,11 +29,10 @@ from semfov.detection.onnx_decoding import (
     fraction_corners,
     likely_rows,
 )
-from semfov.detection.onnx_places import axes_exchanged, misplacement
 from semfov.detection.onnx_signature import Rows, Signature, query_logits
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
-from semfov.errors import InputError, check, check_shape
+from semfov.errors import check, check_shape
 
 _Outputs = Mapping[str, Tensor]
 """Outputs of a model by name, in its order."""
@@ -49,8 +48,6 @@ _NANODET = Preprocessing(
 )
 
 _DISTANCE_CHANNELS = 32  # of NanoDet-Plus: 8 bins for each side of a box
-_OTHER_TASKS = ("segment", "pose", "obb", "classify")
-"""Tasks in Ultralytics' metadata whose outputs are other ones than those of detection."""
 
 
 class Head(ABC):
@@ -85,7 +82,8 @@ class Head(ABC):
             signature: names and shapes of the model's outputs, and what its metadata says.
 
         Returns:
-            True where they fit. Several heads may fit: `recognise` then compares where they place boxes.
+            True where they fit. Several heads may fit: `semfov.detection.onnx_recognition` then compares where they
+            place boxes.
         """
 
     @abstractmethod
@@ -108,87 +106,6 @@ class Head(ABC):
 
 HEADS: dict[str, Head] = {}
 """All known heads by name."""
-
-
-def recognise(signature: Signature, run: Callable[[], _Outputs] | None = None) -> str:
-    """Recognise the head of a model.
-
-    Args:
-        signature: names and shapes of the model's outputs, and what its metadata says.
-        run: runs the model on some image, for its outputs by name; called where several heads fit the signature, to
-            compare where they place boxes. None leaves such a model unrecognised.
-
-    Returns:
-        The head's name.
-
-    Raises:
-        InputError: no head fits, or several do, or the model does not detect objects with all their scores.
-    """
-    task = signature.metadata.get("task", "detect")
-    check(task not in _OTHER_TASKS, "task", "a model that detects objects with upright boxes", f"one for {task!r}")
-    _check_has_scores(signature)
-    names = [name for name, head in HEADS.items() if head.recognises(signature)]
-    if len(names) > 1 and run is not None:
-        names = _placing_boxes(names, run(), signature)
-    # Outputs with YOLOX's own names are YOLOX's, even where the values do not tell which form they have.
-    if len(names) == 1 or names == ["yolox", "yolox-decoded"]:
-        return names[0]
-    raise InputError(_unrecognised(signature, names))
-
-
-def _placing_boxes(names: list[str], outputs: _Outputs, signature: Signature) -> list[str]:
-    """List the heads that place boxes on the canvas; all, if none does, so that a message names them."""
-    placing = [name for name in names if _places_boxes(HEADS[name], outputs, signature)]
-    return placing or names
-
-
-def _unrecognised(signature: Signature, names: Sequence[str]) -> str:
-    """Write that no head fits a signature for certain, or that several do, and what to do."""
-    shapes = ", ".join(f"{name} {shape}" for name, shape in signature.outputs)
-    width, height = signature.canvas
-    count = "" if signature.classes is None else f" with {signature.classes} classes"
-    candidates = f"{' and '.join(names)} fit" if names else "no head fits with certainty"
-    return (
-        f"outputs {shapes} on a {width} x {height} canvas{count}: {candidates}; "
-        f"name the head with head=, one of {', '.join(sorted(HEADS))}"
-    )
-
-
-def _check_has_scores(signature: Signature) -> None:
-    """Raise `InputError` for rows of 7: image, box, class and score, which are left after non-maximum suppression."""
-    if signature.layout != "rows":
-        return
-    rows, columns = signature.rows.sides
-    name, _ = signature.outputs[0]
-    # With three classes, rows of 7 are boxes and all scores; with as many rows as cells, no box was left out.
-    selected = columns == 7 and signature.classes != 3 and not signature.rows.cells.anchors
-    output = f"output {name} (1, {rows}, {columns})"
-    check(not selected, output, "all class scores of each box", "boxes without them; export the model without NMS")
-
-
-def _places_boxes(head: Head, outputs: _Outputs, signature: Signature) -> bool:
-    """Tell whether the boxes that a head makes of outputs lie on the canvas."""
-    try:
-        candidates = head.decode(outputs, signature.canvas, signature.classes)
-    except InputError:
-        return False
-    return explain_misplacement(candidates.boxes, signature.canvas) is None
-
-
-def explain_misplacement(boxes: Tensor, canvas: Canvas) -> str | None:
-    """Describe what boxes of one pass look like if another head has made them, and what to do.
-
-    Args:
-        boxes: `(B, N, 4)`, corners in canvas pixels.
-        canvas: `(width, height)` in pixels.
-
-    Returns:
-        The description; None for boxes in place.
-    """
-    if axes_exchanged(boxes, canvas):
-        return "boxes whose y comes before x; export the model with boxes as x1 y1 x2 y2"
-    reason = misplacement(boxes, canvas)
-    return None if reason is None else f"{reason}; name the model's head with head=, one of {', '.join(sorted(HEADS))}"
 
 
 class _CellsHead(Head):
@@ -234,6 +151,8 @@ class _Candidates(Head):
 
     def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
         scores = outputs["classes" if "classes" in outputs else "scores"]
+        check_shape(outputs["boxes"], "output boxes", None, None, 4)
+        check_shape(scores, "output scores", None, outputs["boxes"].shape[1], None)
         return Candidates(outputs["boxes"], scores, outputs.get("objectness"), outputs.get("background"))
 
 

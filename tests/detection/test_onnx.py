@@ -261,7 +261,9 @@ def test_outputs_of_a_wrong_head_are_refused(make_onnx):
     with pytest.raises(DataError, match="expected boxes on a canvas of 64 x 64 px with head 'yolox', got"):
         load_onnx(decoded, classes=NAMES, head="yolox")(canvas)
     fractions = make_onnx({"output0": random(1, 84, 7).transpose(0, 2, 1)}, file="other.onnx")
-    unusable("got fractions of the canvas", load_onnx(fractions, classes=NAMES), canvas)
+    unusable("got fractions of the canvas instead of pixels; export", load_onnx(fractions, classes=NAMES), canvas)
+    for head in ("picodet", "nanodet", "detr", "candidates", "end2end-nms"):
+        refused("does not fit the outputs", load_onnx, fractions, classes=NAMES, head=head)
 
 
 def test_rows_may_be_boxes_or_channels(make_onnx):

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from semfov.detection import onnx_decoding as decoding
 from semfov.detection.onnx_cells import cell_grid
-from semfov.detection.onnx_heads import HEADS, Head, explain_misplacement, recognise
+from semfov.detection.onnx_heads import HEADS, Head
+from semfov.detection.onnx_recognition import explain_misplacement, recognise
 from semfov.detection.onnx_signature import Signature
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError
@@ -208,10 +209,11 @@ def test_a_head_is_registered_by_being_defined():
         ("with 20 classes: no head fits", signature((1, 84, 8400), classes=20)),
     ],
 )
-def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
+def test_ambiguous_signatures_are_refused_with_the_heads_that_fit(fits, given):
     with pytest.raises(InputError, match=fits) as error:
         recognise(given)
-    assert all(head in str(error.value) for head in HEADS)
+    remedy = str(error.value).rpartition("; ")[2]
+    assert all(head in remedy for head in HEADS if head in fits)
 
 
 def test_models_without_score_vectors_or_of_other_tasks_are_refused():
@@ -222,6 +224,24 @@ def test_models_without_score_vectors_or_of_other_tasks_are_refused():
     refused("84 rows, one for each cell of a 64 x 64 canvas", decode, "yolox", (64, 64), noise(1, 83, 8))
     refused("bins", decoding.decode_distances, noise(1, 84, 3), noise(1, 84, 30), noise(84, 3))
     refused("boxes", decoding.decode_detr, noise(1, 5, 3), noise(1, 5, 5), (64, 64))
+
+
+@pytest.mark.parametrize(
+    ("given", "run", "said"),
+    [
+        pytest.param(signature((1, 17, 8400), classes=3), None, r"classes= with the 13 names", id="names"),
+        pytest.param(
+            signature((1, 100, 84)),
+            {"output0": noise(1, 100, 84).sigmoid()},
+            "head=, one of rfdetr, rtdetr$",
+            id="a head",
+        ),
+        pytest.param(signature((1, 255, 20, 20), (1, 255, 40, 40)), None, "export the model with", id="none"),
+    ],
+)
+def test_the_remedy_for_outputs_that_no_head_fits_is_one_that_works(given, run, said):
+    with pytest.raises(InputError, match=said):
+        recognise(given, run and (lambda: run))
 
 
 def test_places_of_a_pass_tell_heads_of_one_shape_apart():
