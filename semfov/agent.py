@@ -28,6 +28,7 @@ from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
+from semfov.io.state import MovableModule
 from semfov.kinds import KindName, Quality
 from semfov.live import LivePerception
 from semfov.model_folder import is_model_file, open_folder
@@ -53,7 +54,7 @@ from semfov.zoom import GlimpseEvidence, WindowEye
 _Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes
 
 
-class ActivePerception(nn.Module):
+class ActivePerception(MovableModule):
     """An agent that looks at any picture, to find a target, to find all objects, or to learn what is where.
 
     The picture decides how the agent looks (`how="auto"`). At a flat picture of any size it looks at windows, the first

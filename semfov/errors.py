@@ -120,6 +120,21 @@ def check_device(device: object) -> None:
         check(False, "device", f"one that PyTorch has here ({', '.join(devices_here())})", got)
 
 
+def check_is_device(device: object) -> None:
+    """Raise `InputError` for what PyTorch does not take as a device, on any machine."""
+    try:
+        torch.device(device)  # type: ignore[call-overload]
+    except (RuntimeError, TypeError):
+        raise InputError(f"device: expected a device of PyTorch, such as cpu or cuda, got {device!r}") from None
+
+
+def check_where_to(*arguments: object, **options: object) -> None:
+    """Check a device that the arguments of a module's method `to` name by a text."""
+    device = options.get("device", next(iter(arguments), None))
+    if isinstance(device, str):
+        check_is_device(device)
+
+
 def devices_here() -> list[str]:
     """List the kinds of devices that PyTorch has on this machine."""
     is_here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.mps.is_available()}

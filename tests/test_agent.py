@@ -157,6 +157,17 @@ def test_a_device_that_is_not_there_is_refused_with_those_that_are():
             ask()
 
 
+def test_what_is_no_device_is_refused_by_every_part():
+    agent = ActivePerception.raw(Coloured())
+    for part in (agent, agent.eye, agent.eye.detector, agent.eye.sensor):
+        for move in (lambda part=part: part.to("gpu"), lambda part=part: part.to(device="gpu")):
+            with pytest.raises(
+                InputError, match="device: expected a device of PyTorch, such as cpu or cuda, got 'gpu'"
+            ):
+                move()
+        assert part.to("cpu") is part.to(torch.device("cpu"), torch.float32) is part
+
+
 @pytest.mark.parametrize("mapper", [{}, {"prior": 0.25, "fusion": "sum"}], ids=["same", "other"])
 def test_search_keeps_the_beliefs_of_both_observers(image, mapper):
     """The map of all classes is that of the exploring observer, the posterior that of the searching observer."""

@@ -37,7 +37,7 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
     is_at_limit = record.ending == "passes"
-    limit = " (the limit)" if is_at_limit else ""
+    limit = " (the limit of --passes)" if is_at_limit else ""
     looks = f"{amount(record.passes, 'look')}{limit} in {seconds:.1f} s"
     if record.kind.turns:  # whose seconds are those of its movements and looks
         looks += f" on this machine, {record[-1].seconds:.1f} s of eye and head"

@@ -1,7 +1,7 @@
 """The decision of a search: whether the image holds the target, where, and with what probability, on what evidence."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -43,7 +43,7 @@ class Decision(OtherWords):
     outcome: Outcome
     probability: float
     cell: int | None = None
-    box: Tensor | None = None
+    box: Tensor | None = field(default=None, compare=False)  # tensors have no one truth
     place: float | None = None
     confirm: float | None = None
 

@@ -39,7 +39,7 @@ def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
     return vectors.scatter(1, labels[:, None], scores[:, None])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Detections:
     """A padded batch of detections, each with a score for every class and for background.
 

@@ -22,7 +22,7 @@ from semfov.detection.transformers import TransformersDetector
 from semfov.detection.ultralytics import UltralyticsDetector
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import Runtime, YoloV3
-from semfov.errors import DataError, InputError, check, check_device, check_options, lookup
+from semfov.errors import DataError, InputError, check, check_device, check_is_device, check_options, lookup
 from semfov.io.files import check_regular, read_text
 
 _EXPORTED = re.compile(r"(yolo(v?([5-9]|1\d|26)|world|-nas|e-)[a-z0-9_-]*|rt-?detr[a-z0-9_-]*)")
@@ -144,7 +144,7 @@ def _load(load: _Loader, model: str | nn.Module, description: str, options: dict
     if options.get("classes") is not None:
         options = {**options, "classes": given_names(options["classes"])}
     if "device" in options:
-        _check_is_device(options["device"])
+        check_is_device(options["device"])
     selection = _part(options, _SELECTING)
     Selection(**selection)
     detector = load(model, **_part(options, names_of_loader))
@@ -164,14 +164,6 @@ def _load(load: _Loader, model: str | nn.Module, description: str, options: dict
 def _part(options: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     """Take the options of some names."""
     return {name: value for name, value in options.items() if name in names}
-
-
-def _check_is_device(device: torch.device | str) -> None:
-    """Raise `InputError` for what PyTorch does not take as a device."""
-    try:
-        torch.device(device)
-    except (RuntimeError, TypeError):
-        raise InputError(f"device: expected a device of PyTorch, such as cpu or cuda, got {device!r}") from None
 
 
 def _options_of(load: _Loader) -> list[str]:

@@ -28,7 +28,7 @@ _PRINTED = 20  # largest number of objects in the text form
 _BORDER = 2 / 416  # boxes that come this near to a border of their window, in longer sides of the window, are cut by it
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Objects(OtherWords):
     """Objects of a picture, most confident first.
 

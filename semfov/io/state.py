@@ -2,18 +2,27 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.errors import InputError
+from semfov.errors import InputError, check_where_to
 
 EXTRA_STATE = "_extra_state"
 """Name of the settings of a module in its state."""
 
 
-class StatedModule(nn.Module):
+class MovableModule(nn.Module):
+    """Base of modules that refuse what is no device in words of their own."""
+
+    def to(self, *arguments: Any, **options: Any) -> Self:
+        """Move or convert the module, as `torch.nn.Module.to` does; what is no device is refused."""
+        check_where_to(*arguments, **options)
+        return super().to(*arguments, **options)
+
+
+class StatedModule(MovableModule):
     """Base of modules whose settings, as bytes of JSON, are in their state; one without them is loaded, too.
 
     Settings that a module has by construction are compared where a state is loaded. Values that a fit has chosen beside

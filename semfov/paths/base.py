@@ -328,7 +328,7 @@ class Record(Conversion):
         """Make the other attributes from the tensors and JSON values of a file."""
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class Moment(Record):
     """Base of the records of one frame of a stream.
 

@@ -10,7 +10,7 @@ from semfov.detection.detections import Detections
 from semfov.paths.look import Box, RecordedLook, cell_columns, finite_or_none
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class FoveaLook(RecordedLook):
     """One look of a fovea: a fixation, or a closer look at a place of the photograph itself.
 

@@ -105,7 +105,7 @@ class HeadWords(Words):
         return f"views of {width} × {height} px with fields of view of {fields} degrees"
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class HeadLook(RecordedLook):
     """One look of an eye in a head that turns.
 
@@ -171,7 +171,7 @@ def head_looks(
     )
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class HeadPath(Record):
     """The record of an episode: where eye and head looked, what was seen and what was believed.
 

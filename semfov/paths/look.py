@@ -17,7 +17,7 @@ Box = tuple[float, float, float, float]  # `(x1, y1, x2, y2)`
 CONFIDENT = 0.1  # score from which on the detections of a look are counted, named and drawn
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class RecordedLook:
     """One look of a record, in pixels of the picture.
 

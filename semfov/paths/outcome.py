@@ -52,7 +52,7 @@ class _ConfirmedPlace(NamedTuple):
     look: int
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class Outcome(ABC):
     """The looks of a record, what they found, and what was decided (`semfov.paths.Record`)."""
 

@@ -77,7 +77,7 @@ _FORMAT = Format(
 """Format of the files of scanpaths."""
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class _CellRecord(Record):
     """Base of the records of looks of a fovea at cells."""
 
@@ -193,7 +193,7 @@ class ScanpathWords(Words):
         return [f"looks at (column, row): {path} of {cells_of_grid}"]
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class Scanpath(_CellRecord):
     """Looks of one episode of a fovea in order, fixations and closer looks, with the belief after each fixation.
 
@@ -457,7 +457,7 @@ class FoveaMomentWords(MomentWords):
         return [f"frame {self.record.number}, at (column, row): ({column}, {row})"]
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class FoveaMoment(_CellRecord, Moment):
     """Look, belief and decision at one frame that a fovea looks at.
 

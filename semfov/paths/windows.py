@@ -164,7 +164,7 @@ class WindowWords(Words):
     @property
     def _ending(self) -> str:
         """End of the summary's first sentence; the number of looks stands before it."""
-        return " (the limit)." if self.record.ending == "passes" else super()._ending
+        return " (the limit of passes=)." if self.record.ending == "passes" else super()._ending
 
     @property
     def value(self) -> str:
@@ -205,7 +205,7 @@ class WindowWords(Words):
         return [f"looks at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class LookAtWindow(RecordedLook):
     """One look at a window of a picture, or of a frame of a stream.
 
@@ -259,7 +259,7 @@ def _has_found(record: "ZoomPath") -> bool:
     return bool(record.sought) and len(record.objects) > 0
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class ZoomPath(Record):
     """The record of a search or an exploration of a large picture.
 
@@ -480,7 +480,7 @@ class WindowMomentWords(WindowWords, MomentWords):
         return [f"frame {self.record.number}", *super().lines]
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class WindowMoment(ZoomPath, Moment):
     """The looks that count at one frame whose windows are looked at, and what they show.
 

@@ -159,7 +159,7 @@ def same(a, b):
     if isinstance(a, np.ndarray):
         return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
     if dataclasses.is_dataclass(a):
-        compared = [field.name for field in dataclasses.fields(a) if field.compare]
+        compared = [field.name for field in dataclasses.fields(a) if field.compare or field.name == "box"]
         return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in compared)
     if isinstance(a, Views):
         return all(
@@ -208,6 +208,19 @@ def test_closer_looks_are_counted_as_looks_are_also_those_of_earlier_files(tmp_p
     assert ZoomPath.load(file).closer[0].index == 2
 
 
+@pytest.mark.parametrize("make", RECORDS)
+def test_records_are_told_apart_without_their_tensors(make):
+    """Two are the same where they are one object, also in lists and sets."""
+    record, same = make(), make()
+    assert record != same
+    assert same in [record, same]
+    assert len({record, same, record}) == 2
+    assert record.detections[0] != same.detections[0]
+    assert record[0] != same[0]
+    assert Decision("found", 0.5, box=BOX) == Decision("found", 0.5, box=BOX.clone())
+    assert Decision("found", 0.5, box=BOX) != Decision("found", 0.6, box=BOX)
+
+
 def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
     path = zoom_path()
     whole = dataclasses.replace(path.closer[0], index=0)
@@ -223,7 +236,7 @@ def test_an_undecided_search_says_what_found_takes():
     """Of a place where closer looks decide, otherwise of the picture; also where a limit ended it."""
     path = replace(zoom_path(), decision=Decision("undecided", 0.61, confirm=0.7402), ending="passes")
     assert path.summary().startswith(
-        "cup: undecided (there with probability 0.61) in 3 looks (the limit). "
+        "cup: undecided (there with probability 0.61) in 3 looks (the limit of passes=). "
         "No place reached probability 0.74 (1 looked at closely). Best place: box "
     )
     assert path.words.ended == "All 3 passes were used. No place reached probability 0.74 (1 looked at closely)."
