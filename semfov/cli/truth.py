@@ -55,8 +55,8 @@ class Truth:
         """Find the id of a picture by its name; of several of one name that whose folders agree best.
 
         Where no image is named as the picture is, names agree in any letter case, and as other systems and addresses
-        write them: `K%C3%BCche.JPG` for `Küche.jpg`. Last come the names that programs give to uploaded pictures, on
-        one side alone.
+        write them: `K%C3%BCche.JPG` for `Küche.jpg`. Then come the names that programs give to uploaded pictures, on
+        one side alone, and last those of pictures that were saved in another format.
 
         Args:
             name: path of the picture.
@@ -68,7 +68,7 @@ class Truth:
         Raises:
             DataError: no image, or several, have this name, or its size is another one.
         """
-        for agree in (eq, _agree_plainly, _agree_after_upload):
+        for agree in (eq, _agree_plainly, _agree_after_upload, _agree_after_export):
             images = self._named(name, agree)
             if len(images) == 1:
                 break
@@ -158,16 +158,31 @@ def _plain(part: str) -> str:
 def _uploaded(part: str) -> str:
     """Write a part of a path plainly, without what programs add to the names of pictures that are uploaded to them.
 
-    Label Studio puts eight digits before a name, `0b51f2a7-kitchen.jpg`, and Roboflow its own suffix behind it,
+    Label Studio puts eight digits before a name, `0b51f2a7-kitchen.jpg`, and the address of its own server,
+    `?d=photos%5Ckitchen.jpg`; others put a question behind it, `kitchen.jpg?token=1`, and Roboflow its own suffix,
     `kitchen_jpg.rf.4a1cdeb7f3.jpg`.
     """
-    plain = re.sub(r"^[0-9a-f]{8}-(?=.)", "", _plain(part))
+    address, _, question = part.partition("?")
+    asked_for = question[2:] if question.startswith("d=") else address
+    plain = re.split(r"[/\\]", _plain(asked_for))[-1]
+    plain = re.sub(r"^[0-9a-f]{8}-(?=.)", "", plain)
     return re.sub(r"_(jpe?g|png|bmp|tiff?|webp)\.rf\.[0-9a-z]+\.[a-z]+$", r".\1", plain)
 
 
+def _stem(plain: str) -> str:
+    """Leave out the suffix of a picture."""
+    return re.sub(r"(?<=.)\.(jpe?g|png|bmp|tiff?|webp)$", "", plain)
+
+
+def _letters(plain: str) -> str:
+    """Leave out the suffix and all but letters and digits, since uploads replace or drop blanks and brackets."""
+    return re.sub(r"[\W_]", "", _stem(plain))
+
+
 def _spellings(part: str) -> set[str]:
-    """Write a part of a path plainly, and without what programs add to it."""
-    return {_plain(part), _uploaded(part)}
+    """Write a part of a path in all ways in which it may agree with another one."""
+    plain, uploaded = _plain(part), _uploaded(part)
+    return {plain, uploaded, _stem(plain), _letters(plain), _letters(uploaded)}
 
 
 def _agree_plainly(part: str, other: str) -> bool:
@@ -180,7 +195,20 @@ def _agree_after_upload(part: str, other: str) -> bool:
 
     Eight digits are also a date: `20240109-cam1.jpg` and `20240101-cam1.jpg` are two pictures.
     """
-    return _plain(other) in _spellings(part) or _plain(part) in _spellings(other)
+    return _plain(other) in (_plain(part), _uploaded(part)) or _plain(part) == _uploaded(other)
+
+
+def _agree_after_export(part: str, other: str) -> bool:
+    """Tell whether parts are the same but for the format, or of an uploaded picture in letters and digits."""
+    if _stem(_plain(part)) == _stem(_plain(other)):
+        return True
+    return _is_upload_of(part, other) or _is_upload_of(other, part)
+
+
+def _is_upload_of(part: str, other: str) -> bool:
+    """Tell whether a program made a part of a path of another one, whose marks it replaced or dropped."""
+    letters = _letters(_uploaded(part))
+    return _uploaded(part) != _plain(part) and letters == _letters(_plain(other)) != ""
 
 
 def _common_end(parts: Sequence[str], others: Sequence[str], agree: Callable[[str, str], bool]) -> int:

@@ -83,7 +83,8 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
     """Read and check a COCO instances file.
 
     Ids of images and categories are integers or strings. Objects need no id and no area, which nothing depends on.
-    Where `iscrowd` is missing or null it is 0. The name of an image may be the end of its `coco_url`, as in LVIS.
+    Where `iscrowd` is missing or null it is 0. The name of an image may be the end of its `coco_url`, as in LVIS, and
+    numbers may be written as texts.
 
     Args:
         path: the file.
@@ -192,14 +193,28 @@ def _checked(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> 
 
 
 def _fault_of(entry: object, fields: Mapping[str, _Field]) -> str | None:
-    """Say which field of an entry is not as expected; None if all are."""
+    """Say which field of an entry is not as expected; None if all are, after numbers in texts were read."""
     if not isinstance(entry, dict):
         return f"expected an object, got {excerpt(entry)}"
     # There are many entries, so that the message is made where it is needed.
     for field, (accepts, expected) in fields.items():
-        if not accepts(entry.get(field)):
+        if accepts(entry.get(field)):
+            continue
+        # Programs that read tables write their numbers as texts.
+        value = entry.get(field)
+        numbers = [_number_of(each) for each in value] if isinstance(value, list) else _number_of(value)
+        if not accepts(numbers):
             return f"expected {field} to be {expected}, got {_shown(entry, field)}"
+        entry[field] = numbers
     return None
+
+
+def _number_of(value: object) -> object:
+    """Read a number that is written as a text; another value stays."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def _by_id(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> dict[Id, Entry]:

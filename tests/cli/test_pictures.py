@@ -174,6 +174,7 @@ def test_all_objects_are_listed_and_written_as_tables(run, photo, large, tmp_pat
     names = {each["id"]: each["name"] for each in coco["categories"]}
     for each, (x1, y1, x2, y2), image in zip(coco["annotations"], boxes, coco["images"], strict=True):
         assert each["bbox"] == pytest.approx([x1, y1, x2 - x1, y2 - y1])
+        assert each["area"] == round(each["bbox"][2] * each["bbox"][3], 2)  # no more digits than its sides
         assert (names[each["category_id"]], each["image_id"]) == ("red", image["id"])
     places = json.loads((tmp_path / "boxes.geojson").read_text())["features"]
     corners = [each["geometry"]["coordinates"][0] for each in places]
@@ -285,6 +286,22 @@ def test_pictures_have_the_names_that_programs_gave_to_what_was_uploaded(make_tr
     assert [truth.image_id(name) for name in ("a.jpg", "00ff00ff-a.jpg", "11111111-a.jpg")] == [3, 2, 3]
     truth = make_truth("0b51f2a7-a.jpg", "00ff00ff-a.jpg")
     unusable("got 2 of 2", truth.image_id, "a.jpg")
+
+
+def test_pictures_are_found_where_addresses_and_exports_changed_their_names(make_truth):
+    """Questions in addresses, separators in percent signs, blanks and brackets that an upload lost, other formats."""
+    truth = make_truth(
+        "/data/local-files/?d=kitchen.jpg", "/data/local-files/?d=photos%5CHall%201.jpg",
+        "https://localhost/a/yard.jpg?token=b&x=1", "images/0b51f2a7-Küche_2_1.jpg", "my-room--1-_jpg.rf.4a1c.jpg",
+        "street.png", "field",
+    )  # fmt: skip
+    names = "kitchen", "Hall 1", "yard", "K\u00fcche 2 (1)", "my room (1)", "street", "field"
+    assert [truth.image_id(f"photos/{name}.jpg") for name in names] == [1, 2, 3, 4, 5, 6, 7]
+    truth = make_truth("street.png", "street.jpg", "a-1.jpg", "00ff00ff-a1.jpg", "00ff00ff-b_1.jpg")
+    assert [truth.image_id(name) for name in ("street.jpg", "a-1.jpg", "a1.jpg", "b 1.png")] == [2, 3, 4, 5]
+    unusable("expected one image .* of street.tif, got 2 of 5", truth.image_id, "street.tif")
+    marks = make_truth("c-1.jpg")  # nothing tells that it was uploaded
+    unusable("got 0 of 1", marks.image_id, "c 1.jpg")
 
 
 def test_dates_and_hashes_in_two_names_are_of_two_pictures(make_truth):

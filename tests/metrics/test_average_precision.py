@@ -10,6 +10,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from semfov.data.annotations import read_annotations
+from semfov.errors import DataError
 from semfov.metrics.average_precision import average_precision
 
 BOXES = [(0, "person", [4, 4, 30, 20]), (0, "dog", [60, 10, 20, 24]), (1, "person", [10, 40, 16, 30])]
@@ -180,6 +181,23 @@ FILES = {
 def test_the_boxes_of_the_file_itself_are_perfect(tmp_path, make):
     data = make()
     assert average_precision(written(tmp_path, data), perfect(data)) == pytest.approx((1, 1))
+
+
+def test_numbers_may_be_texts_as_tables_have_them(tmp_path):
+    """Ids of what an object refers to, too; what is no number is refused with its entry."""
+    data = coco_file()
+    for image in data["images"]:
+        image |= {"width": "100", "height": "80"}
+    for entry in data["annotations"]:
+        entry |= {name: str(entry[name]) for name in ("image_id", "category_id", "iscrowd")}
+        entry["bbox"] = [f"{number}.0" for number in entry["bbox"]]
+    file = written(tmp_path, data)
+    assert average_precision(file, perfect(coco_file())) == pytest.approx((1, 1))
+    assert file.size(1) == (100, 80)
+    for name, wrong in (("bbox", ["4", "nan", "9", "9"]), ("image_id", "9"), ("iscrowd", "yes")):
+        entries = [data["annotations"][0], {**data["annotations"][1], name: wrong}]
+        with pytest.raises(DataError, match=rf"gt\.json: annotations\[1\]: expected {name} to be .*, got"):
+            written(tmp_path, {**data, "annotations": entries})
 
 
 def by_pycocotools(data, results, limit=100):
