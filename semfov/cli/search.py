@@ -23,7 +23,7 @@ from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import held_outputs
 from semfov.cli.sources import EXAMPLE
 from semfov.cli.written import PictureFiles
-from semfov.data.classes import amount, counted
+from semfov.data.classes import amount, counted, plural
 from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
 from semfov.paths.conversion import Values
 from semfov.paths.words import number_with_error
@@ -242,11 +242,12 @@ def _totals(files: PictureFiles, endings: Counter[str], skipped: int) -> str:
 
 
 def _found_in_all(files: PictureFiles) -> str:
-    """Count the objects of each class in all pictures of a find; empty for other tasks, and where none was found."""
+    """Count the objects of each class in all pictures of a find, also of one that was looked for and is nowhere."""
     if not files.job.every:
         return ""
     counts = Counter[str]()
     for row in files.rows.values():
+        counts.update(dict.fromkeys(row.get("targets", ()), 0))
         counts.update(line["class"] for line in row.get("objects", ()))
     if not counts:
         return ""
@@ -255,22 +256,23 @@ def _found_in_all(files: PictureFiles) -> str:
 
 
 def _expected_in_all(rows: Iterable[Values]) -> str:
-    """Say how many objects of the only class that was looked for to expect in all pictures; empty where not known.
+    """Say how many objects of each class that was looked for to expect in all pictures; empty where not known.
 
     The errors of pictures are independent: the square of that of the sum is the sum of their squares.
     """
     looked_at = [row for row in rows if "error" not in row]
-    target = _only({name for row in looked_at for name in row["targets"]})
-    if target is None:
-        return ""
+    targets = list(dict.fromkeys(name for row in looked_at for name in row["targets"]))
     # A sum without the pictures of which no number is expected would be too small.
-    if any(row["expected"].get(target) is None for row in looked_at):
-        return ""
-    text = f"expect {_sum_with_error(looked_at, target)} in all"
-    guesses = [row for row in looked_at if row["expected_guessed"][target]]
-    if not guesses:
-        return text
-    return f"{text}, of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
+    known = [name for name in targets if all(row["expected"].get(name) is not None for row in looked_at)]
+    texts = []
+    for target in known:
+        noun = f" {plural(target)}" if len(targets) > 1 else ""
+        text = f"expect {_sum_with_error(looked_at, target)}{noun} in all"
+        guesses = [row for row in looked_at if row["expected_guessed"][target]]
+        if guesses:
+            text += f", of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
+        texts.append(text)
+    return "; ".join(texts)
 
 
 def _sum_with_error(rows: Sequence[Values], target: str) -> str:
