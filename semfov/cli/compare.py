@@ -17,7 +17,7 @@ from semfov.data.classes import amount
 from semfov.data.large import open_large
 from semfov.errors import SemfovError, check
 from semfov.io.files import check_writable, write_text
-from semfov.io.tables import csv_text
+from semfov.io.tables import csv_text, digits
 from semfov.report.compare import comparison_page
 from semfov.report.template import write_html
 from semfov.viz.compare import plot_comparison
@@ -190,7 +190,10 @@ def _cells(point: Point) -> list[str]:
 def _write(options: CompareOptions, points: Sequence[Point], about: str, sentences: Sequence[str]) -> None:
     """Write the table, the figure and the page into a folder."""
     folder = options.out
-    rows = [[point.way, point.passes, point.seconds, point.ap50, *point.counts] for point in points]
+    rows = [
+        [point.way, digits(point.passes), round(point.seconds, 3), digits(point.ap50), *point.counts]
+        for point in points
+    ]
     write_text(folder / "compare.csv", csv_text([_COLUMNS, *rows]))
     figure = plot_comparison(points, "AP50" if options.annotations else "AP50, all slices taken as the truth")
     save_figure(figure, folder / "compare.png")

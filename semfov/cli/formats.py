@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from semfov.io.tables import csv_text
+from semfov.io.tables import csv_text, pixels
 
 if TYPE_CHECKING:
     from semfov.cli.truth import Truth
@@ -214,9 +214,10 @@ class Coco(ResultsFormat):
         if not {canonical_name(name) for name in names} <= names_in_coco:
             categories = [{"id": number, "name": name} for number, name in enumerate(names, 1)]
         annotations = []
-        for result in record.to_coco(0, categories):
+        for result, confirmed in zip(record.to_coco(0, categories), record.confirmed.tolist(), strict=True):
             _, _, width, height = result["bbox"]
-            annotations.append({**result, "area": width * height, "iscrowd": 0})
+            # One that a closer look confirmed is listed whatever its score.
+            annotations.append({**result, "area": pixels(width * height), "iscrowd": 0, "confirmed": confirmed})
         return {"categories": categories, "parts": annotations}
 
     def text(self, rows: Sequence[Row]) -> str:

@@ -87,6 +87,10 @@ def test_all_slices_find_the_annotated_squares_and_ranked_ones_the_same_in_the_e
     passes = [float(point["passes"]) for point in points["semfov"]]
     assert passes == sorted(set(passes))
     assert float(points["semfov"][-1]["ap50"]) >= float(points["semfov"][0]["ap50"])
+    for point in (slices, *points["best slices"], *points["semfov"]):
+        assert [len(point[name].partition(".")[2]) <= most for name, most in (("seconds", 3), ("ap50", 4))] == [
+            True
+        ] * 2
     assert f"all slices have an AP50 of {float(slices['ap50']):.3f}" in printed.out
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from semfov import Detections, Flat, Grid, Objects, Panorama
+from semfov.cli.formats import Coco
 from semfov.cli.outcome import _crops, _looks_text
 from semfov.decision import CloseUp, Decision
 from semfov.head.views import Views
@@ -145,6 +146,8 @@ def test_what_the_decision_found_is_among_the_objects():
         assert decided.objects.boxes.tolist() == [box, RIGHT]
         assert decided.confirmed.tolist() == [True, False]
         assert decided.objects.scores.tolist() == pytest.approx([0.8, 0.31])
+        in_coco = Coco().added(decided, "a.jpg", None)["parts"]
+        assert [(each["score"], each["confirmed"]) for each in in_coco] == [(0.8, True), (0.31, False)]
     absent = replace(weak, decision=Decision("absent", 0.1, None, None))
     assert absent.objects.boxes.tolist() == []
 
