@@ -6,13 +6,15 @@ tracks ── time passes, the camera moves ──► predicted ── a look at
 """
 
 from dataclasses import dataclass, replace
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from semfov.detection.selection import Selection, remaining_rows
-from semfov.motion import CameraStep, Motion
+from semfov.motion import CameraStep, LostScene, Motion
 from semfov.tracking.assignment import cheapest_pairs
 from semfov.tracking.kalman import Floats, Kinematics
 from semfov.tracking.model import TrackingModel
@@ -53,6 +55,13 @@ class Seen:
     entering: NDArray[np.bool_] | None = None
 
 
+class _Known(NamedTuple):
+    """Objects, and the seconds of the stream at which they were predicted last."""
+
+    tracks: Tracks
+    time: float
+
+
 class Tracker:
     r"""Tracks objects through a stream: Kalman filters of constant velocity, and a probability that each is there.
 
@@ -73,12 +82,12 @@ class Tracker:
     Attributes:
         tracks: the objects, where they are in the present frame.
 
-    Private attributes: `_aside` has the objects of a scene that the camera has lost and may find again, where they were
-    in its last frame; None while none is lost. `_waited` is the time in seconds since that frame, `_last` the last
-    number that was given, and `_is_marked` tells whether the trails have a place in the present frame.
+    Private attributes: `_lost` has the objects of a scene that the camera has lost and may find again, where they were
+    in its last frame. `_last` is the last number that was given, and `_is_marked` tells whether the trails have a place
+    in the present frame.
 
-    Invariant: `tracks` are in the order of their numbers, none of which is given twice; those of `_aside` are lower
-    than those that began after it.
+    Invariant: `tracks` are in the order of their numbers, none of which is given twice; those of `_lost` are lower than
+    those that began after it.
 
     >>> tracker = Tracker()
     >>> box = np.array([[100.0, 100.0, 140.0, 180.0]])
@@ -92,8 +101,8 @@ class Tracker:
     def __init__(self, model: TrackingModel | None = None) -> None:
         self.model = model or TrackingModel()
         self.tracks = Tracks.none()
-        self._aside: Tracks | None = None
-        self._waited = 0.0
+        self._now = 0.0  # seconds of the stream
+        self._lost: LostScene[_Known] = LostScene()
         self._last = 0
         self._is_marked = False
 
@@ -104,30 +113,17 @@ class Tracker:
             seconds: time since the last frame.
             camera: how the camera moved since the last frame; None for one that stands still.
         """
-        self._waited += seconds
+        known = _Known(self.tracks, self._now)
+        self._now += seconds
         self._is_marked = False
-        if camera is None:
-            self.tracks = self._after(self.tracks, seconds, None)
-            self._aside = None
-            return
-        if camera.motion is None:
-            self._set_aside(seconds)
-        else:
-            self.tracks = self._after(self.tracks, seconds, camera.motion)
-        if camera.recovered is not None and self._aside is not None:
-            found = self._after(self._aside, self._waited, camera.recovered)
-            self.tracks = found.joined(self.tracks)
-        if camera.recovered is not None or not camera.waits:
-            self._aside = None
+        scenes = self._lost.follow([known], camera or CameraStep(Motion.still()), self._at_present)
+        self.tracks = reduce(Tracks.joined, (scene.tracks for scene in scenes)) if scenes else Tracks.none()
 
-    def _set_aside(self, seconds: float) -> None:
-        """Set the objects of a scene aside that was lost in the last seconds; others are dropped if one waits."""
-        if self._aside is None:
-            self._aside = self.tracks
-            self._waited = seconds
-        self.tracks = Tracks.none()
+    def _at_present(self, scenes: list["_Known"], motion: Motion) -> list["_Known"]:
+        """Predict objects at the present frame, to which the camera moved."""
+        return [_Known(self._after(tracks, self._now - time, motion), self._now) for tracks, time in scenes]
 
-    def _after(self, tracks: Tracks, seconds: float, motion: Motion | None) -> Tracks:
+    def _after(self, tracks: Tracks, seconds: float, motion: Motion) -> Tracks:
         """Predict objects some seconds later, and forget those that are hardly there any more."""
         model = self.model
         if not len(tracks):
@@ -142,7 +138,7 @@ class Tracker:
             unseen=tracks.unseen + seconds,
         )
         later = later[later.log_odds > np.log(model.least / (1 - model.least))]
-        return later if motion is None or motion.is_still else later.carried(motion)
+        return later if motion.is_still else later.carried(motion)
 
     def see(self, seen: Seen) -> None:
         """Update the objects by a look at the present frame.
