@@ -294,9 +294,10 @@ def test_frames_of_opencv_give_the_same_moments():
     refused("order of channels", agent_with(observer).live, "green", color="brg")
 
 
+@pytest.mark.parametrize("how", ["fovea", "windows"])
 @pytest.mark.parametrize("kind", ["array", "tensor", "floats"])
-def test_a_moment_keeps_the_bytes_of_its_frame_also_where_the_next_one_takes_its_memory(kind):
-    live, pixels = agent_with(Semantic(3)).live("green", how="fovea"), scene(100, 80).mul(255).round().to(torch.uint8)
+def test_a_moment_keeps_the_bytes_of_its_frame_also_where_the_next_one_takes_its_memory(kind, how):
+    live, pixels = agent_with(Semantic(3)).live("green", how=how), scene(100, 80).mul(255).round().to(torch.uint8)
     frame = {"array": pixels.permute(1, 2, 0).numpy().copy(), "tensor": pixels.clone(), "floats": pixels / 255}[kind]
     moment = live.step(frame)
     frame *= 0
@@ -321,11 +322,12 @@ def test_fainter_objects_are_listed_from_the_probability_that_is_asked_for():
     refused("passes: expected 1 for a fovea, or how='windows', got 2", agent.live, how="fovea", passes=2)
 
 
-def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once():
-    """Each frame, which is reduced for the moment, is written over the one before."""
+@pytest.mark.parametrize(("how", "size"), [("fovea", (480, 640)), ("windows", (960, 1280))])
+def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once(how, size):
+    """Each frame, which is reduced for the moment of a fovea, is written over the one before."""
 
     def moments():
-        live = agent_with(observers()["search"]).live("green", seed=5, how="fovea", rate=0.3)
+        live = agent_with(observers()["search"]).live("green", seed=5, how=how, rate=0.3)
         buffer = np.empty((960, 1280, 3), np.uint8)
         for number in range(6):
             small = (scene(20 * number) * 255).byte().permute(1, 2, 0).numpy()
@@ -334,21 +336,23 @@ def test_a_moment_that_is_read_later_is_the_one_that_is_read_at_once():
 
     def told(moment):
         objects = [getattr(moment.objects, name).tolist() for name in ("boxes", "scores", "labels", "passes")]
-        belief = moment.probability.tolist(), moment.visited.tolist(), moment.next_cell
-        return moment.describe(), moment.found, objects, belief, moment.photograph.tolist()
+        belief = (moment.probability.tolist(), moment.visited.tolist()) if how == "fovea" else None
+        return moment.describe(), moment.found, objects, belief, moment.next_point, moment.photograph.tolist()
 
     at_once = [told(moment) for moment in moments()]
     kept = list(moments())
     # No more than the last moments keep their whole frames in memory.
     assert [isinstance(vars(moment)["photograph"], torch.Tensor) for moment in kept] == [True] * 4 + [False] * 2
     assert [told(moment) for moment in kept] == at_once
-    assert kept[0].photograph.shape == (3, 480, 640)
+    assert kept[0].photograph.shape == (3, *size)
 
 
-def test_a_moment_that_nobody_keeps_makes_no_photograph(monkeypatch):
+@pytest.mark.parametrize(("how", "function"), [("fovea", "_reduced"), ("windows", "reduced_copy")])
+def test_a_moment_that_nobody_keeps_makes_no_photograph(how, function, monkeypatch):
     reduced = []
-    monkeypatch.setattr("semfov.agents.fovea_episode._reduced", lambda *frame: reduced.append(frame))
-    live = agent_with(observers()["search"]).live("green", seed=5, how="fovea", rate=0.3)
+    kind = {"fovea": "fovea_episode", "windows": "window_episode"}[how]
+    monkeypatch.setattr(f"semfov.agents.{kind}.{function}", lambda *frame: reduced.append(frame))
+    live = agent_with(observers()["search"]).live("green", seed=5, how=how, rate=0.3)
     for number in range(6):
         moment = live.step(scene(20 * number), 0.2)
     assert moment.number == 5

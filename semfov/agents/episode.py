@@ -6,10 +6,12 @@ and `run` looks until the decision or a limit. A `StreamEpisode` looks once at e
 """
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Generic, Literal, Self, TypeVar
+from weakref import ref
 
 import torch
 from numpy.typing import ArrayLike
@@ -22,6 +24,8 @@ from semfov.errors import InputError, check, check_number, check_whole
 from semfov.motion import Motion
 from semfov.paths import Ending, Moment, Record, RecordedLook
 from semfov.settings import MOST_PASSES, LookSettings, OnLook
+
+_UNREDUCED = 2  # largest number of moments that hold their whole frames
 
 _Module = TypeVar("_Module", bound=nn.Module)
 _Record_co = TypeVar("_Record_co", bound=Record, covariant=True)
@@ -202,8 +206,14 @@ class PictureEpisode(Episode[_Record_co]):
 class StreamEpisode(Episode[_Moment_co]):
     """Base of the episodes of a stream, each frame of which is given to `step`. They have no end.
 
+    The photograph of a moment is made when it is read: most are never read, and reducing a large frame takes as long as
+    half of a look.
+
     Attributes:
         forgetting: how evidence fades with time.
+
+    Private attributes: `_moment` is the record of the present frame, None before the first one. `_latest` has the
+    moments whose photographs may not be made yet.
     """
 
     def __init__(self, goal: Goal, rate: float) -> None:
@@ -211,11 +221,17 @@ class StreamEpisode(Episode[_Moment_co]):
         self.forgetting = Forgetting(rate)
         self._size: tuple[int, int] | None = None  # `(width, height)` of the frames, from the first one on
         self._passes = 0
+        self._moment: _Moment_co | None = None
+        self._latest: deque[ref[Moment]] = deque()
 
     @property
     def passes(self) -> int:
         """Number of passes of the detector so far."""
         return self._passes
+
+    @property
+    def decision(self) -> Decision | None:
+        return None if self._moment is None else self._moment.decision
 
     @torch.inference_mode()
     def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> _Moment_co:
@@ -234,9 +250,21 @@ class StreamEpisode(Episode[_Moment_co]):
     def _look_at(self, frame: ImageLike, passed: float, pose: Motion | ArrayLike | None) -> None:
         """Spend a frame on a look."""
 
-    @abstractmethod
     def moment(self) -> _Moment_co:
-        """Make the record of the present frame, after the first one."""
+        """Give the record of the present frame, after the first one."""
+        if self._moment is None:
+            raise InputError("moment: expected a frame before it, got none; call step with a frame first")
+        return self._moment
+
+    def _keep(self, moment: _Moment_co) -> None:  # type: ignore[misc]
+        """Make a moment the present one; kept for longer, it holds the reduced frame alone."""
+        self._moment = moment
+        self._latest.append(ref(moment))
+        # While a frame is looked at, a loop over frames still has the moment of the one before, and drops it then.
+        if len(self._latest) > _UNREDUCED:
+            older = self._latest.popleft()()
+            if older is not None:
+                _ = older.photograph
 
     def record(self) -> _Moment_co:
         """Make the record of what counts at the present frame: its moment."""
@@ -248,11 +276,6 @@ class StreamEpisode(Episode[_Moment_co]):
         width, height = self._size
         expected = f"{width} × {height} pixels, the size of the first frame"
         check(size == self._size, "frame", expected, f"{size[0]} × {size[1]}")
-
-
-def no_frame_yet() -> InputError:
-    """Make the error of a stream that is asked for its moment before its first frame."""
-    return InputError("moment: expected a frame before it, got none; call step with a frame first")
 
 
 def on_cpu(module: _Module) -> _Module:

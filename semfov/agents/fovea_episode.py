@@ -6,18 +6,16 @@ looks at a photograph, whose record is a `Scanpath`; `FoveaStream` has the look 
 """
 
 import sys
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from weakref import ref
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, no_frame_yet, on_cpu
+from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, on_cpu
 from semfov.belief import Belief, Grid, Verification
 from semfov.belief.prior import Prior, PriorLike
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels
@@ -41,7 +39,6 @@ from semfov.settings import DecisionSettings, Start
 from semfov.strategy import Strategy
 
 _LONGEST = 640  # longer side of the frames that records keep, in pixels
-_UNREDUCED = 2  # largest number of moments that hold their whole frames
 
 
 @dataclass(frozen=True)
@@ -352,8 +349,6 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         self.plan = plan
         self.color = color
         self._gaze: FoveaGaze | None = None  # from the first frame on
-        self._moment: FoveaMoment | None = None
-        self._latest: deque[ref[FoveaMoment]] = deque()  # the moments whose photographs may not be made yet
         self._pixels = torch.zeros(0)  # of the present frame, as they came
         self._since_fixation = 0.0  # seconds
         self._closer_look: tuple[int, Detections, dict[str, float]] | None = None  # cell, what it shows, and its time
@@ -367,15 +362,6 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
     def criterion(self) -> str | None:
         """What a search needs for the decision `found`, in words, after the first frame."""
         return None if self._gaze is None else self._gaze.criterion.criterion
-
-    @property
-    def decision(self) -> Decision | None:
-        return None if self._moment is None else self._moment.decision
-
-    def moment(self) -> FoveaMoment:
-        if self._moment is None:
-            raise no_frame_yet()
-        return self._moment
 
     def _look_at(self, frame: ImageLike, passed: float, pose: Motion | ArrayLike | None) -> None:
         check(pose is None, "pose", "None for a fovea, or how='windows', whose looks follow the camera", pose)
@@ -424,16 +410,6 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         assert step is not None
         self._passes += 1
         self._keep(self._made(self._gaze, int(step.cell), step.detections, {**watch.seconds, **step.seconds}))
-
-    def _keep(self, moment: FoveaMoment) -> None:
-        """Make a moment the present one; kept for longer, it holds the reduced frame alone."""
-        self._moment = moment
-        self._latest.append(ref(moment))
-        # While a frame is looked at, a loop over frames still has the moment of the one before, and drops it then.
-        if len(self._latest) > _UNREDUCED:
-            older = self._latest.popleft()()
-            if older is not None:
-                _ = older.photograph
 
     def _made(
         self,

@@ -16,11 +16,11 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode, no_frame_yet
+from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode
 from semfov.agents.window_objects import MergedLooks, seen_by
 from semfov.belief.prior import Prior
 from semfov.data.inputs import Color, ImageLike
-from semfov.data.large import open_large
+from semfov.data.large import ArrayPicture, open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp, Decision
 from semfov.detection import SCORE_THRESHOLD, Detections, Objects
@@ -468,7 +468,6 @@ class WindowStream(StreamEpisode[WindowMoment]):
         self._limits = EpisodeLimits()
         self._camera = _Camera(follows=follows)
         self._session: WindowSession | None = None  # from the first frame on
-        self._moment: WindowMoment | None = None
         self._frames = 0  # number of frames so far
         self._is_lost = False  # whether the present frame fits none before it
 
@@ -482,17 +481,10 @@ class WindowStream(StreamEpisode[WindowMoment]):
         """What a search needs for the decision `found`, in words, after the first frame."""
         return None if self._session is None else self._session.decisions.criterion
 
-    @property
-    def decision(self) -> Decision | None:
-        return None if self._moment is None else self._moment.decision
-
-    def moment(self) -> WindowMoment:
-        if self._moment is None:
-            raise no_frame_yet()
-        return self._moment
-
     def _look_at(self, frame: ImageLike | LargePicture, passed: float, pose: Motion | ArrayLike | None) -> None:
-        view = self.eye.open(open_large(frame, color=self.color))
+        picture = open_large(frame, color=self.color)
+        # A camera writes the next frame into the same memory, and the photograph of the moment is made when it is read.
+        view = self.eye.open(picture.copied() if isinstance(picture, ArrayPicture) else picture)
         self._check_size(view.picture.size)
         session = self._session
         if session is None:
@@ -504,7 +496,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
             session.look()
             self._passes += 1
         self._frames += 1
-        self._moment = self._made(session, view)
+        self._keep(self._made(session, view))
 
     def _follow(self, session: WindowSession, view: WindowView, passed: float, pose: Motion | ArrayLike | None) -> None:
         """Show the next frame, and carry what is known along with the camera."""
@@ -531,7 +523,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
         return WindowMoment(
             **session.record_fields(looks),
             decision=session.decisions.decision,
-            photograph=reduced_copy(view.picture),
+            photograph=partial(reduced_copy, view.picture),  # type: ignore[arg-type]
             number=self._frames - 1,
             lost=self._is_lost,
             tracks=session.tracks,

@@ -37,6 +37,14 @@ class ArrayPicture(LargePicture):
         window = self._array[y1:y2, x1:x2]
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
 
+    def copied(self) -> "ArrayPicture":
+        """Copy the picture, so that it stays as it is whatever is written to the array.
+
+        Returns:
+            The copy, whose pixels lie in memory in their order.
+        """
+        return ArrayPicture(np.array(self._array, order="C"))
+
 
 def open_large(
     source: LargePicture | ImageLike, *, color: Color = "rgb", white: White | None = None, bands: ChosenBands = None

@@ -503,6 +503,7 @@ class WindowMoment(ZoomPath, Moment):
     next_window: Window
     lost: bool = False
     tracks: Tracks = field(default_factory=Tracks.none)
+    photograph: Tensor | None = MadeWhenRead(None)  # type: ignore[assignment]
 
     _words = WindowMomentWords
     _format = Format(
