@@ -109,8 +109,8 @@ class FoveaKind(KindOfLook):
         return _counted_from(picture.named(record), settings.score_threshold)
 
     def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Moment]:
-        remedy = "for all objects of several classes use how='windows', and for one of them a class without a list"
-        check(not targets, "target", f"one class, or None; {remedy}", targets)
+        expected = "one class by its name, or None, for a fovea, or how='windows', which finds all objects of a list"
+        check(not targets, "target", expected, "a list")
         return self.parts.fovea.stream(target, settings)
 
 

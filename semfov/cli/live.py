@@ -10,11 +10,14 @@ from pathlib import Path
 from shlex import quote
 from time import perf_counter
 
+import torch
+
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, white_of
 from semfov.cli.results import held_outputs
 from semfov.data.classes import amount, counted, known_class
 from semfov.data.sources import Picture, Stream, open_stream
+from semfov.detection import Detections
 from semfov.errors import InputError, check
 from semfov.io.files import check_apart, check_writable, write_text
 from semfov.live import LivePerception
@@ -279,7 +282,9 @@ def _legend(live: LivePerception, moment: Moment) -> list[str]:
     """Say what the line of a frame has in it, and when a search is decided."""
     place = "(x, y) × magnification" if moment.belief_map(len(moment) - 1) is None else "cell (column, row)"
     known = "what is known so far" if moment.decision is None else "what is decided so far"
-    lines = [f"  a line: frame, at {place} of the look: what it shows, with scores; then {known}"]
+    names = ", ".join(moment.classes[label] for label in moment.sought)
+    shown = f"what it shows of {names}" if names else "what it shows"
+    lines = [f"  a line: frame, at {place} of the look: {shown}, with scores; then {known}"]
     if live.criterion is not None:
         lines.append(f"  found: when {live.criterion} (--confirm)")
         lines.append("  absent: when p is below one half, and no closer look is worth a frame (--stop-below)")
@@ -300,7 +305,15 @@ def _moment_line(moment: Moment) -> str:
         place = f"cell ({row['column']}, {row['row']})"
         most_likely = f", most likely at cell ({highest_column}, {highest_row})"
     if moment.examined is None:
-        look = f"at {place}: {detections_in_words(moment.seen, moment.classes, 2)}"
+        look = f"at {place}: {detections_in_words(_sought_of(moment), moment.classes, 2)}"
     else:
         look = f"closely at {place}: p {moment.examined.place:.2f} there"
     return f"{f'{moment.number:4d}  {look}':60s}  {moment.describe()}{most_likely}"
+
+
+def _sought_of(moment: Moment) -> Detections:
+    """Take the detections of the classes that are looked for; all where none is named."""
+    if not moment.sought:
+        return moment.seen
+    labels = moment.seen.labels[0]
+    return moment.seen.take(torch.isin(labels, labels.new_tensor(moment.sought)))

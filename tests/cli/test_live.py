@@ -91,11 +91,14 @@ def test_a_video_is_searched_or_explored(run, tmp_path):
     assert code == 0
     lines = printed.out.splitlines()
     assert lines[0] == "red.avi: searching for “red”"
-    assert lines[1].startswith("  a line: frame, at cell (column, row) of the look: what it shows, with scores; then ")
+    assert lines[1].startswith("  a line: frame, at cell (column, row) of the look: what it shows of red, ")
     assert re.match(r"     0  at cell \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at cell \(", lines[2])
     assert re.search(r"\d frames/s$", lines[5])
     assert re.match(r"4 frames, [\d.]+ frames/s after the first 3", lines[6])
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
+    code, printed = run("live", path, "--target", "green", "--frames", 2)
+    # Only what is looked for is named.
+    assert len(re.findall(r"\n +\d  at cell \(\d, \d\): nothing ", printed.out)) == 2
     run("live", path, "--frames", 2, "--out", tmp_path / "seen.avi")
     assert len(read(tmp_path / "seen.avi")) == 2
     code, printed = run("live", path)

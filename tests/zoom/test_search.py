@@ -389,7 +389,12 @@ def test_an_agent_with_raw_scores_looks_at_photographs_by_windows(raw, picture):
 
 def test_arguments_that_do_not_suit_the_kind_of_look_are_refused(raw, picture):
     refused(r"how: expected 'fovea', 'windows' or 'auto' for a stream; .* got head", raw.live, "red", how="head")
-    refused(r"target: expected one class, or None; .* how='windows'", raw.live, ["red", "blue"], how="fovea")
+    refused(
+        r"target: expected one class by its name, .* how='windows', .* got a list",
+        raw.live,
+        ["red", "blue"],
+        how="fovea",
+    )
     refused(r"start: expected None for frames that are looked at by windows", raw.live, "red", how="windows", start=3)
     live = raw.live("red", start=3)
     refused("start: expected None", live.step, picture)
