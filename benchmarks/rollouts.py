@@ -7,7 +7,7 @@ import torch
 from benchmarks.timing import Comparison
 from semfov import Detections, Grid, observers, policies
 from semfov.episode import StoredLooks
-from semfov.fit.protocols import Trial, run_episodes
+from semfov.runs.protocols import Trial, run_episodes
 from semfov.strategy import Strategy
 
 CLASSES, SHIFTS = 80, 30

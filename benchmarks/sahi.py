@@ -34,12 +34,12 @@ from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.agents.windows import ZoomAgent
 from semfov.data.images import to_bytes
 from semfov.detection.objects import FAINTEST, Objects
-from semfov.fit.window_looking import TileSize
 from semfov.io.files import write_text
 from semfov.observation.matching import right_boxes
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.window_looking import TileSize
 from semfov.settings import FindSettings
 from semfov.viz.style import COLOURS, make_figure, save_figure, styled
 from semfov.zoom.episode import Order, WindowStep, look_by_look

@@ -24,7 +24,6 @@ from eval.comparison.summary import announce, by_scene, collect_records, write_s
 from eval.search.report import found
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
-from semfov.fit.looking import Looking
 from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
 from semfov.io.files import write_text
 from semfov.io.ranges import Count, Range
@@ -32,6 +31,7 @@ from semfov.metrics.episodes import FloatArray, standard_error
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.config import PolicyConfig, RunConfig
+from semfov.runs.looking import Looking
 from semfov.runs.presets import AGENT
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish

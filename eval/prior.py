@@ -30,18 +30,18 @@ from semfov.belief.prior import PriorLike
 from semfov.data.classes import class_index
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.protocols import choose_classes
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.io.ranges import Count, Seed, Share, Whole
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
+from semfov.runs.protocols import choose_classes
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import SceneRun, finish
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_detector, make_scenes
 from semfov.runs.tables import plus_minus, share, table
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.settings import DecisionSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye

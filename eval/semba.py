@@ -27,13 +27,13 @@ from semfov.detection.detections import Detections
 from semfov.episode import EpisodeLook, Looks, Step, rollout
 from semfov.errors import DataError, check
 from semfov.eye import Eye
-from semfov.fit.looking import CellLooks, Looking
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.files import write_text
 from semfov.io.ranges import Positive, Share
 from semfov.runs.command import command
 from semfov.runs.config import BeliefConfig, DetectorConfig, LookingConfig, ProtocolConfig, SensorConfig
+from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.looks import photograph_looks
 from semfov.runs.progress import track
 from semfov.runs.seeds import noise_for

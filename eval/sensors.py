@@ -32,7 +32,6 @@ from semfov.data.scene import Scenes
 from semfov.detection.detections import highest_score
 from semfov.errors import check, lookup
 from semfov.eye import Eye
-from semfov.fit.protocols import choose_classes
 from semfov.io.files import plain_name, write_text
 from semfov.io.ranges import Count, Whole
 from semfov.metrics.episodes import area_under_roc
@@ -41,6 +40,7 @@ from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.protocols import choose_classes
 from semfov.runs.scene_run import finish
 from semfov.runs.tables import percent, plus_minus, table
 from train.fit_fom import FitFomConfig, fit_fom

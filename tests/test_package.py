@@ -22,11 +22,11 @@ SUBPACKAGES = [
     "version", "words", "errors", "threads", "io", "data", "kinds", "settings", "motion", "sensor", "detection",
     "observation", "dirichlet", "belief", "observers", "gaze", "acquisition", "policies", "saliency", "eye",
     "episode", "decision", "zoom", "tracking", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
-    "agent", "metrics", "viz", "report", "runs", "cli", "__main__", "baselines", "human", "fit", "envs",
+    "agent", "metrics", "viz", "report", "runs", "cli", "__main__", "baselines", "human", "envs", "fit",
 ]  # fmt: skip
-# Others' models for comparison, what is known of people, the fits with their stored looks and protocols, and the
-# environments stand on all other rooms, which work without them. A command imports them when it is run.
-ABOVE = ("baselines", "human", "fit", "envs")
+# Others' models for comparison, what is known of people, the environments and the fits stand on all other rooms, which
+# work without them. A command imports them when it is run.
+ABOVE = ("baselines", "human", "envs", "fit")
 # A record draws itself, writes its page and compares itself with people by rooms that come after it, in which alone are
 # the packages that draw. Its methods import them when they are called, and nothing of them when the record is made. And
 # public names that rooms above have taken over keep their places: they are imported when they are asked for.

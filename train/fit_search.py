@@ -19,9 +19,9 @@ import json
 import sys
 
 from semfov.fit import search
-from semfov.fit.looking import Looking
 from semfov.fit.search import FitSearchConfig
 from semfov.runs.command import command
+from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import make_observation
 from train.outputs import model_path, write_outputs

@@ -20,7 +20,6 @@ from pathlib import Path
 
 from semfov.belief.verification import TRUE_CELLS
 from semfov.errors import DataError, InputError
-from semfov.fit.looking import Looking
 from semfov.fit.searches import open_photographs
 from semfov.fit.settings import VerificationConfig
 from semfov.fit.training import training_of
@@ -29,6 +28,7 @@ from semfov.fit.verification_report import verification_report
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
+from semfov.runs.looking import Looking
 from semfov.runs.setup import make_searching
 from train.outputs import model_path, write_outputs
 

@@ -6,10 +6,10 @@ from itertools import chain
 import torch
 
 from semfov.data.mosaics import Mosaics
-from semfov.fit.window_looking import found_in
 from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_evidence import ZoomExample
 from semfov.runs.progress import track
+from semfov.runs.window_looking import found_in
 from semfov.zoom.episode import find_everything
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.looks import WindowLook, WindowLooks

@@ -21,14 +21,14 @@ from eval.search.run import SearchConfig
 from semfov.belief.observers import Observer, SemanticMap, SemanticSearch
 from semfov.episode import Step, rollout
 from semfov.episode.stopwatch import Stopwatch
-from semfov.fit.looking import CellLooks
-from semfov.fit.protocols import DrawnSearch, choose_searches
 from semfov.gaze.acquisition import AcquisitionFunction, Uniform
 from semfov.gaze.acquisition.base import Task
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
 from semfov.gaze.policies import Policy
 from semfov.runs.config import PolicyConfig
+from semfov.runs.looking import CellLooks
 from semfov.runs.presets import label
+from semfov.runs.protocols import DrawnSearch, choose_searches
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import make_map, make_searching
 

@@ -12,9 +12,9 @@ from eval.comparison.saliency import SaliencyStore, saliency_map, saliency_table
 from eval.comparison.settings import ComparedConfig
 from semfov.belief.grid import Grid
 from semfov.errors import lookup
-from semfov.fit.policy_looking import PolicyLooking
 from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
 from semfov.runs.config import SaliencyModel
+from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.scene_run import store_folder
 from semfov.strategy import Strategy
 

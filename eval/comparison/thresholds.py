@@ -13,9 +13,9 @@ from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 from semfov.eye import Eye, View
-from semfov.fit.looking import Looking
 from semfov.io.ranges import Share
 from semfov.runs.config import LookingConfig
+from semfov.runs.looking import Looking
 from semfov.runs.looks import one_thread, tight
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish, store_folder

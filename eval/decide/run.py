@@ -37,9 +37,6 @@ from semfov.detection.detections import Detections, highest_score
 from semfov.episode import Looks, Step, StoredLooks, rollout
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye
-from semfov.fit.looking import CellLooks
-from semfov.fit.protocols import DrawnSearch, choose_searches
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.gaze.acquisition.base import Task
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Policy
@@ -48,11 +45,14 @@ from semfov.model_folder import ModelFolder
 from semfov.observation.matching import box_iou
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import PolicyConfig
+from semfov.runs.looking import CellLooks
 from semfov.runs.looks import photograph_looks
 from semfov.runs.presets import AGENT
+from semfov.runs.protocols import DrawnSearch, choose_searches
 from semfov.runs.results import ResultRecord
 from semfov.runs.setup import make_observation, make_verification
 from semfov.runs.store import RememberedLooks
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.settings import DecisionSettings
 from semfov.strategy import Strategy
 from semfov.zoom.evidence import GlimpseEvidence

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from semfov.episode import StoredLooks, rollout
-from semfov.fit.protocols import Exploration
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.episodes import right_cells
+from semfov.runs.protocols import Exploration
 from semfov.strategy import Strategy
 
 _Progress = tuple[list[int], dict[str, list[int]]]

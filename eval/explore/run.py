@@ -18,10 +18,10 @@ from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
 from semfov.episode import StoredLooks
 from semfov.episode.stopwatch import Stopwatch
-from semfov.fit.protocols import Exploration, explorations_of
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import PolicyConfig, ProtocolConfig
+from semfov.runs.protocols import Exploration, explorations_of
 from semfov.runs.results import ResultRecord
 from semfov.runs.seeds import noise_for
 

@@ -13,8 +13,8 @@ from torch.nn import functional as F
 
 from semfov.fit.gaze import GazeFit, fit_oculomotor
 from semfov.fit.gaze_folds import Fold, Groups
-from semfov.fit.viewing import Viewed, counted, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
+from semfov.human.viewing import Viewed, counted, log_centre
 
 Maps = Literal["features", "none", "other people"]
 """What the map is: fitted to feature maps, flat, or the density of all other people in the picture."""

@@ -18,9 +18,9 @@ from semfov.detection.detections import Detections
 from semfov.detection.feature_maps import FeatureMaps
 from semfov.fit.gaze import maps_of, score
 from semfov.fit.gaze_folds import Fold, FoldStore
-from semfov.fit.viewing import Events, MapSource
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.glimpses import features_so_far
+from semfov.human.viewing import Events, MapSource
 from semfov.io.code import modules_digest
 from semfov.metrics.episodes import standard_error
 from semfov.runs.tables import plus_minus, table

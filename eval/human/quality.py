@@ -19,9 +19,9 @@ from semfov.detection.load import load_detector
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, score
 from semfov.fit.gaze_folds import Fold, FoldStore
-from semfov.fit.viewing import Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.views import picture_terms
+from semfov.human.viewing import Viewed, ViewingData, features_of, look
 from semfov.io.code import modules_digest
 from semfov.io.ranges import Range
 from semfov.kinds import Quality

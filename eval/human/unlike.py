@@ -20,9 +20,9 @@ from semfov.data.reading import read_image
 from semfov.data.sources import picture_files
 from semfov.detection.load import load_detector
 from semfov.errors import check
-from semfov.fit.viewing import MapSource, features_of
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.likeness import PictureLikeness, pooled
+from semfov.human.viewing import MapSource, features_of
 from semfov.io.ranges import Count, Range, Seed
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.config import DetectorConfig

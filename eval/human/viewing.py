@@ -27,9 +27,9 @@ from semfov.detection.placement import Placement
 from semfov.errors import check
 from semfov.fit.gaze import GazeFit, maps_of
 from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Groups, Scores
-from semfov.fit.viewing import MapSource, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.fixation_density import cells_of
+from semfov.human.viewing import MapSource, Viewed, ViewingData, features_of, look
 from semfov.io.code import modules_digest
 from semfov.io.files import write_text
 from semfov.io.ranges import Range, Whole

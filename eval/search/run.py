@@ -11,11 +11,11 @@ from eval.comparison.looking import ComparedLooking
 from eval.comparison.settings import ComparedConfig
 from semfov.episode import StoredLooks
 from semfov.episode.stopwatch import Stopwatch
-from semfov.fit.protocols import Trial, episodes_of, run_episodes
 from semfov.gaze.acquisition.base import Task
 from semfov.io.ranges import Whole
 from semfov.runs.config import PolicyConfig
 from semfov.runs.presets import AGENT
+from semfov.runs.protocols import Trial, episodes_of, run_episodes
 from semfov.runs.results import ResultRecord
 from semfov.runs.seeds import noise_for
 

@@ -26,18 +26,18 @@ from semfov.data.scene import Annotation
 from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import check
-from semfov.fit.protocols import choose_classes
-from semfov.fit.window_looking import (
+from semfov.io.ranges import Count, Range, Whole
+from semfov.observation.matching import right_boxes
+from semfov.paths import ZoomPath
+from semfov.runs.protocols import choose_classes
+from semfov.runs.results import ResultRecord
+from semfov.runs.scene_run import SceneRun
+from semfov.runs.window_looking import (
     TileSize,
     WindowLooking,
     WindowLookingConfig,
     found_in,
 )
-from semfov.io.ranges import Count, Range, Whole
-from semfov.observation.matching import right_boxes
-from semfov.paths import ZoomPath
-from semfov.runs.results import ResultRecord
-from semfov.runs.scene_run import SceneRun
 from semfov.zoom.decision import CLOSER
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look, look_for
 from semfov.zoom.hints import DETECTION_SCORE

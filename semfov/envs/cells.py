@@ -26,12 +26,12 @@ from semfov.episode.loop import attend
 from semfov.episode.memory import Memory
 from semfov.episode.stopwatch import Stopwatch
 from semfov.errors import InputError, check
-from semfov.fit.protocols import Exploration, Trial
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import right_cells
 from semfov.paths import Scanpath
 from semfov.paths.stimulus import Stimulus, reduced_copy
 from semfov.paths.trace import Trace
+from semfov.runs.protocols import Exploration, Trial
 from semfov.viz.animation import render
 from semfov.viz.look import plot_fixation
 

@@ -23,9 +23,6 @@ from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, InputError, check, check_options, check_whole
 from semfov.eye import Eye, View
-from semfov.fit.policy_looking import PolicyLooking
-from semfov.fit.protocols import Exploration, Trial, episodes_of, explorations_of
-from semfov.fit.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
 from semfov.runs.config import (
@@ -37,6 +34,9 @@ from semfov.runs.config import (
     RunConfig,
     SensorConfig,
 )
+from semfov.runs.policy_looking import PolicyLooking
+from semfov.runs.protocols import Exploration, Trial, episodes_of, explorations_of
+from semfov.runs.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.sensor.named import SensorName
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice

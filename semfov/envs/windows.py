@@ -16,8 +16,8 @@ from semfov.detection.detections import Detections
 from semfov.envs.gazes import Gazes, GazeSettings, Outcome, scene_number
 from semfov.envs.scenery import ZoomScenery
 from semfov.errors import InputError, check
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.gaze.acquisition.base import Task
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.viz.animation import render
 from semfov.viz.scanpath import plot_scanpath
 from semfov.zoom.lattice import Lattice

@@ -14,4 +14,5 @@
 
 `MosaicFit.fit` (`windows`) fits all that is of windows. `folder` fits the parts of a folder of models one after another
 and keeps those that are better than raw scores; a finished part is read again (`part`). Reports say what was measured.
+Looks are stored by `semfov.runs.looking`, `semfov.runs.zoom_store` and `semfov.human.viewing`.
 """

@@ -20,11 +20,11 @@ from semfov.errors import DataError, InputError
 from semfov.fit.folder import FITS, FolderFit
 from semfov.fit.folder_report import class_counts, folder_report
 from semfov.fit.gaze_model import fit_gaze_model, gaze_report
-from semfov.fit.looking import Looking
 from semfov.fit.settings import FitDetectorConfig
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS
 from semfov.runs.config import DataConfig, DetectorConfig
+from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import check_sources, make_detector

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from semfov.errors import DataError, InputError
-from semfov.fit.looking import Looking
 from semfov.fit.observation import ObservationFit
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.search_part import SearchFit
@@ -19,6 +18,7 @@ from semfov.fit.windows_part import WindowsFit
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Manifest, Part
 from semfov.runs.config import WHERE
+from semfov.runs.looking import Looking
 from semfov.runs.scene_run import digest_of
 from semfov.runs.settings import plain
 from semfov.runs.setup import detector_options

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping
 
 import torch
 
-from semfov.fit.looking import Looking
 from semfov.fit.part import PartInputs
+from semfov.runs.looking import Looking
 from semfov.runs.tables import table
 
 _TITLES = {

@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.fit.training import descend
-from semfov.fit.viewing import Events, Viewed, log_centre
 from semfov.gaze.saliency import OculomotorBias, cell_saliency
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
+from semfov.human.viewing import Events, Viewed, log_centre
 from semfov.io.ranges import Count, Positive, Range, Seed, Share, Whole
 from semfov.runs.settings import Settings
 

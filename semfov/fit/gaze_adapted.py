@@ -10,8 +10,8 @@ from torch.nn import functional as F
 from semfov.fit.gaze import GazeFit
 from semfov.fit.gaze_folds import Fold, Groups
 from semfov.fit.training import descend
-from semfov.fit.viewing import Viewed, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
+from semfov.human.viewing import Viewed, log_centre
 from semfov.io.code import modules_digest
 
 _STEPS = 100

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from semfov.errors import SemfovError
 from semfov.fit.gaze import GazeFit, fitted_density, maps_of, score
-from semfov.fit.viewing import Viewed, log_centre
 from semfov.gaze.saliency.fixation_density import FixationDensity, cells_of
+from semfov.human.viewing import Viewed, log_centre
 from semfov.io.code import modules_digest
 from semfov.io.storage import read_tensors, write_tensors
 from semfov.runs.scene_run import digest_of

@@ -14,9 +14,9 @@ from semfov.errors import check
 from semfov.fit.gaze import GazeFit, fitted_density
 from semfov.fit.gaze_adapted import AdaptedFold, adapted_density
 from semfov.fit.gaze_folds import CENTRE, ROWS, Fold, FoldStore, Scores
-from semfov.fit.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.gaze.saliency.likeness import FEWEST, PictureLikeness, pooled
+from semfov.human.viewing import LONGEST, Viewed, ViewingData, features_of, look
 from semfov.io.ranges import Whole
 from semfov.runs.tables import table
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import torch
 
-from semfov.fit.looking import Looking
 from semfov.fit.samples import Samples
 from semfov.fit.settings import FitConfig, FitDetectorConfig
 from semfov.io.files import sha256
@@ -23,6 +22,7 @@ from semfov.io.manifest import Part
 from semfov.io.pretrained import Pretrained
 from semfov.model_folder import KINDS
 from semfov.runs.config import ProtocolConfig
+from semfov.runs.looking import Looking
 from semfov.runs.seeds import generator_for
 
 _Config = TypeVar("_Config", bound=FitConfig)

@@ -11,15 +11,15 @@ from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.protocols import choose_classes, numbers_drawn
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import OneKindError, fit_verification
 from semfov.fit.verification_report import NO_PLACES, verification_report
 from semfov.fit.windows_certainty import Exploration, fit_spread, left_out
 from semfov.fit.windows_settings import FitMosaicsConfig
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
+from semfov.runs.protocols import choose_classes, numbers_drawn
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, TargetFacts, look_closely

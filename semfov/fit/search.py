@@ -16,9 +16,7 @@ from semfov.data.scene import Scenes
 from semfov.episode import Step, rollout
 from semfov.errors import DataError, check
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.looking import CellLooks, Looking
 from semfov.fit.presence import COUNTED, BeliefsOfSearches, fit_presence, judge_presence
-from semfov.fit.protocols import choose_searches, numbers_drawn
 from semfov.fit.settings import FitOnCellsConfig
 from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
 from semfov.fit.training import split, training_of
@@ -28,7 +26,9 @@ from semfov.io.ranges import Count, Positive, Range, Share, Whole
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.presence import log_odds_of_cells
 from semfov.runs.config import DataConfig, ProtocolConfig
+from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.progress import track
+from semfov.runs.protocols import choose_searches, numbers_drawn
 from semfov.runs.setup import make_scenes
 from semfov.runs.tables import table
 

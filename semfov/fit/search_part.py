@@ -13,7 +13,6 @@ from semfov.errors import DataError
 from semfov.fit.detector_report import Difference, curves_figure, curves_table, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.presence import thresholds_of_searches
-from semfov.fit.protocols import episodes_of, run_episodes
 from semfov.fit.search import FitSearchConfig, fit_search, search_photographs
 from semfov.fit.thresholds import SUREST, SUREST_OF_FEW
 from semfov.gaze.policies import Policy
@@ -22,6 +21,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
+from semfov.runs.protocols import episodes_of, run_episodes
 from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure

@@ -24,14 +24,14 @@ from semfov.decision import (
 from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
-from semfov.fit.looking import CellLooks, Looking
-from semfov.fit.protocols import DrawnSearch, choose_classes, choose_searches
 from semfov.fit.settings import VerificationConfig
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import ProtocolConfig
+from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.progress import track
+from semfov.runs.protocols import DrawnSearch, choose_classes, choose_searches
 from semfov.runs.store import RememberedLooks
 
 

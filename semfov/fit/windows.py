@@ -25,13 +25,13 @@ from semfov.fit.windows_decisions import (
 )
 from semfov.fit.windows_evidence import ZoomExample, fit_rates, fit_survey, judge_windows
 from semfov.fit.windows_settings import FitMosaicsConfig
-from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.files import json_sha256
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, make_scenes, split_photographs
 from semfov.runs.tables import table
 from semfov.runs.workers import prepare_worker, run_tasks
+from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import half_steps

@@ -19,11 +19,11 @@ from torch import Tensor
 
 from semfov.data.scene import Annotation, Scenes
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
 from semfov.observation.matching import right_boxes
 from semfov.runs.progress import track
 from semfov.runs.tables import table
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import FACTS, SPREAD, Certainty, number_of, reacts
 from semfov.zoom.episode import find_everything

@@ -11,20 +11,20 @@ from torch.nn import functional as F
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
-from semfov.fit.protocols import choose_classes
 from semfov.fit.searches import TargetSearch
 from semfov.fit.thresholds import Bounds, choose_thresholds
 from semfov.fit.training import descend
 from semfov.fit.verification import OneKindError, examine, fit_to_closer_looks, with_thresholds
 from semfov.fit.verification_report import NO_PLACES, verification_report
 from semfov.fit.windows_settings import FitMosaicsConfig
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
+from semfov.runs.protocols import choose_classes
 from semfov.runs.tables import table
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom.closer import CandidateBoxes, TargetFacts, look_closely
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import look_for

@@ -11,13 +11,13 @@ from semfov.data.mosaics import Mosaics
 from semfov.fit.detector_report import Difference, curves_table, mean_percent, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.verification import mean_of
-from semfov.fit.window_looking import found_in
 from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_settings import FitMosaicsConfig
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.episodes import FloatArray
 from semfov.runs.config import SensorConfig
 from semfov.runs.looks import one_thread
+from semfov.runs.window_looking import found_in
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.looks import WindowLook

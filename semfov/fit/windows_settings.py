@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 from semfov.fit.settings import FitConfig
-from semfov.fit.window_looking import TileSize
 from semfov.io.ranges import Count, Range, Share, Whole
 from semfov.runs.config import DetectorConfig
+from semfov.runs.window_looking import TileSize
 from semfov.zoom.closer import USUAL_WINDOW
 
 

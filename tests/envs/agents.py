@@ -7,8 +7,8 @@ import torch
 
 from semfov.envs import EpisodeEnv, GazeVectorEnv
 from semfov.envs.windows import _action_of
-from semfov.fit.protocols import Trial
 from semfov.gaze.choice import Greedy, drawn_from
+from semfov.runs.protocols import Trial
 from semfov.runs.seeds import noise_for
 from semfov.zoom.looks import Window
 from semfov.zoom.policy import best_find

@@ -9,8 +9,8 @@ import torch
 from eval import semba, sensors
 from eval.semba import _BilinearFovea, _Inhibited, _search_scene, _SembaConfig
 from semfov import Eye, Grid
-from semfov.fit.looking import Looking
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
+from semfov.runs.looking import Looking
 from tests.colours import write_home
 from tests.small import cells_of
 

@@ -9,8 +9,8 @@ from eval.comparison.thresholds import ThresholdLooksConfig, _ThresholdEyes, loo
 from semfov import Eye, Foveation
 from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.selection import select
-from semfov.fit.looking import Looking
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig, SensorConfig
+from semfov.runs.looking import Looking
 from semfov.runs.looks import tight
 
 THRESHOLDS = (0.02, 0.25, 0.5)

@@ -31,9 +31,7 @@ from semfov.fit.detector import _check_photographs, _config_of, _seconds_of_look
 from semfov.fit.detector_report import Difference
 from semfov.fit.folder import FITS as PART_FITS
 from semfov.fit.folder_report import thin_classes
-from semfov.fit.looking import Looking
 from semfov.fit.part import PartInputs, PartResult
-from semfov.fit.protocols import choose_classes
 from semfov.fit.search import FitSearchConfig
 from semfov.fit.searches import SearchEnd
 from semfov.fit.settings import FitDetectorConfig
@@ -44,7 +42,9 @@ from semfov.io.files import sha256
 from semfov.io.manifest import PARTS, Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.runs.config import DataConfig, DetectorConfig, PolicyConfig
+from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar, task_bar, track
+from semfov.runs.protocols import choose_classes
 from semfov.runs.setup import make_map
 from tests.colours import CLASSES, COLOURS, SIDE, SMALL, write_home, write_network, write_photographs
 from tests.refusals import refused, unusable

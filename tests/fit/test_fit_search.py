@@ -13,12 +13,12 @@ from semfov import EmbeddedScenes, FovealObservationModel, Grid
 from semfov.belief.observers import SemanticSearch
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.presence import BeliefsOfSearches, fit_presence, judge_presence
-from semfov.fit.protocols import choose_classes, choose_searches, numbers_drawn
 from semfov.fit.search import FitSearchConfig, fit_places, fit_search, search_photographs, shares_drawn
 from semfov.fit.thresholds import choose_thresholds
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import ProtocolConfig
+from semfov.runs.protocols import choose_classes, choose_searches, numbers_drawn
 from tests.refusals import refused, unusable
 from tests.small import cells_of, looking, rand
 

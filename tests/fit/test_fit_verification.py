@@ -13,7 +13,6 @@ from scipy.optimize import minimize
 from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, FovealObservationModel, Foveation
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic, SemanticSearch
-from semfov.fit.looking import Looking
 from semfov.fit.searches import SearchEnd, _PhotographSearch, open_photographs, photograph_searches
 from semfov.fit.settings import VerificationConfig
 from semfov.fit.verification import (
@@ -32,6 +31,7 @@ from semfov.gaze.policies import Policy
 from semfov.io.storage import read
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
+from semfov.runs.looking import Looking
 from semfov.runs.store import cell_store, look_everywhere
 from tests.refusals import unusable
 from tests.small import CLASSES, Blobs

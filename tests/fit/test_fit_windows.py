@@ -19,23 +19,23 @@ from semfov.decision import MOST_CLOSER
 from semfov.errors import DataError
 from semfov.fit import windows_decisions
 from semfov.fit.folder import FolderFit
-from semfov.fit.looking import Looking
 from semfov.fit.photographs import _explored, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification import verify
-from semfov.fit.window_looking import found_in
 from semfov.fit.windows_decisions import fit_closer_looks, search_pictures
 from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
 from semfov.fit.windows_settings import FitMosaicsConfig
-from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.manifest import Manifest
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou, right_boxes
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import DataConfig
+from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
+from semfov.runs.window_looking import found_in
+from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.settings import DecisionSettings, FindSettings
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import SPREAD

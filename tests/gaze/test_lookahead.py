@@ -21,7 +21,6 @@ from semfov import (
     policies,
 )
 from semfov.belief.observers import SemanticMap
-from semfov.fit.policy_looking import _make_strategy
 from semfov.gaze.acquisition import (
     BayesianSurprise,
     ExpectedAccuracy,
@@ -36,6 +35,7 @@ from semfov.gaze.acquisition.accuracy import _CORRECTED
 from semfov.gaze.acquisition.lookahead import look_ahead_by_samples, sampled_likelihoods
 from semfov.gaze.policies import Policy
 from semfov.runs.config import BeliefConfig, PolicyConfig
+from semfov.runs.policy_looking import _make_strategy
 from semfov.runs.presets import label, presets, resolve
 from semfov.strategy import Strategy
 from tests import small

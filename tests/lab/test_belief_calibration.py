@@ -14,10 +14,10 @@ from eval.search.run import SearchConfig
 from semfov import FovealObservationModel, InputError, rollout
 from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.episode import StoredLooks
-from semfov.fit.protocols import choose_classes
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
+from semfov.runs.protocols import choose_classes
 from semfov.runs.scene_run import finish
 from semfov.runs.seeds import generator_for, noise_for
 

@@ -13,13 +13,13 @@ from semfov import DataError, Detections, DirichletBelief, FovealObservationMode
 from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.decision import OUTCOMES, decide, decision_without_closer_looks
 from semfov.episode import StoredLooks, rollout
-from semfov.fit.protocols import choose_classes
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import Policy
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.config import BeliefConfig, DataConfig, ProtocolConfig
+from semfov.runs.protocols import choose_classes
 from semfov.runs.seeds import generator_for, noise_for
 
 pytestmark = pytest.mark.usefixtures("few_samples")

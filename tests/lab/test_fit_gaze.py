@@ -32,7 +32,8 @@ from semfov.fit.gaze_model import (
     summaries,
 )
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.viewing import (
+from semfov.gaze.saliency.fixation_density import cells_of
+from semfov.human.viewing import (
     Events,
     MapSource,
     ViewingData,
@@ -41,7 +42,6 @@ from semfov.fit.viewing import (
     log_centre,
     look,
 )
-from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.metrics.scanpath import auc, log_likelihood, nss
 from tests.refusals import refused
 from tests.small import Shown

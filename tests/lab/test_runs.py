@@ -19,7 +19,7 @@ from eval.search import report as search_report
 from eval.search.run import SearchConfig, SearchRun
 from semfov import ActivePerception, FovealObservationModel, rollout
 from semfov.belief.observers import SemanticMap
-from semfov.fit import protocols
+from semfov.runs import protocols
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig
 from tests.refusals import refused
 from tests.small import run_settings

@@ -15,9 +15,8 @@ import torch
 from eval.comparison.records import StoredRecords
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
-from semfov.fit import policy_looking
 from semfov.gaze.acquisition import FUNCTIONS, TargetPosterior
-from semfov.runs import scene_run
+from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import PolicyConfig
 from semfov.runs.results import SceneResults
 from semfov.runs.scene_run import finish

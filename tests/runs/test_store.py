@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from semfov.detection import Detections
-from semfov.fit.zoom_store import WindowLookStore
 from semfov.runs import store as store_module
 from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.store import DetectionStore, RememberedLooks, cell_store
+from semfov.runs.zoom_store import WindowLookStore
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook

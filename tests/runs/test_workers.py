@@ -20,9 +20,9 @@ import torch
 from tqdm import tqdm
 
 from semfov.errors import InputError, SemfovError
-from semfov.fit.looking import Looking
 from semfov.runs import workers
 from semfov.runs.config import BeliefConfig, DataConfig, LookingConfig
+from semfov.runs.looking import Looking
 from semfov.runs.scene_run import finish
 from semfov.runs.workers import run_tasks, shared_processes
 from tests.refusals import refused

@@ -20,11 +20,11 @@ from semfov.detection.objects import unlike
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.windows_certainty import _fit_unseen, _Numbers, explorations_of_kinds, fit_spread
 from semfov.fit.windows_decisions import WindowSearches, fit_judge, judge_searches
-from semfov.fit.zoom_store import StoredWindowLooks
 from semfov.metrics.calibration import calibration_error
 from semfov.observation.matching import right_boxes
 from semfov.observation.thresholds import Thresholds
 from semfov.paths import ZoomPath
+from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import DISPERSION, FACTS, SPREAD, Certainty, number_of

@@ -18,11 +18,11 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import check_detector
 from semfov.episode import StoredLooks
 from semfov.episode.stopwatch import Stopwatch
-from semfov.fit.protocols import Trial, run_episodes
 from semfov.gaze.acquisition.base import Task
 from semfov.io.ranges import Count, Positive, Range
 from semfov.runs.config import BeliefConfig, PolicyConfig, ProtocolConfig
 from semfov.runs.presets import AGENT
+from semfov.runs.protocols import Trial, run_episodes
 from semfov.runs.results import ResultRecord
 from semfov.runs.seeds import noise_for
 from semfov.runs.settings import Settings

@@ -19,12 +19,6 @@ from semfov import (
     observers,
     policies,
 )
-from semfov.fit import policy_looking
-from semfov.fit.policy_looking import (
-    _belief_settings,
-    _load,
-    _make_strategy,
-)
 from semfov.gaze.acquisition import (
     FUNCTIONS,
     ExpectedAccuracy,
@@ -33,7 +27,13 @@ from semfov.gaze.acquisition import (
     Static,
     TargetPosterior,
 )
+from semfov.runs import policy_looking
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig
+from semfov.runs.policy_looking import (
+    _belief_settings,
+    _load,
+    _make_strategy,
+)
 from semfov.runs.presets import presets, resolve
 from semfov.strategy import Strategy
 from tests.small import Blobs
@@ -122,7 +122,7 @@ def test_models_are_loaded_by_the_names_in_the_settings(monkeypatch):
 
 def test_a_run_has_the_models_that_its_policies_need(model, monkeypatch, tmp_path):
     looked = SearchConfig(policies=("random",), data=DataConfig(limit=1, min_instances=0), cache=tmp_path)
-    monkeypatch.setattr("semfov.fit.looking.make_eye", lambda detector, sensor: Eye(Foveation(9.0), Blobs()))
+    monkeypatch.setattr("semfov.runs.looking.make_eye", lambda detector, sensor: Eye(Foveation(9.0), Blobs()))
     monkeypatch.setattr(policy_looking, "_load", lambda name, belief, eye: model)
     assert not any(SearchRun(looked).models)
     guided = (PolicyConfig("non-predictive", "learned", saliency="vocus2"), "random")

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 from semfov.belief.observers import Observer, Semantic, SemanticMap, SemanticSearch
 from semfov.errors import check
 from semfov.eye import Eye
-from semfov.fit.looking import Looking
 from semfov.gaze.acquisition.base import FUNCTIONS, Task
 from semfov.gaze.acquisition.static import Uniform
 from semfov.gaze.policies import Policy
 from semfov.io.code import class_digest
 from semfov.observation.foveal import FovealObservationModel
 from semfov.runs.config import BeliefConfig, PolicyConfig, RunConfig
+from semfov.runs.looking import Looking
 from semfov.runs.presets import label, resolve
 from semfov.runs.scene_run import SceneRun, digest_of
 from semfov.runs.setup import make_map, make_observation, make_searching

@@ -9,12 +9,12 @@ from torch import Tensor
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.errors import DataError
-from semfov.fit.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.io.ranges import Range, Seed, Side, Whole
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.runs.config import DataConfig, DetectorConfig, WorkConfig
 from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, make_scenes
+from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.hints import DETECTION_SCORE

@@ -14,9 +14,9 @@ from semfov import Detections, FovealObservationModel, Grid, fusion, policies
 from semfov.belief.observers.semantic import SemanticEvidence
 from semfov.data import Annotation
 from semfov.episode import StoredLooks
-from semfov.fit.protocols import episodes_of, explorations_of, run_episodes
 from semfov.metrics.episodes import answers_of, cumulative_performance
 from semfov.runs.config import ProtocolConfig
+from semfov.runs.protocols import episodes_of, explorations_of, run_episodes
 from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from tests.small import FixedLook, kaplan
