@@ -63,11 +63,6 @@ def note_of_former(former: str, present: str) -> str:
     return f"{former} is called {present} now; the earlier name will go"
 
 
-def note_of_dropped(setting: str) -> str:
-    """Say that a setting of earlier versions changes nothing."""
-    return f"{setting} is a setting of earlier versions and changes nothing now; leave it out"
-
-
 COMMANDS = _by_word(
     {
         "find": "annotate count detect infer label predict segment",

@@ -86,7 +86,7 @@ class Verification(DecidingModule, PretrainedForEye):
             InputError: only one of both has probabilities that a fit has made true.
         """
         kinds = {True: "true probabilities of cells", False: "probabilities of cells as the belief has them"}
-        read = bool(self.metadata.get(TRUE_CELLS, False))  # files of earlier versions do not say so
+        read = bool(self.metadata.get(TRUE_CELLS, False))
         if read != searching.true_cells:
             detector = searching.metadata.get("detector", {}).get("name", "MODEL")
             raise InputError(

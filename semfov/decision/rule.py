@@ -65,8 +65,7 @@ class CloseUp:
         box: box `(4,)` of the target, or the examined one where the look does not show the target.
         place: probability that the target is there, after the look.
         presence: probability that the picture holds the target, after the look.
-        index: place of the look that it is in its record, `record[index]`, from 0; None in files of earlier versions,
-            where closer looks were no looks of the record.
+        index: place of the look that it is in its record, `record[index]`, from 0; None if it is no look of a record.
     """
 
     fixation: int | None

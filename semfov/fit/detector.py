@@ -3,7 +3,6 @@
 import logging
 import math
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from os import PathLike, fspath
@@ -29,7 +28,6 @@ from semfov.runs.progress import WholeBar
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import check_sources, make_detector
 from semfov.threads import available_cores
-from semfov.words import note_of_dropped
 
 _MOST_FAULTS = 5  # largest number of photographs that a message names
 _MOST_CLASSES = 8  # largest number of classes that a message names
@@ -96,9 +94,6 @@ def _config_of(
     """Make the settings of a fit from the arguments of `fit_detector`."""
     of_detector = {field.name for field in fields(DetectorConfig)} - {"name"}
     of_fit = {field.name for field in fields(FitDetectorConfig)} - {"model", "data", "detector", "out", "workers"}
-    for name in settings.keys() & FitDetectorConfig.dropped:
-        warnings.warn(note_of_dropped(name), FutureWarning, stacklevel=3)  # of who calls `fit_detector`
-    settings = {name: value for name, value in settings.items() if name not in FitDetectorConfig.dropped}
     unknown = sorted(settings.keys() - of_detector - of_fit)
     if unknown:
         raise InputError(

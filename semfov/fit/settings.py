@@ -92,7 +92,6 @@ class FitDetectorConfig(FitOnCellsConfig):
     """
 
     unused = ("name",)
-    dropped = ("map_steps",)
     model: Path | None = None
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     max_target_area: Positive = 0.2

@@ -20,7 +20,7 @@ NanoDet-Plus's was rebuilt from a copy with weights of 8 bits.
 
 
 # Keys that other checks compare, and keys of how a network is computed, which changes its numbers only by rounding.
-# (Models that were fitted before the key `runtime` existed have `winograd`.)
+# (Some shipped models have `winograd` in place of `runtime`.)
 _NOT_COMPARED = {"name", "digest", "background", "winograd", "runtime", "dtype"}
 
 Settings = Mapping[str, Any]

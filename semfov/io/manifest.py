@@ -1,7 +1,6 @@
 """The record of a folder of fitted models: their detector and sensor, the parts, and which of the parts are used."""
 
 import json
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
@@ -21,9 +20,6 @@ _MOST_BYTES = 2**24
 
 PARTS = ("observation", "search", "verification", "windows")
 """Parts that a folder may hold, in the order in which they are fitted."""
-
-_FORMER = {"map": "map", "evidence": "evidence for targets", "tempering": "exponent of scores"}
-"""Parts of folders of earlier versions by name, in words."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
 
@@ -50,7 +46,7 @@ _RECORD = {
     # Further values depend on the sensor, which checks them when it is made.
     "sensor": Object({"name": Text(), "reference": Number(above=0)}, Json(), ("name", "reference")),
     "grid": Array(Number(1, 200), 2),
-    "parts": Object(dict.fromkeys((*PARTS, *_FORMER), _PART)),
+    "parts": Object(dict.fromkeys(PARTS, _PART)),
     "training": Object(others=Json()),
 }
 
@@ -105,14 +101,7 @@ class Manifest:
     def read(cls, folder: str | PathLike[str]) -> Self:
         """Read the record of a folder, and verify it and the files that it names by their checksums."""
         record = _read_record(Path(folder) / FILE)
-        former = [words for name, words in _FORMER.items() if name in record["parts"]]
-        if former:
-            warnings.warn(
-                f"{folder}: its {' and its '.join(former)} is of an earlier version and is not read; run semfov fit "
-                "again",
-                stacklevel=2,
-            )
-        parts = {name: Part(**part) for name, part in record["parts"].items() if name in PARTS}
+        parts = {name: Part(**part) for name, part in record["parts"].items()}
         for part in parts.values():
             _check_file(part, Path(folder))
         columns, rows = record["grid"]

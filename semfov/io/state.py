@@ -41,10 +41,7 @@ class StatedModule(MovableModule):
         return {}
 
     def _load_fitted_values(self, values: Mapping[str, Any]) -> None:
-        """Take those of a state, which may lack them."""
-
-    def _complete_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Add to a state what those of earlier versions lack."""
+        """Take those of a state."""
 
     def get_extra_state(self) -> Tensor:
         """Write the settings and the values of a fit as bytes of JSON."""
@@ -77,11 +74,10 @@ class StatedModule(MovableModule):
         # Before the tensors, so that the message names the setting and not the shapes that follow from it.
         if key in state_dict:
             self.set_extra_state(state_dict[key])
-        self._complete_state(state_dict, prefix)
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
         )
-        # Files that were saved without settings are loaded, too.
+        # Files of models have their settings in the record.
         if key in missing_keys:
             missing_keys.remove(key)
 

@@ -19,9 +19,6 @@ from semfov.version import __version__
 _KEY = "semfov"
 _CHECKSUM = "sha256"
 
-_FORMER_KINDS = {"map-evidence": "such maps are no longer read: give an observation model, or run semfov fit again"}
-"""What to do with kinds of files of earlier versions."""
-
 
 def write_file(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, object]) -> None:
     """Write tensors and a record to a file atomically; the same content gives the same bytes.
@@ -60,8 +57,7 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], JsonO
     tensors, record = _read_unverified(path)
     if not isinstance(record, dict) or record.get("kind") != kind:
         got = record.get("kind") if isinstance(record, dict) else type(record).__name__
-        remedy = _FORMER_KINDS.get(str(got), "check the path")
-        raise DataError(f"{path}: expected a file of kind {kind}, got {got}; {remedy}")
+        raise DataError(f"{path}: expected a file of kind {kind}, got {got}; check the path")
     recorded = record.pop(_CHECKSUM, None)
     if recorded is None:
         raise DataError(f"{path}: expected a file with the sha256 of its content, got one without; write it again")

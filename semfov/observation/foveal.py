@@ -1,6 +1,5 @@
 """The foveal observation model: how a detector scores objects of each class at each distance from the fovea."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from os import PathLike
@@ -28,7 +27,6 @@ from semfov.observation.thresholds import THRESHOLDS, thresholds_of, thresholds_
 _MOST_TEMPERING = 100
 _MOST_DISTANCE = 10  # larger ones are taken for pixels: no fixation lies ten longer sides from a box of its image
 _MOST_LOG_CELL = 50  # of the logarithms of m, a and w
-_SINCE = ("log_exponents", "refutation", "log_cell", "presence")  # parts that states of earlier versions lack
 
 
 class FovealObservationModel(Pretrained):
@@ -440,7 +438,7 @@ class FovealObservationModel(Pretrained):
             presence=presence_of(tensors, thresholds_of(record.get("thresholds"))),
             metadata=record["metadata"],
         )
-        # Files from before these parameters lack them: then they have the paper's values.
+        # Parameters that a file leaves out have the paper's values.
         model.load_state_dict({**model.state_dict(), **tensors})
         return model
 
@@ -463,21 +461,6 @@ class FovealObservationModel(Pretrained):
         if detector is not None:
             model.check_compatible(detector.settings(), detector.classes)
         return model
-
-    def _complete_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Add the module's own values of parts that a state of an earlier version lacks, so that they stay."""
-        parts = {name.removeprefix(prefix).partition(".")[0] for name in state if name.startswith(prefix)}
-        lacking = [part for part in _SINCE if part not in parts and getattr(self, part) is not None]
-        if not lacking or "log_alpha" not in parts:
-            return
-        # The children of the module, such as `presence`, read the same state later.
-        for name, value in self.state_dict(keep_vars=True).items():
-            if name.partition(".")[0] in lacking:
-                state[prefix + name] = value
-        warnings.warn(
-            f"state_dict: it is of an earlier version, without {', '.join(lacking)}; those of the module stay",
-            stacklevel=2,
-        )
 
     def extra_repr(self) -> str:
         """Write the sizes for the `repr` of the module.

@@ -1,6 +1,5 @@
 """Whether a picture holds a class, from the belief about its cells."""
 
-import warnings
 from copy import deepcopy
 
 import torch
@@ -8,7 +7,6 @@ from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_tensor
 from semfov.io.schema import Field
-from semfov.io.state import EXTRA_STATE
 from semfov.observation.thresholds import DecidingModule, Thresholds
 
 SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
@@ -136,22 +134,6 @@ class Presence(DecidingModule):
         """
         return self.offset.to(facts) + facts @ self.weight.to(facts)
 
-    def _complete_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Lose the two numbers that a state lacks, or keep them where it has no thresholds either.
-
-        Both go together: thresholds are of probabilities that these numbers made true, or of those of the belief.
-        """
-        name = f"{prefix}centre"
-        if self.centre is None or name in state or f"{prefix}offset" not in state:
-            return
-        if f"{prefix}{EXTRA_STATE}" in state:
-            self.centre = None
-            happens = "probabilities of cells are left as they are"
-        else:
-            state[name] = self.centre
-            happens = "that of the module stays"
-        warnings.warn(f"state_dict: it is of a presence without centre; {happens}", stacklevel=2)
-
     def detach(self) -> "Presence":
         """Copy the module with numbers that are constants, through which no gradient flows.
 
@@ -193,11 +175,10 @@ def presence_of(tensors: dict[str, Tensor], thresholds: Thresholds | None) -> Pr
     Raises:
         InputError: it has only some of them.
     """
-    needed = ("presence.offset", "presence.weight", "presence.shares")
+    needed = ("presence.offset", "presence.weight", "presence.shares", "presence.place")
     found = [name for name in PRESENCE if name in tensors]
     if not found:
         return None
     check(all(name in found for name in needed), "presence", f"all of {', '.join(needed)}", ", ".join(found))
-    offset, weight, shares = (tensors[name] for name in needed)
-    cells = {name: tensors.get(f"presence.{name}") for name in ("place", "centre")}
-    return Presence(offset, weight, shares, thresholds, **cells)
+    offset, weight, shares, place = (tensors[name] for name in needed)
+    return Presence(offset, weight, shares, thresholds, place=place, centre=tensors.get("presence.centre"))

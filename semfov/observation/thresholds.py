@@ -43,9 +43,9 @@ class Thresholds:
 
 
 THRESHOLDS = Maybe(
-    Object({"confirm": Number(0, 1), "give_up": Number(0, 1), "place": Number(0, 1)}, required=("confirm", "give_up"))
+    Object(dict.fromkeys(("confirm", "give_up", "place"), Number(0, 1)), required=("confirm", "give_up", "place"))
 )
-"""Schema of thresholds in the file of a model, which keeps the earlier name of `stop_below`: all files are alike."""
+"""Schema of thresholds in the file of a model, in which `stop_below` is called `give_up`."""
 
 
 def thresholds_record(thresholds: Thresholds | None) -> dict[str, float] | None:
@@ -76,7 +76,7 @@ def thresholds_of(record: Mapping[str, float] | None) -> Thresholds | None:
     """
     if record is None:
         return None
-    return Thresholds(record["confirm"], record["give_up"], record.get("place", 0.0))
+    return Thresholds(record["confirm"], record["give_up"], record["place"])
 
 
 class DecidingModule(StatedModule):
@@ -92,6 +92,4 @@ class DecidingModule(StatedModule):
         return {"thresholds": thresholds_record(self.thresholds)}
 
     def _load_fitted_values(self, values: Mapping[str, Any]) -> None:
-        # A state of an earlier version has none; those of the module stay.
-        if "thresholds" in values:
-            self.thresholds = thresholds_of(values["thresholds"])
+        self.thresholds = thresholds_of(values["thresholds"])

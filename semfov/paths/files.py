@@ -16,7 +16,6 @@ from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object, Sc
 from semfov.io.storage import read, write_file
 from semfov.paths.stimulus import LONGEST
 from semfov.version import __version__
-from semfov.words import FORMER
 
 Ending = Literal[
     "box", "decision", "detection", "min_gain", "shifts", "cells", "passes", "windows", "seconds", "duration", "stopped"
@@ -31,8 +30,13 @@ POSITIVE = Number(above=0)
 CHANCE = Number(0, 1)
 _SHARE = Number(above=0, high=nextafter(1, 0))
 
-_DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell": Maybe(WHOLE), "place": Maybe(CHANCE)}
-_DECISION_SINCE = {"confirm": Maybe(Number())}  # what files of earlier versions lack
+_DECISION = {
+    "outcome": Text(get_args(Outcome)),
+    "probability": Number(),
+    "cell": Maybe(WHOLE),
+    "place": Maybe(CHANCE),
+    "confirm": Maybe(Number()),
+}
 _CLOSER = {
     "fixation": Maybe(WHOLE),
     "index": Maybe(WHOLE),
@@ -47,9 +51,9 @@ _DETECTIONS = {
     "boxes": Field(("M", 4), mixed=True, low=-FARTHEST, high=FARTHEST),
     "scores": Field(("M", "C"), mixed=True),
     "mask": Field(("M",), dtype=torch.bool),
+    "confidence": Field(("M",), mixed=True),
 }
 _OPTIONAL = {
-    "confidence": Field(("M",), mixed=True, optional=True),  # files of earlier versions have none
     "box": Field((4,), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
     "closer_boxes": Field(("Q", 4), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
     "photograph": Field((3, "h", "w"), dtype=torch.uint8, optional=True),
@@ -68,7 +72,7 @@ _SHARED = {
     "shown": Maybe(Object({"white": Json(), "bands": Json()})),
     "detector": Maybe(Text()),
     "ending": Maybe(Text(get_args(Ending))),
-    "decision": Maybe(Object({**_DECISION, **_DECISION_SINCE}, None, tuple(_DECISION))),
+    "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
 _PLAIN = ("target", "found", "prior", "assumed", "score_threshold", "source", "shown", "detector", "ending")
@@ -191,8 +195,6 @@ class Format:
         """
         tensors, record = read(path, self.kind)
         record.pop("kind")
-        # First of all, as the schema knows the present names alone.
-        _rename_former(record)
         unknown = record.keys() - self.schema.record.keys()
         check(not unknown, "record", f"no other values than {', '.join(self.schema.record)}", sorted(unknown))
         self.schema.check(tensors, record)
@@ -202,7 +204,7 @@ class Format:
 
 def _decision_values(decision: Decision) -> dict[str, Any]:
     """Make the JSON values of a decision, whose box is a tensor of the file."""
-    return {name: getattr(decision, name) for name in (*_DECISION, *_DECISION_SINCE)}
+    return {name: getattr(decision, name) for name in _DECISION}
 
 
 def _shared_fields(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> SharedFields:
@@ -232,7 +234,7 @@ def _shared_fields(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> 
 def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
     """Collect the tensors that all records have: detections, the photograph, and boxes of decision and closer looks."""
     tensors = {}
-    for name in (*_DETECTIONS, "confidence"):
+    for name in _DETECTIONS:
         # Batches of one become rows, one look after the other.
         tensors[name] = torch.cat([getattr(look, name)[0] for look in outcome.detections])
     if outcome.decision is not None and outcome.decision.box is not None:
@@ -248,29 +250,15 @@ def _separated(tensors: Mapping[str, Tensor], lengths: list[int]) -> tuple[Detec
     """Separate the detections of the looks, which stand in a row in a file; return batches of one.
 
     Args:
-        tensors: boxes `(M, 4)`, scores, mask, and from present versions confidence of all looks.
+        tensors: boxes `(M, 4)`, scores, mask and confidence of all looks.
         lengths: number of detections of each look, with sum M.
     """
-    # Files of earlier versions have no confidence, which detections then take from their scores.
-    columns = [tensors[name].split(lengths) for name in (*_DETECTIONS, "confidence") if name in tensors]
+    columns = [tensors[name].split(lengths) for name in _DETECTIONS]
     looks = []
     for parts in zip(*columns, strict=True):
         batch_of_one = [part[None] for part in parts]
         looks.append(Detections(*batch_of_one))
     return tuple(looks)
-
-
-def _rename_former(record: dict[str, Any]) -> None:
-    """Give the values of a file of an earlier version their present names, and the ending its own."""
-    for former in FORMER.keys() & record.keys():
-        record[FORMER[former]] = record.pop(former)
-    ending = record.get("ending")
-    if isinstance(ending, str):
-        record["ending"] = FORMER.get(ending, ending)
-    closer = record.get("closer")
-    for values in closer if isinstance(closer, list) else ():
-        if isinstance(values, dict) and "number" in values:
-            values["index"] = values.pop("number")
 
 
 def _check_shared(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:

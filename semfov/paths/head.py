@@ -52,14 +52,14 @@ _FORMAT = Format(
     {
         "actions": Field(("n",), dtype=torch.int64, low=0),
         "maps": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3),
-        "values": Field(("n",), mixed=True, finite=False, optional=True),
+        "values": Field(("n",), mixed=True, finite=False),
     },
     {
         "world": Object(_WORLD, None, ("kind", "picture", "size", "cell")),
         "fields": Array(POSITIVE, least=1, ascending=True),
         "fovea": POSITIVE,
         "seconds": Array(Number(low=0), "n"),
-        "aimed": Maybe(Array(Array(Number(), 3))),
+        "aimed": Array(Array(Number(), 3)),
         "duration": Maybe(Number(low=0)),
     },
 )
@@ -412,7 +412,7 @@ class HeadPath(Record):
         maps = tensors["maps"]
         check(maps.shape[-1] == cells, "maps", f"values of {cells} cells", maps.shape[-1])
         check_decided_cell(shared["decision"], cells)
-        values = tensors["values"].tolist() if "values" in tensors else []
+        values = tensors["values"].tolist()
         looks = head_looks(views, actions.tolist(), shared["detections"], maps, record["seconds"], values)
         return {"views": views, "looks": looks, "maps": maps, "duration": record.get("duration")}
 
@@ -426,11 +426,7 @@ def _unwrapped(x: Tensor, around: float) -> Tensor:
 def _views_of_file(record: Values) -> Views:
     """Make the views of a path from the JSON values of its file, with the poses of its closer looks."""
     views = Views(_world_of_file(record["world"]), record["fields"], fovea=record["fovea"])
-    aimed = record.get("aimed")
-    # With one field of view there were no closer looks, also in files that do not say so.
-    is_known = aimed is not None or len(views.fields) == 1
-    check(is_known, "aimed", "the poses of closer looks", "none, as earlier versions wrote it")
-    for pose in aimed or ():
+    for pose in record["aimed"]:
         views.add(torch.tensor(pose))
     return views
 

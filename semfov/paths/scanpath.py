@@ -297,7 +297,7 @@ class Scanpath(_CellRecord):
         if self.target is None:
             # Class 0 is the background.
             return self.grid, self.probabilities[fixation, :, 1:].amax(-1)
-        # Files of earlier versions may have no belief of the search beside the map of all classes.
+        # A record may have no belief of the search beside the map of all classes.
         posterior = self.probabilities[..., self.target] if self.posterior is None else self.posterior  # (n, X·Y)
         return self.grid, posterior[fixation]
 
@@ -380,13 +380,13 @@ def _looks_of_file(
     """Make the looks of a scanpath from the tensors and values of a file.
 
     Detections are of all looks in their order; other tensors are of the fixations alone, or of the closer looks alone.
-    Closer looks of earlier versions have no index: they are in `closer` alone, not among the looks.
+    A closer look without an index is in `closer` alone, not among the looks.
     """
     close_ups = {close_up.index: close_up for close_up in shared["closer"] if close_up.index is not None}
     detections = shared["detections"]
     seconds = record["seconds"] or [{}] * len(detections)
     cells = tensors["cells"].tolist()
-    # Records without closer looks, and all of earlier versions, lack these tensors.
+    # Records without closer looks lack these tensors.
     regions = tensors.get("closer_regions", torch.zeros(0, 4)).tolist()
     chances = tensors.get("closer_values", torch.zeros(0)).tolist()
     expected = f"{len(cells)} fixations and {len(regions)} closer looks"

@@ -14,7 +14,7 @@ from semfov.errors import check
 from semfov.io.ranges import CheckedSettings
 from semfov.runs.setting_types import FlagType, ListType, SettingType, setting_types
 from semfov.runs.settings import Settings, load_yaml
-from semfov.words import FORMER, dashed, note_of_dropped, note_of_former
+from semfov.words import FORMER, dashed, note_of_former
 
 
 def usual_form(arguments: Sequence[str], config: type[Settings], options: Container[str]) -> list[str]:
@@ -29,14 +29,12 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         options: the options of the parser, with underscores, such as `--stop_below`.
 
     Returns:
-        The words for the parser. Those that it does not know stay as they are; an option of earlier versions is left
-        out, with a note in standard error.
+        The words for the parser. Those that it does not know stay as they are.
 
     Raises:
         InputError: an option that takes one value is given twice, or one that takes a file is given no name.
     """
     types = setting_types(config)
-    dropped = [f"--{setting}" for setting in config.dropped]
     usual: list[str] = []
     words = deque(arguments)
     while words:
@@ -44,9 +42,7 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         if word == "--":  # what follows it are no options
             return [*usual, word, *words]
         option = _option_of(word)
-        if option in dropped:
-            _leave_out(word, words)
-        elif option in options:
+        if option in options:
             kind = types.get(option[2:], _NO_SETTING)
             _check_once(option, kind, usual)
             value = _value_of(word, kind, words)
@@ -77,16 +73,6 @@ def _in_messages(option: str) -> str:
     return option.removeprefix("--").rstrip("_")
 
 
-def _leave_out(word: str, words: deque[str]) -> None:
-    """Leave out an option of earlier versions and its value, with a note."""
-    name, has_value, _ = word.partition("=")
-    print(f"note: {note_of_dropped(name)}", file=sys.stderr)
-    # The value is in the word, `--name=value`, or else the next word, unless that is an option itself.
-    value_follows = not has_value and words and not words[0].startswith("--")
-    if value_follows:
-        words.popleft()
-
-
 def _check_once(option: str, kind: SettingType, before: Iterable[str]) -> None:
     """Raise `InputError` for an option that is given again; flags and `--config` may be."""
     if isinstance(kind, FlagType) or option == "--config":
@@ -112,8 +98,7 @@ def in_present_names(text: str, config: type[Settings]) -> str:
     """Give the settings of a file the names that they have in Python.
 
     Args:
-        text: YAML, with names of options, present or earlier ones; an earlier one is noted in standard error, and left
-            out where nothing took its place.
+        text: YAML, with names of options, present or earlier ones; an earlier one is noted in standard error.
         config: dataclass of the settings.
 
     Returns:
@@ -132,9 +117,6 @@ def in_present_names(text: str, config: type[Settings]) -> str:
     renamed: dict[str, object] = {}
     for key, value in values.items():
         name = str(key)
-        if _in_python(name) in config.dropped:
-            print(f"note: {note_of_dropped(name)}", file=sys.stderr)
-            continue
         present = _present_name(name, types)
         check(present not in renamed, _in_messages(present), "once", f"it again as {name!r}")
         renamed[present] = value

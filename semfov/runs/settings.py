@@ -16,7 +16,6 @@ class Settings(CheckedSettings):
     """Base of dataclasses of settings that are options of a command, or are read from a file."""
 
     unused: ClassVar[tuple[str, ...]] = ()  # inherited settings that mean nothing here: no options, and not written
-    dropped: ClassVar[tuple[str, ...]] = ()  # settings of earlier versions, which are taken with a note
 
     def plain(self) -> JsonObject:
         """Write the settings as JSON values, in which paths are text and tuples are lists."""

@@ -107,7 +107,8 @@ _PHOTOGRAPH = Object(
         "thresholds": THRESHOLDS,
         "certainty": _CERTAINTY,
         "window": Array((Number(above=0, high=1), Number(1, _LARGEST))),
-    }
+    },
+    required=("window",),
 )
 
 
@@ -339,7 +340,7 @@ def _restored_certainty(record: Mapping[str, Any]) -> Certainty | None:
 
 
 def _restored_photograph(record: Mapping[str, Any], classes: int, tensors: Mapping[str, Tensor]) -> PhotographEvidence:
-    least, context = record.get("window", USUAL_WINDOW)
+    least, context = record["window"]
     return PhotographEvidence(
         classes,
         thresholds=thresholds_of(record["thresholds"]),

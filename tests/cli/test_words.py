@@ -217,23 +217,6 @@ def test_files_of_settings_have_names_of_options_and_earlier_ones(command, text,
     assert told.err == (f"note: {note}; the earlier name will go\n" if note else "")
 
 
-@pytest.mark.parametrize("given", [["--map-steps", "300"], ["--map_steps=300"], ["--map_steps"], ["--config"]])
-def test_a_setting_that_was_dropped_is_taken_with_a_note(given, tmp_path, capsys):
-    if given == ["--config"]:
-        (tmp_path / "settings.yaml").write_text("map_steps: null\nseed: 7\n")
-        given, name = ["--config", str(tmp_path / "settings.yaml")], "map_steps"
-    else:
-        name = given[0].partition("=")[0]
-        given = [*given, "--seed", "7"]
-    with pytest.raises(SystemExit) as stopped:
-        main(["fit", "mine.onnx", *given, "--print-config"])
-    assert stopped.value.code == 0
-    told = capsys.readouterr()
-    assert "\nseed: 7\n" in told.out
-    assert "map_steps" not in told.out
-    assert told.err == f"note: {name} is a setting of earlier versions and changes nothing now; leave it out\n"
-
-
 @pytest.mark.parametrize("text", ["least: 0.9\nscore_threshold: 0.3", "score-threshold: 0.9\nscore_threshold: 0.3"])
 def test_a_file_that_has_a_setting_by_two_names_is_refused(text, tmp_path, capsys):
     (tmp_path / "settings.yaml").write_text(text)

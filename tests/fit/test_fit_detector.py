@@ -27,7 +27,7 @@ from semfov.belief import Verification
 from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.cli.main import main as command
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.fit.detector import _check_photographs, _config_of, _seconds_of_looks, _with_classes
+from semfov.fit.detector import _check_photographs, _seconds_of_looks, _with_classes
 from semfov.fit.detector_report import Difference
 from semfov.fit.folder import FITS as PART_FITS
 from semfov.fit.folder_report import thin_classes
@@ -582,40 +582,6 @@ def test_the_bar_expects_looks_from_all_cells_that_are_not_stored(home, tmp_path
     for index in range(3):
         run.detections(index)
     assert _seconds_of_looks(run, _check_photographs(run)) == 1
-
-
-def test_a_setting_that_was_dropped_changes_nothing_in_python():
-    with pytest.warns(FutureWarning, match="map_steps is a setting of earlier versions and changes nothing now"):
-        config = _config_of("mine.onnx", "photographs", "instances.json", "out", None, 1, {"map_steps": 3, "seed": 4})
-    assert config.seed == 4
-
-
-def test_the_map_of_an_earlier_version_is_noted(home, tmp_path):
-    """Folders had a map of its own beside the observation model, or alone where that could not be fitted."""
-    folder = copy_models(home, tmp_path)
-    known = Manifest.read(folder)
-    earlier = replace(known, parts={**known.parts, "map": known.parts["observation"]})
-    earlier.write(folder)
-    said = "models: its map is of an earlier version and is not read; run semfov fit again"
-    with pytest.warns(UserWarning, match=said):
-        agent = ActivePerception.from_pretrained(folder)
-    assert isinstance(agent.exploring.observer, SemanticMap)
-    left_out = replace(known.parts["observation"], file=None, sha256=None, used=False)
-    replace(earlier, parts={**earlier.parts, "observation": left_out}).write(folder)
-    with pytest.warns(UserWarning, match=said):
-        agent = ActivePerception.from_pretrained(folder)
-    assert agent.exploring.policy.name == "random"
-
-
-def test_what_guided_the_searches_of_an_earlier_version_is_noted(home, tmp_path):
-    folder = copy_models(home, tmp_path)
-    known = Manifest.read(folder)
-    others = {name: part for name, part in known.parts.items() if name != "search"}
-    replace(known, parts={**others, "evidence": known.parts["search"]}).write(folder)
-    with pytest.warns(UserWarning, match="models: its evidence for targets is of an earlier version and is not read"):
-        agent = ActivePerception.from_pretrained(folder)
-    assert isinstance(agent.searching.observer, Semantic)
-    assert agent.verification is None
 
 
 @pytest.mark.slow

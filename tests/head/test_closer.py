@@ -15,7 +15,6 @@ from semfov.head.views import Views
 from semfov.paths import HeadPath
 from semfov.sensor.sphere import panorama_directions
 from semfov.settings import ExploreSettings, SearchSettings
-from tests.refusals import unusable
 from tests.small import Coloured, rand
 
 FIELDS = (4.0, 20.0, 60.0)
@@ -230,23 +229,6 @@ def test_a_closer_look_changes_the_belief_at_its_place_alone(agent, speck):
     angles = world.angles_of(world.centres[changed])
     assert 1 <= len(changed) <= 4  # cells of 6 degrees
     assert ((angles - torch.tensor([20.0, 10.0])).abs() < 7).all()
-
-
-@pytest.mark.usefixtures("closely")
-def test_a_record_of_several_fields_from_before_closer_looks_is_refused(agent, speck, tmp_path, monkeypatch):
-    contents = HeadPath._contents
-
-    def without_closer(self):
-        tensors, record = contents(self)
-        del record["aimed"]
-        return tensors, record
-
-    monkeypatch.setattr(HeadPath, "_contents", without_closer)
-    agent.explore(Panorama(speck, fields=FIELDS), ExploreSettings(passes=2)).save(tmp_path / "old.safetensors")
-    unusable("aimed: expected the poses of closer looks", HeadPath.load, tmp_path / "old.safetensors")
-    one = agent.explore(Panorama(speck), ExploreSettings(passes=2))
-    one.save(tmp_path / "one.safetensors")
-    assert HeadPath.load(tmp_path / "one.safetensors").actions == one.actions
 
 
 @pytest.mark.usefixtures("closely")

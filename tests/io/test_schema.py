@@ -109,15 +109,6 @@ def test_missing_damaged_and_other_files_are_refused(name, tmp_path):
         LOADERS[name].from_pretrained(other)
 
 
-def test_the_map_of_an_earlier_version_is_refused_with_what_to_give_instead(tmp_path):
-    storage.write_file(tmp_path / "map.safetensors", {"weight": torch.ones(1)}, {"kind": "map-evidence"})
-    unusable(
-        "got map-evidence; such maps are no longer read: give an observation model",
-        FovealObservationModel.from_pretrained,
-        tmp_path / "map.safetensors",
-    )
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_shipped_models_are_found_by_name(name, tmp_path, monkeypatch):
     monkeypatch.setattr(LOADERS[name], "shipped", tmp_path)

@@ -55,7 +55,7 @@ def without_shared(state):
 
 @pytest.mark.parametrize("kind", PAIRS)
 def test_a_state_without_settings_is_loaded(kind):
-    """As of an earlier version, and as files of models hold it."""
+    """As files of models hold it."""
     make, one, other = PAIRS[kind]
     make(other).load_state_dict(without_settings(make(one).state_dict()))
 
@@ -81,7 +81,7 @@ def deciding_modules():
 
 @pytest.mark.parametrize("kind", deciding_modules())
 def test_thresholds_are_in_the_state(kind):
-    """A state of an earlier version has none; then those of the module stay. Settings that differ are refused still."""
+    """Tensors alone have none; then those of the module stay. Settings that differ are refused still."""
     chosen = Thresholds(0.7, 0.1, 0.05)
     source, target = deciding_modules()[kind], deciding_modules()[kind]
 
@@ -103,48 +103,13 @@ def observation_model(**settings):
     return FovealObservationModel.identity(["cup", "cat"], [0.2], **settings)
 
 
-def test_a_state_of_an_earlier_version_leaves_what_it_lacks_as_it_is():
-    """Alone, and as a part of another module; with a warning that names what was left."""
-    presence = Presence(torch.tensor(1.5), torch.ones(2), torch.full((2,), 0.5))
-    source = observation_model(tempering=0.5)
-    former = {name: value for name, value in source.state_dict().items() if "log_cell" not in name}
-    target = observation_model(cell=(0.1, 1.0, 1.0), presence=presence)
-    for module, prefix in ((target, ""), (torch.nn.ModuleList([target]), "0.")):
-        with pytest.warns(UserWarning, match="earlier version, without log_cell, presence; those of the module stay"):
-            module.load_state_dict({prefix + name: value for name, value in former.items()})
-    assert float(target.tempering) == 0.5
-    assert target.log_cell.exp().tolist() == pytest.approx([0.1, 1.0, 1.0])
-    assert float(target.presence.offset.detach()) == 1.5
-    nothing = {name: value for name, value in former.items() if name != "log_alpha"}
-    with pytest.raises(RuntimeError, match="log_alpha"):
-        target.load_state_dict(nothing)
-
-
-@pytest.mark.parametrize("has_thresholds", [True, False])
-def test_true_cells_go_with_the_thresholds_of_a_state(has_thresholds):
-    """A state without these two numbers, alone and in another module: its thresholds are of cells as they are."""
-    told, chosen = (
-        Presence(torch.tensor(1.0), torch.ones(2), torch.full((2,), 0.5), thresholds, centre=centre)
-        for thresholds, centre in (
-            (Thresholds(0.9, 0.039, 0.4), torch.tensor([2.0, 0.5])),
-            (Thresholds(0.8, 0.002, 0.05), None),
-        )
-    )
-    state = observation_model(presence=chosen).state_dict()
-    if not has_thresholds:  # nor had those of earlier versions
-        state = {name: value for name, value in state.items() if name != "presence._extra_state"}
-    said = "left as they are" if has_thresholds else "that of the module stays"
-    for prefix in ("", "0."):
-        model = observation_model(presence=told)
-        module = torch.nn.ModuleList([model]) if prefix else model
-        with pytest.warns(UserWarning, match=f"presence without centre; .*{said}"):
-            module.load_state_dict({prefix + name: value for name, value in state.items()})
-        if has_thresholds:
-            assert model.presence.centre is None
-            assert model.presence.thresholds == chosen.thresholds
-        else:
-            assert model.presence.centre.tolist() == [2.0, 0.5]
-            assert model.presence.thresholds == told.thresholds
+@pytest.mark.parametrize("part", ["log_cell", "presence.centre"])
+def test_a_state_that_lacks_a_part_is_refused(part):
+    presence = Presence(torch.tensor(1.5), torch.ones(2), torch.full((2,), 0.5), centre=torch.tensor([2.0, 0.5]))
+    state = observation_model(presence=presence).state_dict()
+    del state[part]
+    with pytest.raises(RuntimeError, match=f"Missing key.*{part}"):
+        observation_model(presence=presence).load_state_dict(state)
 
 
 def test_a_part_that_the_module_lacks_is_refused():

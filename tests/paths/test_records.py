@@ -194,17 +194,13 @@ def test_every_record_has_words_rows_and_a_notebook_view(make):
     assert "cup" in shown or "cat" in shown
 
 
-def test_closer_looks_are_counted_as_looks_are_also_those_of_earlier_files(tmp_path):
-    """Their `index` is that of `record[index]`, and their `number` from 1 as in tables; files called it `number`."""
+def test_closer_looks_are_counted_as_looks_are(tmp_path):
+    """Their `index` is that of `record[index]`, and their `number` from 1 as in tables."""
     path = zoom_path()
     (look,) = path.closer
     assert (look.index, look.number) == (path[look.index].index, path[look.index].number) == (2, 3)
     file = tmp_path / "record.safetensors"
     path.save(file)
-    tensors, values = read(file, "zoom path")
-    former = [{**values["closer"][0]}]
-    former[0]["number"] = former[0].pop("index")
-    write_file(file, tensors, {**values, "closer": former})
     assert ZoomPath.load(file).closer[0].index == 2
 
 
@@ -250,14 +246,10 @@ def test_an_undecided_search_says_what_found_takes():
         assert replace(path, **known).words.lack() == ""
 
 
-def test_a_file_keeps_what_found_takes_and_earlier_files_do_without(tmp_path, monkeypatch):
+def test_a_file_keeps_what_found_takes(tmp_path):
     path = replace(zoom_path(), decision=Decision("undecided", 0.61, confirm=0.74))
     path.save(tmp_path / "now.safetensors")
     assert type(path).load(tmp_path / "now.safetensors").decision.confirm == 0.74
-    monkeypatch.setattr("semfov.paths.files._DECISION_SINCE", {})
-    path.save(tmp_path / "before.safetensors")
-    again = type(path).load(tmp_path / "before.safetensors").decision
-    assert (again.probability, again.confirm) == (0.61, None)
 
 
 def seen(record, score, place):
@@ -544,19 +536,6 @@ def test_every_record_draws_itself_on_its_picture(make, tmp_path):
 
 
 @pytest.mark.parametrize("make", RECORDS)
-def test_a_file_with_earlier_names_is_read(make, tmp_path):
-    record = replace(make(), score_threshold=0.4, ending="min_gain")
-    file = tmp_path / "a.safetensors"
-    record.save(file)
-    tensors, values = read(file, record._format.kind)
-    write_file(file, tensors, {**values, "least": values.pop("score_threshold"), "ending": "worth"})
-    loaded = type(record).load(file)
-    assert (loaded.score_threshold, loaded.ending) == (0.4, "min_gain")
-    with pytest.warns(FutureWarning, match="least is called score_threshold now"):
-        assert loaded.least == 0.4
-
-
-@pytest.mark.parametrize("make", RECORDS)
 def test_a_file_keeps_the_picture(make, tmp_path):
     record = replace(with_picture(make), targets=(1, 2), score_threshold=0.4, source="a.jpg")
     file = tmp_path / "a.safetensors"
@@ -638,7 +617,10 @@ def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
         (tensors, {**values, "world": world}, "world.reach: expected a value"),
         (
             tensors,
-            {**values, "decision": {"outcome": "found", "probability": 0.9, "cell": 10**6, "place": None}},
+            {
+                **values,
+                "decision": {"outcome": "found", "probability": 0.9, "cell": 10**6, "place": None, "confirm": None},
+            },
             "decision.cell",
         ),
     ):

@@ -185,7 +185,7 @@ def spoil(tensors, record):
     def told(**values):
         return tensors, {**record, **values}
 
-    found = {"outcome": "found", "probability": 0.5, "cell": None, "place": None}
+    found = {"outcome": "found", "probability": 0.5, "cell": None, "place": None, "confirm": None}
     yield "cells", changed("cells", tensors["cells"] + 20)
     yield "cells", changed("cells", tensors["cells"].float())
     yield "fixations", changed("fixations", tensors["fixations"][:-1])
@@ -208,7 +208,7 @@ def spoil(tensors, record):
     yield "seconds", told(seconds=record["seconds"][1:])
     yield "decision", told(decision={**found, "outcome": "perhaps"})
     yield "decision.cell", told(decision={**found, "cell": 20})
-    look = {"fixation": 0, "number": None, "target": 1, "cell": 1, "place": 0.5, "presence": 0.5}
+    look = {"fixation": 0, "index": None, "target": 1, "cell": 1, "place": 0.5, "presence": 0.5}
     yield "closer_boxes", told(closer=[look])
     yield "closer", (changed("closer_boxes", torch.zeros(1, 4))[0], {**record, "closer": [{**look, "cell": 20}]})
     yield "closer", (changed("closer_boxes", torch.zeros(1, 4))[0], {**record, "closer": [{**look, "target": 3}]})

@@ -420,7 +420,7 @@ class FixationDensity(Pretrained):
         # Their sizes are those of the file.
         model.centre = tensors["centre"]
         model.duration = tensors["duration"]
-        if "likeness.mean" in tensors:  # models of earlier versions have none
+        if "likeness.mean" in tensors:  # models of few pictures have none
             model.likeness = PictureLikeness(len(tensors["likeness.mean"]), len(tensors["likeness.variance"]))
         model.to(tensors["shift"].dtype)
         model.load_state_dict({name: value.to(tensors["shift"].dtype) for name, value in tensors.items()})
