@@ -24,7 +24,7 @@ from eval.comparison.summary import announce, by_scene, collect_records, write_s
 from eval.search.report import found
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
-from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
+from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searched_looks
 from semfov.io.files import write_text
 from semfov.io.ranges import Count, Range
 from semfov.metrics.episodes import FloatArray, standard_error
@@ -86,17 +86,10 @@ class _Folds:
             raise InputError(f"data: expected at least 2 photographs in each fold, got {len(run.scenes)} in all")
         finish(run, "looking")
         self.ids = [*run.scenes.ids]
-        self.searches: list[SearchedLooks | None] = []
-        for index in range(len(run.scenes)):
-            grid = run.grid(index)
-            found_there = searches_of(
-                run.scenes.annotation(index),
-                run.detections(index),
-                grid.centres,
-                grid,
-                config.data.max_target_area,
-            )
-            self.searches.append(found_there)
+        photographs = range(len(run.scenes))
+        looks = ((index, run.detections(index), run.grid(index).centres) for index in photographs)
+        searches = searched_looks(run.scenes, looks, run.cells, config.data.max_target_area)
+        self.searches: list[SearchedLooks | None] = [searches.get(index) for index in photographs]
         self.start = make_observation(config.belief.model, run.eye)
 
     def fit(self, left_out: int | None) -> FovealObservationModel:

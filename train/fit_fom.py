@@ -277,7 +277,8 @@ def _fit_to_search(
     """Fit a model through the belief; returns it, and how much better searches of held-out photographs land."""
     searches: dict[int, SearchedLooks] = {}
     for shard in sampler.by_shard():
-        searches |= searched_looks(sampler.scenes, shard, _CELLS, config.max_target_area)
+        looks = ((index, *shard.looks_at(index)) for index in shard.scenes.unique().tolist())
+        searches |= searched_looks(sampler.scenes, looks, _CELLS, config.max_target_area)
     training = [looks for index, looks in searches.items() if index % config.holdout]
     judged = [looks for index, looks in searches.items() if index % config.holdout == 0]
     options = {"looks": config.looks, "steps": config.steps, "seed": config.seed}

@@ -35,7 +35,6 @@ _PRESENT = 2  # largest number of present classes to search for in a photograph
 _ABSENT = 20
 """Number of absent classes to search for in a photograph. As many as there are present ones count for the fit."""
 _NEAR = 5.0  # strength with which the shares of searches stay near those that the frequencies predict
-_NEWTON_STEPS = 50
 _FALSE_ALARMS = 0.007  # maximum share of absent targets that may be reported as found; it determines the threshold
 
 _AREA = 0.2  # classes that cover a larger share of a photograph are not searched for
@@ -257,16 +256,14 @@ def measured_shares(evidence: PhotographEvidence, scores: Tensor, held: Tensor, 
     """
     classes = torch.arange(scores.shape[-1]) + 1
     log_odds = evidence.presence(scores, classes.expand(scores.shape)).detach().double()
-    present = held.double()
     usual = _log_odds_held(held.sum(0), len(held))
     expected = usual - shares.double().logit()
-    shift = expected.clone()
-    for _ in range(_NEWTON_STEPS):
-        chance = (log_odds + shift).sigmoid()
-        gradient = (present - chance).sum(0) - _NEAR * (shift - expected)
-        curvature = (chance * (1 - chance)).sum(0) + _NEAR
-        shift = shift + (gradient / curvature).clamp(-1, 1)
-    return (usual - shift).sigmoid().clamp(1e-4, 1 - 1e-4).float()
+    no_facts = log_odds.new_zeros(len(held), 0)
+    strength = torch.tensor([_NEAR], dtype=torch.float64)
+    shifts = []
+    for known, is_held, near in zip(log_odds.mT, held.mT, expected, strict=True):
+        shifts += logistic_regression(no_facts, is_held, known=known, prior=(near[None], strength))
+    return (usual - torch.tensor(shifts)).sigmoid().clamp(1e-4, 1 - 1e-4).float()
 
 
 def _explored(looks: Sequence[WindowLook], lattice: Lattice, annotation: Annotation) -> Iterator[Exploration]:

@@ -18,7 +18,7 @@ from semfov.errors import DataError, check
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.presence import COUNTED, BeliefsOfSearches, fit_presence, judge_presence
 from semfov.fit.settings import FitOnCellsConfig
-from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searches_of
+from semfov.fit.through_belief import fit_through_belief, searched_looks
 from semfov.fit.training import split, training_of
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
@@ -165,7 +165,10 @@ def _with_odds_of_a_miss(
     """Fit the odds of a miss of a copy to the photographs that are not held out, or keep those of the model."""
     if config.steps == 0:
         return deepcopy(start)
-    training = [looks for index, looks in looks_with_targets(run, config).items() if index % config.holdout]
+    read = track(range(len(run.scenes)), "reading looks", "photograph")
+    looks = ((index, run.detections(index), run.grid(index).centres) for index in read)
+    searches = searched_looks(run.scenes, looks, run.cells, config.max_target_area)
+    training = [searched for index, searched in searches.items() if index % config.holdout]
     record = {"looks": config.looks, "steps": config.steps, "photographs": len(training)}
     return fit_through_belief(start, training, looks=config.looks, steps=config.steps, seed=config.seed, search=record)
 
@@ -183,26 +186,6 @@ def shares_drawn(scenes: Scenes, config: FitSearchConfig, absent: int | None) ->
     """
     there, missing = numbers_drawn(scenes, config.classes, config.max_target_area, absent)
     return ((there + 0.5) / (there + missing + 1)).float()
-
-
-def looks_with_targets(run: Looking, config: FitSearchConfig) -> dict[int, SearchedLooks]:
-    """List the stored looks at photographs with the classes that may be searched for.
-
-    Args:
-        run: the photographs and their stored looks.
-        config: the largest targets.
-
-    Returns:
-        The looks by the number of the photograph; photographs without such a class are left out.
-    """
-    searched = {}
-    for index in track(range(len(run.scenes)), "reading looks", "photograph"):
-        grid = run.grid(index)
-        annotation = run.scenes.annotation(index)
-        looks = searches_of(annotation, run.detections(index), grid.centres, grid, config.max_target_area)
-        if looks is not None:
-            searched[index] = looks
-    return searched
 
 
 def search_photographs(

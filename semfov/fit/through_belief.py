@@ -1,7 +1,7 @@
 """Fit an observation model through the belief, so that searches with it land on their targets sooner."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +15,6 @@ from semfov.belief.observers import SemanticSearch
 from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
-from semfov.fit.samples import Samples
 from semfov.fit.training import descend
 from semfov.observation.foveal import FovealObservationModel
 
@@ -45,43 +44,35 @@ class SearchedLooks:
 
 
 def searched_looks(
-    scenes: Scenes, samples: Samples, cells: tuple[int, int], max_target_area: float
+    scenes: Scenes,
+    looks: Iterable[tuple[int, Detections, Tensor]],
+    cells: tuple[int, int],
+    max_target_area: float | None,
 ) -> dict[int, SearchedLooks]:
-    """Find the searches that stored looks allow.
+    """Find the searches that looks at photographs allow.
 
     Args:
         scenes: the photographs.
-        samples: labelled detections of their looks.
+        looks: number of a photograph, detections of R looks at it, and their fixations `(R, 2)`, in pixels.
         cells: columns and rows of the grid.
-        max_target_area: classes that cover a larger share of the image are not searched for.
-
-    Returns:
-        The searches by the number of the photograph; some photographs have none.
-    """
-    searches = {}
-    for index in samples.scenes.unique().tolist():
-        annotation = scenes.annotation(index)
-        search = searches_of(annotation, *samples.looks_at(index), Grid(*cells, annotation.size), max_target_area)
-        if search is not None:
-            searches[index] = search
-    return searches
-
-
-def searches_of(
-    annotation: Annotation, looks: Detections, fixations: Tensor, grid: Grid, max_target_area: float | None
-) -> SearchedLooks | None:
-    """Find the classes that may be searched for in a photograph, and their cells.
-
-    Args:
-        annotation: the objects of the photograph.
-        looks: detections of R looks at it.
-        fixations: `(R, 2)`, in pixels.
-        grid: the cells.
         max_target_area: classes that cover a larger share of the image are not searched for; None: no limit.
 
     Returns:
-        The looks with these classes; None if there is no class to search for.
+        The looks with these classes by the number of the photograph; those without a class to search for are left out.
     """
+    searches = {}
+    for index, detections, fixations in looks:
+        annotation = scenes.annotation(index)
+        grid = Grid(*cells, annotation.size)
+        goals = _goals(annotation, grid, max_target_area)
+        if goals:
+            targets = torch.tensor([*goals])
+            searches[index] = SearchedLooks(detections, fixations, grid, targets, torch.stack([*goals.values()]))
+    return searches
+
+
+def _goals(annotation: Annotation, grid: Grid, max_target_area: float | None) -> dict[int, Tensor]:
+    """Find the cells `(X·Y,)` of each class that may be searched for."""
     covered = grid.footprint(annotation.boxes)
     goals: dict[int, Tensor] = {}
     for target in legal_targets(annotation, max_target_area):
@@ -89,9 +80,7 @@ def searches_of(
         # A target in every cell is found at once.
         if goal.any() and not goal.all():
             goals[target] = goal
-    if not goals:
-        return None
-    return SearchedLooks(looks, fixations, grid, torch.tensor([*goals]), torch.stack([*goals.values()]))
+    return goals
 
 
 def landing_loss(observer: SemanticSearch, searched: SearchedLooks, order: Tensor) -> Tensor | None:

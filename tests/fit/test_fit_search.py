@@ -33,6 +33,7 @@ def run():
     """A stand-in for a run with stored looks at five embedded scenes."""
     stand_in = looking(CLASSES, GRID, 5)
     stand_in.eye = SimpleNamespace(settings=lambda: {"detector": {"name": "toy"}})
+    stand_in.cells = (GRID.columns, GRID.rows)
     return stand_in
 
 
