@@ -15,7 +15,7 @@ from semfov.cli.agent import detector_classes, make_agent, note_of_detector
 from semfov.cli.options import SearchOptions
 from semfov.errors import InputError, SemfovError
 from semfov.io.pretrained import shipped_model
-from semfov.observation.presence import presence_facts
+from semfov.observation.presence import log_evidence, presence_facts
 from semfov.observation.thresholds import Thresholds
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
@@ -173,7 +173,7 @@ def test_yolov3_tiny_searches_with_the_numbers_of_yolox_nano():
     )
     assert "those of yolox-nano-search" in model.metadata["search"]
     assert torch.equal(model.log_miss, other.log_miss)
-    assert torch.equal(model.presence.weight, other.presence.weight)
+    assert torch.equal(model.presence.slopes, other.presence.slopes)
     assert torch.equal(model.presence.centre, other.presence.centre)
     assert model.presence.thresholds == other.presence.thresholds
 
@@ -185,7 +185,7 @@ def test_the_card_has_the_numbers_and_thresholds_of_true_cells(name, detector):
     presence = model.presence
     offset, slope = presence.centre.tolist()
     assert f"{offset:.2f} and {slope:.2f} for {detector}" in card
-    cell, score = presence.weight.tolist()
+    cell, score = presence.slopes.tolist()
     assert f"{cell:.2f} and {score:.2f} in `{name}-search`" in card
     thresholds = presence.thresholds
     assert f"| {thresholds.confirm:.2f} | {thresholds.place:.2f} | {thresholds.stop_below:.2f} |" in card
@@ -194,13 +194,13 @@ def test_the_card_has_the_numbers_and_thresholds_of_true_cells(name, detector):
 @pytest.mark.parametrize("name", DETECTORS)
 def test_the_presence_of_models_of_searches_grows_with_what_the_looks_show(name):
     presence = semfov.FovealObservationModel.from_pretrained(f"{name}-search").presence
-    assert bool((presence.weight > 0).all())
+    assert bool((presence.slopes > 0).all())
     assert presence.shares.shape == (80,)
     thresholds = presence.thresholds
     assert 0.49 < thresholds.confirm < 1
     assert 0 < thresholds.stop_below <= 0.3
     # Nothing was seen in one look, and the class with certainty in the other: below and above the threshold.
-    facts = presence_facts(torch.tensor([[1e-6], [0.99]]), torch.tensor([1e-3, 0.95]).log())
+    facts = presence_facts(torch.tensor([[1e-6], [0.99]]), log_evidence(torch.tensor([0.0, 0.95])))
     unseen, seen = presence(facts).sigmoid().tolist()
     assert unseen < 0.1
     assert seen > thresholds.confirm

@@ -33,7 +33,7 @@ from semfov.decision import (
     decide,
     decision_without_closer_looks,
 )
-from semfov.detection.detections import Detections, highest_score
+from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, StoredLooks, rollout
 from semfov.episode.stopwatch import Stopwatch
 from semfov.eye import Eye
@@ -251,10 +251,10 @@ class DecisionRun(ComparedLooking):
                 "scene": self.scenes.ids[index],
                 "target": target,
                 "present": search.present,
-                "sharp": float(highest_score(sharp, target)),
+                "sharp": float(sharp.highest[0, target]),
                 "frequency": float(self.frequencies[index][target]),
                 "plain": plain_looks(self.eye, image, sharp, target, grid, goal) if tiles else None,
-                "tiled": max(float(highest_score(look, target)) for look in (sharp, *tiles)) if tiles else None,
+                "tiled": max(float(look.highest[0, target]) for look in (sharp, *tiles)) if tiles else None,
                 "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }
             if self.windows is not None:

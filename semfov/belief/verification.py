@@ -113,8 +113,9 @@ def closer_features(
     r"""Describe a closer look at a place by seven features, and find the target in it.
 
     Detection m has the largest score times overlap o with the examined box. The features are the logits, within 0.001,
-    of: the picture and the cell holding the target, and the evidence there, all before; :math:`s_{mt} o_m`,
-    :math:`\max_l s_{lt}`, :math:`\max_l o_l \max_{k \ne t} s_{lk}` and :math:`s_{mt}`.
+    of: the picture and the cell holding the target, and the evidence there, all before; :math:`s_{mt} o_m`; the highest
+    score of the target in the look, in faint candidates, too; :math:`\max_l o_l \max_{k \ne t} s_{lk}`; and
+    :math:`s_{mt}`.
 
     Args:
         presence: probability that the picture holds the target, before the look.
@@ -140,7 +141,7 @@ def closer_features(
     rival = scores.index_fill(1, no_rivals, 0).amax(-1)
     after = [
         float(score[best] * overlap[best]),
-        float(score.max()),
+        float(closer.highest[0, target]),
         float((overlap * rival).max()),
         float(score[best]),
     ]

@@ -73,7 +73,8 @@ def _merge_fixation(
         boxes[index].cpu(), score.cpu(), label.cpu(), looks=crop.cpu(), cut=is_cut.cpu(), sharpness=-crop.cpu()
     )
     objects = index[distinct[:limit].to(index)]
-    return rows.take(objects)[None]
+    found = rows.take(objects)[None]
+    return replace(found, highest=detections.highest.amax(0, keepdim=True))
 
 
 def _shown_in_full(boxes: Tensor, windows: Tensor, picture: Tensor, side: int) -> Tensor:

@@ -52,6 +52,8 @@ class Detections:
         mask: `(..., L)`, true where a row is a detection and false where it is padding.
         confidence: `(..., L)`, the detector's own score of the best class, 0 for padding; None takes the largest score
             of a class from the vectors.
+        highest: `(..., K+1)`, the highest score of each class in the whole image, in the vectors of candidates that are
+            too faint for a detection, too; None takes that of the detections.
 
     Detections are in descending order of their largest score of a class in the vectors, in which beliefs fuse them,
     with padding last.
@@ -69,6 +71,7 @@ class Detections:
     scores: Tensor
     mask: Tensor
     confidence: Tensor = None  # type: ignore[assignment]  # `__post_init__` replaces None
+    highest: Tensor = None  # type: ignore[assignment]  # likewise
 
     def __post_init__(self) -> None:
         check_shape(self.boxes, "boxes", None, 4)
@@ -86,6 +89,15 @@ class Detections:
             best = classes.amax(-1) if classes.shape[-1] else classes.sum(-1)
             object.__setattr__(self, "confidence", best * self.mask)
         check(self.confidence.shape == lead, "confidence", f"shape {tuple(lead)}", tuple(self.confidence.shape))
+        if self.highest is None:
+            object.__setattr__(self, "highest", self._highest_of_rows())
+        by_class = (*lead[:-1], self.scores.shape[-1])
+        check(self.highest.shape == by_class, "highest", f"shape {by_class}", tuple(self.highest.shape))
+
+    def _highest_of_rows(self) -> Tensor:
+        """Find the highest score of each class among the detections, `(..., K+1)`; 0 without detections."""
+        scores = self.scores * self.mask[..., None]
+        return scores.amax(-2) if scores.shape[-2] else scores.sum(-2)
 
     @property
     def count(self) -> Tensor:
@@ -120,7 +132,9 @@ class Detections:
         return self._mapped(lambda tensor: tensor.to(device))
 
     def __getitem__(self, index: int | slice | Tensor | tuple[Tensor, ...] | None) -> Self:
-        """Return the detections of some images of the batch."""
+        """Return the detections of some images of the batch; single rows, by a tuple, are no whole image any more."""
+        if isinstance(index, tuple):
+            return type(self)(*(column[index] for column in self._columns()))
         return self._mapped(lambda tensor: tensor[index])
 
     def take(self, rows: slice | Tensor) -> Self:
@@ -133,16 +147,20 @@ class Detections:
             The detections, in the order of the rows.
         """
         return type(self)(
-            self.boxes[..., rows, :], self.scores[..., rows, :], self.mask[..., rows], self.confidence[..., rows]
+            self.boxes[..., rows, :],
+            self.scores[..., rows, :],
+            self.mask[..., rows],
+            self.confidence[..., rows],
+            self.highest,
         )
 
     def _columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """List the tensors, in the order of the attributes."""
+        """List the tensors that have a row for each detection, in the order of the attributes."""
         return self.boxes, self.scores, self.mask, self.confidence
 
     def _mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
         """Apply a function to each tensor."""
-        return type(self)(*map(function, self._columns()))
+        return type(self)(*map(function, (*self._columns(), self.highest)))
 
     @classmethod
     def empty(cls, batch: int, classes: int, *, like: Tensor | None = None) -> Self:
@@ -174,7 +192,7 @@ class Detections:
         """
         check(len(images) > 0, "images", "at least one batch of detections", 0)
         longest = max(batch.mask.shape[-1] for batch in images)
-        padded = [batch._padded(longest)._columns() for batch in images]
+        padded = [(*batch._padded(longest)._columns(), batch.highest) for batch in images]
         return cls(*map(torch.cat, zip(*padded, strict=True)))
 
     def _padded(self, length: int) -> Self:
@@ -185,6 +203,7 @@ class Detections:
             pad(self.scores, (0, 0, 0, missing)),
             pad(self.mask, (0, missing)),
             pad(self.confidence, (0, missing)),
+            self.highest,
         )
 
     def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -324,19 +343,3 @@ class Detections:
             image = replace(image, confidence=confidence[None])
         order = vectors[:, 1:].amax(-1).argsort(descending=True, stable=True)
         return image.take(order)
-
-
-def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
-    """Find the highest score of classes among the detections of each look.
-
-    Args:
-        detections: a batch of B looks.
-        target: a class, or classes `(T,)`.
-
-    Returns:
-        `(B,)`, or `(B, T)`; 0 without detections.
-    """
-    scores = detections.scores * detections.mask[..., None]  # (B, L, K+1)
-    batch, rows, components = scores.shape
-    highest = scores.amax(1) if rows else scores.new_zeros(batch, components)
-    return highest[..., target]

@@ -40,7 +40,8 @@ class Detector(StatedModule, ABC):
         stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         stretch: whether images are stretched to the canvas instead of letterboxed.
         corner: whether letterboxed images are in the upper left corner of the canvas instead of its middle.
-        faint: confidence from which on a candidate is a hint of where to zoom in (`semfov.zoom.hints`).
+        faint: confidence from which on a candidate counts, though it is no detection: as a hint of where to zoom in
+            (`semfov.zoom.hints`), and of what the picture holds (`Detections.highest`).
         score_threshold: score from which on a detection counts: two of three are right.
         digest: sha256 of the weights, `""` for random weights.
 
@@ -167,10 +168,19 @@ class Detector(StatedModule, ABC):
         """
         check(len(canvas) > 0, "canvas", "at least one image", 0)
         check(canvas.is_floating_point(), "canvas", "floating-point RGB in [0, 1]", canvas.dtype)
-        candidates = self.propose_likely(canvas, self.selection.threshold).precise()
+        candidates = self.propose_likely(canvas, self._faintest).precise()
         if back is not None:
             candidates = replace(candidates, boxes=back(candidates.boxes))
-        return select(candidates, placement, self.selection, self.background)
+        return self._select(candidates, placement)
+
+    @property
+    def _faintest(self) -> float:
+        """Confidence of the faintest candidate that `Detections.highest` reads."""
+        return min(self.faint, self.selection.threshold)
+
+    def _select(self, candidates: Candidates, placement: Placement | None) -> Detections:
+        """Select the detections among candidates."""
+        return select(candidates, placement, self.selection, self.background, self._faintest)
 
     def forward(self, images: Tensor) -> Detections:
         """Detect objects in images.
@@ -219,7 +229,7 @@ class Detector(StatedModule, ABC):
             InputError: the detector hides its feature maps, or has no map of this name.
         """
         candidates, maps = self.propose_with_features(canvas, layers)
-        detections = select(candidates.precise(), placement, self.selection, self.background)
+        detections = self._select(candidates.precise(), placement)
         height, width = canvas.shape[-2:]
         return FeatureMaps(maps, (width, height), placement, detections)
 

@@ -1,7 +1,7 @@
 """Selection of a detector's boxes: threshold, non-maximum suppression, and a limit on their number."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -42,7 +42,11 @@ class Selection:
 
 
 def select(
-    candidates: Candidates, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
+    candidates: Candidates,
+    placement: Placement | None,
+    selection: Selection,
+    policy: BackgroundPolicy,
+    faint: float | None = None,
 ) -> Detections:
     """Select the best boxes of each image, map them to the image, and compute their score vectors.
 
@@ -51,6 +55,7 @@ def select(
         placement: placement of the images on the canvas; None leaves boxes in canvas pixels.
         selection: threshold, non-maximum suppression and limit.
         policy: background policy of the score vectors.
+        faint: confidence from which on candidates count for `Detections.highest`; None: the detections alone do.
 
     Returns:
         The boxes, those with the largest score of a class in their vectors first.
@@ -64,6 +69,11 @@ def select(
     if values_known(candidates.boxes):
         candidates = candidates.to(torch.device("cpu"))
     images = [_select_of_image(candidates, image, placement, selection, policy) for image in range(count)]
+    if faint is not None:
+        images = [
+            replace(detections, highest=_highest_of_candidates(candidates, image, faint, policy)[None])
+            for image, detections in enumerate(images)
+        ]
     detections = images[0] if count == 1 else Detections.stack(images)
     return detections if detections.boxes.device == device else detections.to(device)
 
@@ -126,6 +136,26 @@ def _select_of_image(
     confidence = rows.confidence.index_select(0, order)
     mask = torch.ones_like(order, dtype=torch.bool)
     return Detections(boxes[None], scores[None], mask[None], confidence[None])
+
+
+def _highest_of_candidates(candidates: Candidates, image: int, faint: float, policy: BackgroundPolicy) -> Tensor:
+    """Find the highest score of each class in the vectors of all candidates of an image that are not too faint.
+
+    Args:
+        candidates: all boxes of a head.
+        image: number of the image.
+        faint: smallest confidence of a candidate that counts.
+        policy: background policy of the score vectors.
+
+    Returns:
+        `(K+1,)`; 0 without candidates.
+    """
+    index = (candidates.confidence[image] >= faint).nonzero()[:, 0]
+    rows = candidates.take(image, index)
+    if not candidates.are_checked:
+        check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
+    scores = score_vectors(rows, policy)
+    return scores.amax(0) if len(scores) else scores.sum(0)
 
 
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:

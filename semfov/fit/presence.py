@@ -94,7 +94,7 @@ def fit_presence(searches: BeliefsOfSearches, shares: Tensor, bounds: Bounds) ->
     of_class = shares[searches.target - 1].double().logit()
     known = of_class.repeat(len(counted))
     times = torch.full_like(known, 1 / len(counted))  # all looks of a search are one case
-    weight = torch.zeros(2)
+    slopes = torch.zeros(2)
     kept = [0, 1]  # numbers of the facts that count
     while True:
         offset, *weights = logistic_regression(facts[:, kept], answers, times=times, known=known, ridge=_RIDGE)
@@ -102,9 +102,9 @@ def fit_presence(searches: BeliefsOfSearches, shares: Tensor, bounds: Bounds) ->
             break
         # A surer cell, or a higher score, must not speak against the class: few searches may say so by chance.
         del kept[weights.index(min(weights))]
-    weight[kept] = torch.tensor(weights)
+    slopes[kept] = torch.tensor(weights)
     centre = _fit_cells(searches, of_class)
-    presence = Presence(torch.tensor(offset), weight, shares, centre=centre).requires_grad_(False)
+    presence = Presence(torch.tensor(offset), slopes, shares, centre=centre).requires_grad_(False)
     presence.thresholds = thresholds_of_searches(presence, searches, bounds)
     return presence
 

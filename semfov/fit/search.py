@@ -24,7 +24,7 @@ from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.io.ranges import Count, Positive, Range, Share, Whole
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.presence import log_odds_of_cells
+from semfov.observation.presence import FAINT_SCORE, log_odds_of_cells
 from semfov.runs.config import DataConfig, ProtocolConfig
 from semfov.runs.looking import CellLooks, Looking
 from semfov.runs.progress import track
@@ -92,7 +92,7 @@ class FittedSearch(NamedTuple):
         assert presence is not None
         thresholds = presence.thresholds
         assert thresholds is not None
-        cell, score = presence.weight.tolist()
+        cell, score = presence.slopes.tolist()
         rows = [["looks", "gaze on target, %", "area under ROC", "ECE", "NLL"]]
         for row in self.judged:
             figures = (f"{row[name]:.3f}" for name in ("area", "ece", "nll"))
@@ -107,7 +107,7 @@ class FittedSearch(NamedTuple):
                 *table(rows),
                 "",
                 f"Presence: logit P = {float(presence.offset):.2f} + {cell:.2f} logit of the most "
-                f"probable cell + {score:.2f} mean ln of the highest scores.",
+                f"probable cell + {score:.2f} ln(1 + s / {FAINT_SCORE:g}) of the highest score s.",
                 "",
                 "Thresholds: the target counts as found if the probability of its presence is at least "
                 f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search "

@@ -14,7 +14,7 @@ SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
 
 PRESENCE = {
     "presence.offset": Field((), low=-1e3, high=1e3, optional=True),
-    "presence.weight": Field((2,), low=-1e3, high=1e3, optional=True),
+    "presence.slopes": Field((2,), low=-1e3, high=1e3, optional=True),
     "presence.shares": SHARES,
     "presence.place": Field((2,), low=-1e3, high=1e3, optional=True),
     "presence.centre": Field((2,), low=-1e3, high=1e3, optional=True),
@@ -24,8 +24,8 @@ PRESENCE = {
 EVEN = 0.5
 """Share of the searches whose target is there that a `Presence` assumes."""
 
-LEAST_SCORE = 1e-3
-"""Score that is added to the highest one of a look before its logarithm is taken."""
+FAINT_SCORE = 3e-4
+"""Score ε below which the highest score of a class hardly counts (`log_evidence`)."""
 
 _SURE = 1e-6  # probabilities nearer to 0 or 1 count as this far from them
 
@@ -42,35 +42,48 @@ def log_odds_of_cells(probability: Tensor) -> Tensor:
     return probability.clamp(_SURE, 1 - _SURE).logit()
 
 
-def presence_facts(probability: Tensor, log_score: Tensor) -> Tensor:
+def log_evidence(score: Tensor) -> Tensor:
+    r"""Compute :math:`\ln (1 + s / \varepsilon)` of scores s, which is 0 where nothing was seen (`FAINT_SCORE`).
+
+    Args:
+        score: `(...)`, from 0 to 1.
+
+    Returns:
+        `(...)`, at least 0.
+    """
+    return (score / FAINT_SCORE).log1p()
+
+
+def presence_facts(probability: Tensor, evidence: Tensor) -> Tensor:
     """Put together what a `Presence` reads of a belief about a class.
 
     Args:
         probability: `(..., X·Y)`, of the class in each cell.
-        log_score: `(...)`, mean over the looks of the logarithm of the highest score of the class (`LEAST_SCORE`).
+        evidence: `(...)`, `log_evidence` of the highest score of the class in any look.
 
     Returns:
         `(..., 2)`.
     """
-    return torch.stack([log_odds_of_cells(probability.amax(-1)), log_score], -1)
+    return torch.stack([log_odds_of_cells(probability.amax(-1)), evidence], -1)
 
 
 class Presence(DecidingModule):
-    r"""Probability that a picture holds a class, from the most probable cell, and from the scores of all looks.
+    r"""Probability that a picture holds a class, from the most probable cell, and from the highest score of any look.
 
     .. math:: \operatorname{logit} P(t) = a + b \operatorname{logit} \max_x P(t \in x)
-              + \frac{c}{n} \sum_{i=1}^n \ln \bigl(\max_l s_{lt}^{(i)} + 0.001\bigr)
+              + c \max_{i, l} \ln \bigl(1 + s_{lt}^{(i)} / \varepsilon\bigr)
 
-    A cell takes the closest look alone; the last term, over the detections l of each look i, keeps what all of them
-    saw. It assumes that the target is in half of the pictures (`EVEN`), whatever the class. Two further numbers make
-    the probability of a cell true (`of_cells`): two where all cells under a detection have its weight, and two where
-    the cell of its centre has all of it.
+    A cell takes the closest look alone, and knows of detections only. The last term, over the candidates l of each look
+    i, those that are too faint for a detection among them, keeps the best of what was seen (`log_evidence`). It assumes
+    that the target is in half of the pictures (`EVEN`), whatever the class. Two further numbers make the probability of
+    a cell true (`of_cells`): two where all cells under a detection have its weight, and two where the cell of its
+    centre has all of it.
 
     .. math:: \operatorname{logit} P'(t \in x) = a_x + b_x \operatorname{logit} P(t \in x)
 
     Args:
         offset: a, `()`.
-        weight: b and c, `(2,)`.
+        slopes: b and c, `(2,)`.
         shares: `(K,)`, by class, shares of the searches of the fit whose target was there.
         thresholds: thresholds at which searches decide; None if none were chosen.
         place: :math:`a_x` and :math:`b_x`, `(2,)`, where all cells under a detection have its weight; None leaves the
@@ -81,13 +94,13 @@ class Presence(DecidingModule):
         InputError: a shape does not fit, or a number is not finite.
 
     >>> presence = Presence(torch.tensor(0.0), torch.tensor([0.5, 0.0]), torch.full((2,), 0.5))
-    >>> facts = presence_facts(torch.tensor([[0.9, 0.1]]), torch.tensor([-1.0]))
+    >>> facts = presence_facts(torch.tensor([[0.9, 0.1]]), log_evidence(torch.tensor([0.8])))
     >>> presence(facts).detach().sigmoid()  # less sure than the cell
     tensor([0.7500])
     """
 
     offset: Tensor
-    weight: Tensor
+    slopes: Tensor
     place: Tensor
     centre: Tensor | None
     shares: Tensor
@@ -95,7 +108,7 @@ class Presence(DecidingModule):
     def __init__(
         self,
         offset: Tensor,
-        weight: Tensor,
+        slopes: Tensor,
         shares: Tensor,
         thresholds: Thresholds | None = None,
         *,
@@ -105,7 +118,7 @@ class Presence(DecidingModule):
         super().__init__()
         check_tensor(shares, "shares")
         place = torch.tensor([0.0, 1.0]).to(shares) if place is None else place
-        numbers = [("offset", offset, ()), ("weight", weight, (2,)), ("place", place, (2,))]
+        numbers = [("offset", offset, ()), ("slopes", slopes, (2,)), ("place", place, (2,))]
         if centre is not None:
             numbers.append(("centre", centre, (2,)))
         for name, values, shape in [*numbers, ("shares", shares, (shares.numel(),))]:
@@ -132,7 +145,7 @@ class Presence(DecidingModule):
         Returns:
             `(...)`, differentiable in the facts and the three numbers.
         """
-        return self.offset.to(facts) + facts @ self.weight.to(facts)
+        return self.offset.to(facts) + facts @ self.slopes.to(facts)
 
     def detach(self) -> "Presence":
         """Copy the module with numbers that are constants, through which no gradient flows.
@@ -175,10 +188,10 @@ def presence_of(tensors: dict[str, Tensor], thresholds: Thresholds | None) -> Pr
     Raises:
         InputError: it has only some of them.
     """
-    needed = ("presence.offset", "presence.weight", "presence.shares", "presence.place")
+    needed = ("presence.offset", "presence.slopes", "presence.shares", "presence.place")
     found = [name for name in PRESENCE if name in tensors]
     if not found:
         return None
     check(all(name in found for name in needed), "presence", f"all of {', '.join(needed)}", ", ".join(found))
-    offset, weight, shares, place = (tensors[name] for name in needed)
-    return Presence(offset, weight, shares, thresholds, place=place, centre=tensors.get("presence.centre"))
+    offset, slopes, shares, place = (tensors[name] for name in needed)
+    return Presence(offset, slopes, shares, thresholds, place=place, centre=tensors.get("presence.centre"))

@@ -67,6 +67,7 @@ class DetectionStore(SceneStore):
             "boxes": Field(("M", 4)),
             "scores": Field(("M", "C" if components is None else components), low=0, high=1),
             "confidence": Field(("M",), low=0, high=1),
+            "highest": Field(("N", "C" if components is None else components), low=0, high=1),
         }
         super().__init__(folder, what, modules_digest(*sources, __name__), Schema(fields | {**self.more}))
 
@@ -104,6 +105,7 @@ class DetectionStore(SceneStore):
             "boxes": torch.cat([look.boxes[look.mask] for look in looks]),  # (M, 4)
             "scores": torch.cat([look.scores[look.mask] for look in looks]),  # (M, C)
             "confidence": torch.cat([look.confidence[look.mask] for look in looks]),  # (M,)
+            "highest": torch.cat([look.highest for look in looks]),  # (N, C)
         }
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Any]) -> list[Any]:
@@ -116,8 +118,9 @@ class DetectionStore(SceneStore):
                 scores[None].clone(),
                 torch.ones(1, len(boxes), dtype=torch.bool),
                 confidence[None].clone(),
+                highest[None].clone(),
             )
-            for boxes, scores, confidence in looks
+            for (boxes, scores, confidence), highest in zip(looks, tensors["highest"], strict=True)
         ]
 
 

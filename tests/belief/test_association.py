@@ -174,7 +174,7 @@ def test_a_search_needs_odds_of_a_miss(looks):
     refused("miss_rate: expected a model fitted with miss rates", watch, SemanticSearch(bare), looks)
 
 
-def test_the_most_probable_cell_and_all_scores_tell_whether_the_picture_holds_the_target(looks):
+def test_the_most_probable_cell_and_the_highest_score_tell_whether_the_picture_holds_the_target(looks):
     thresholds = Thresholds(0.7, 0.1)
     presence = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((3,), 0.5), thresholds)
     plain, told = (SemanticSearch(model(presence=each).requires_grad_(False)) for each in (None, presence))
@@ -185,8 +185,21 @@ def test_the_most_probable_cell_and_all_scores_tell_whether_the_picture_holds_th
         peak = float(belief.probability(target).max())
         assert float(without.presence(target)) == pytest.approx(peak)
         seen = [(scores[:, target] * mask).max() for scores, mask in zip(looks.scores, looks.mask, strict=True)]
-        odds = -0.4 + 0.7 * math.log(peak / (1 - peak)) + 0.2 * sum(math.log(each + 1e-3) for each in seen) / 3
+        odds = -0.4 + 0.7 * math.log(peak / (1 - peak)) + 0.2 * math.log(1 + float(max(seen)) / 3e-4)
         assert float(belief.presence(target)) == pytest.approx(1 / (1 + math.exp(-odds)), rel=1e-5)
+
+
+def test_candidates_that_are_too_faint_for_a_detection_tell_of_the_picture_and_of_no_cell(looks):
+    presence = Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.full((3,), 0.5))
+    observer = SemanticSearch(model(presence=presence).requires_grad_(False))
+    hinted = looks.highest.clone()
+    hinted[1, 2] = 0.97
+    plain, told = (watch(observer, replace(looks, highest=each)) for each in (looks.highest, hinted))
+    assert torch.equal(plain.probability(2), told.probability(2))
+    odds = plain.presence(2).logit() + 0.2 * (
+        math.log1p(0.97 / 3e-4) - math.log1p(float(looks.highest[:, 2].max()) / 3e-4)
+    )
+    torch.testing.assert_close(told.presence(2).logit(), odds)
 
 
 @pytest.mark.parametrize("footprint", ["box_centre", "overlap"])

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from torchvision.ops import box_iou
 
 from semfov import Detections
 from semfov.detection import Candidates, score_vectors
-from semfov.detection.detections import highest_score
 from semfov.detection.exchange import category_ids
 from tests.refusals import refused
 
@@ -277,22 +277,25 @@ def test_inconsistent_arguments_are_refused_by_name(monkeypatch):
     refused("pip install supervision", some().to_supervision)
 
 
-def test_highest_scores_equal_a_loop(device):
-    looks = detections([2, 5, 0, 3], classes=4)
-    every = torch.tensor([2, 0, 4])
-    several = highest_score(looks.to(device), every.to(device))
-    assert several.shape == (4, 3)
+def test_highest_scores_are_those_of_the_detections_where_nothing_else_is_given(device):
+    looks = detections([2, 5, 0, 3], classes=4).to(device)
     for look in range(4):
-        for row, target in enumerate(every.tolist()):
+        for target in range(5):
             shown = [float(s[target]) for s, m in zip(looks.scores[look], looks.mask[look], strict=True) if m]
-            assert float(several[look, row]) == max(shown, default=0.0)
-    for target in range(5):
-        one = highest_score(looks.to(device), target)
-        assert one.shape == (4,)
-        assert torch.equal(one, highest_score(looks.to(device), torch.tensor([target], device=device))[:, 0])
+            assert float(looks.highest[look, target]) == max(shown, default=0.0)
     empty = Detections.empty(3, 4, like=torch.empty(0, dtype=torch.float64, device=device))
-    for target, shape in ((2, (3,)), (every, (3, 3))):
-        none = highest_score(empty, target)
-        assert none.shape == shape
-        assert none.dtype == torch.float64
-        assert not none.any()
+    assert torch.equal(empty.highest, torch.zeros(3, 5, dtype=torch.float64, device=device))
+
+
+def test_highest_scores_stay_with_their_images():
+    seen = torch.tensor([[0.9, 0.5, 0.6, 0.7], [0.1, 0.8, 0.3, 0.2]])
+    looks = replace(detections([2, 4]), highest=seen)
+    assert torch.equal(looks[1:].highest, seen[1:])
+    assert torch.equal(looks[0].highest, seen[0])
+    assert torch.equal(looks.take(torch.tensor([0])).highest, seen)
+    assert torch.equal(Detections.stack([looks[1:], looks[:1]]).highest, seen.flip(0))
+    assert looks.to("cpu").highest.equal(seen)
+    # Rows of several images are no image.
+    rows = looks[torch.tensor([0, 1]), torch.tensor([0, 3])]
+    assert torch.equal(rows.highest, torch.maximum(looks.scores[0, 0], looks.scores[1, 3]))
+    refused("highest", replace, looks, highest=seen[:1])

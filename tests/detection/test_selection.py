@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torchvision.ops import batched_nms, nms
 
 from semfov import Objects, merge_boxes
-from semfov.detection import Candidates, Detections, Selection, letterbox
+from semfov.detection import Candidates, Detections, Selection, letterbox, score_vectors
 from semfov.detection.crops import merge_crops
 from semfov.detection.objects import merge_looks, survivors
 from semfov.detection.selection import select, suppress
@@ -82,6 +82,27 @@ def test_selection_applies_threshold_suppression_and_order():
     best = found.scores[..., 1:].amax(-1)
     assert bool((best[:, :-1] >= best[:, 1:]).all())
     torch.testing.assert_close(found.scores.sum(-1), found.mask.double())
+
+
+@pytest.mark.parametrize("faint", [0.0, 0.02, 0.3, 1.0])
+def test_the_highest_scores_are_those_of_all_candidates_that_are_not_too_faint(faint):
+    candidates = make(30)
+    found = select(candidates, None, Selection(threshold=0.3, iou=0.1, limit=2), "residual", faint)
+    vectors = score_vectors(candidates, "residual")
+    for image in range(2):
+        confidences = candidates.confidence[image].tolist()
+        rows = [row for row, each in zip(vectors[image], confidences, strict=True) if each >= faint]
+        for label in range(4):
+            expected = max((float(row[label]) for row in rows), default=0.0)
+            assert float(found.highest[image, label]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_detector_reads_candidates_that_are_too_faint_for_a_detection():
+    boxes, classes = torch.rand(1, 3, 4).cumsum(-1) * 9, torch.tensor([[[0.9, 0.1], [0.1, 0.9], [0.8, 0.2]]])
+    detector = Fixed(candidates=Candidates(boxes, classes, torch.tensor([[0.5, 0.01, 0.0001]])))
+    seen = detector(torch.rand(1, 3, 8, 8))
+    assert seen.count.tolist() == [1]
+    torch.testing.assert_close(seen.highest[0, 1:], torch.tensor([0.45, 0.009]))
 
 
 def test_boxes_outside_the_image_are_dropped():

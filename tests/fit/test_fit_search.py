@@ -137,7 +137,7 @@ def test_the_presence_maximises_the_likelihood_given_the_shares_of_classes(looks
         return cost + 0.5 * (1e-6 * numbers[0] ** 2 + 1e-3 * (numbers[1:] ** 2).sum())
 
     best = minimize(loss, np.zeros(3), tol=1e-12).x
-    assert [float(presence.offset), *presence.weight.tolist()] == pytest.approx(list(best), abs=1e-3)
+    assert [float(presence.offset), *presence.slopes.tolist()] == pytest.approx(list(best), abs=1e-3)
     assert torch.equal(presence.shares, SHARES)
     assert not any(parameter.requires_grad for parameter in presence.parameters())
     # Thresholds are those of targets that are there in half of the pictures.
@@ -382,8 +382,8 @@ def test_the_report_has_the_measures_and_the_thresholds(run, model):
     said = f"presence is at least {thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}"
     assert said in fitted.report
     assert f"no other cell has a probability of at least {thresholds.stop_below:.3f}" in fitted.report
-    cell, score = presence.weight.tolist()
-    said = f"logit P = {float(presence.offset):.2f} + {cell:.2f} logit of the most probable cell + {score:.2f} mean"
+    cell, score = presence.slopes.tolist()
+    said = f"logit P = {float(presence.offset):.2f} + {cell:.2f} logit of the most probable cell + {score:.2f} ln(1 + s"
     assert said in fitted.report
     names = ("area", "ece", "nll")
     assert cells_of(fitted.report)[2:] == [
@@ -400,9 +400,9 @@ def test_a_surer_cell_never_speaks_against_the_class():
     alone = fit_presence(
         replace(searches, facts=searches.facts * torch.tensor([0.0, 1.0])[:, None, None]), SHARES, FitSearchConfig()
     )
-    assert presence.weight[0] == 0
-    assert presence.weight[1] > 0
-    assert presence.weight[1].item() == pytest.approx(alone.weight[1].item(), abs=1e-4)
+    assert presence.slopes[0] == 0
+    assert presence.slopes[1] > 0
+    assert presence.slopes[1].item() == pytest.approx(alone.slopes[1].item(), abs=1e-4)
     assert presence.offset.item() == pytest.approx(alone.offset.item(), abs=1e-4)
 
 

@@ -77,7 +77,7 @@ def test_a_prior_scales_all_cells_of_a_view_as_it_changes_the_presence(agent, pa
     """By the odds o that the view holds the target, P' / P = k (1 + o) / (1 + k o), with k the ratio of the priors."""
     chance = 0.03
     agent.searching.presence.offset.fill_(1.0)
-    agent.searching.presence.weight.copy_(torch.tensor([1.0, 0.0]))  # no cell is more probable than the view
+    agent.searching.presence.slopes.copy_(torch.tensor([1.0, 0.0]))  # no cell is more probable than the view
 
     def look(prior, assumed):
         path = agent.search(Panorama(panorama), "green", SearchSettings(passes=1, prior=prior), chance=chance)

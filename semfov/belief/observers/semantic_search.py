@@ -13,10 +13,10 @@ from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import likelihoods
 from semfov.belief.observers.base import Evidence, Observer, farther, own
 from semfov.belief.prior import Prior, PriorLike, with_prior
-from semfov.detection.detections import Detections, highest_score
+from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.presence import EVEN, LEAST_SCORE, Presence, presence_facts
+from semfov.observation.presence import EVEN, Presence, log_evidence, presence_facts
 from semfov.observation.thresholds import Thresholds
 
 _LEAST = 1e-6  # of the likelihood of background, by which the others are divided
@@ -33,7 +33,7 @@ class SearchEvidence(Evidence):
         covered: the cells under each detection, `(B, L, X·Y)`.
         distance: from the fixation to each cell, `(B, X·Y)`, in longer sides of the image.
         fixated: the fixated cell, `(B,)`.
-        log_score: logarithm of the highest score of each class, `(B, K+1)`.
+        highest: `log_evidence` of the highest score of each class, `(B, K+1)`.
     """
 
     by_detection = ("ratio", "weight", "covered")
@@ -43,7 +43,7 @@ class SearchEvidence(Evidence):
     covered: Tensor
     distance: Tensor
     fixated: Tensor
-    log_score: Tensor
+    highest: Tensor
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class SearchBelief(DirichletBelief):
         following: `(B, X·Y, K+1)`, Dirichlet parameters given that no fixated cell holds the target (`chance`); `beta`
             are those given the looks alone.
         visited: `(B, X·Y)` boolean, the fixated cells.
-        log_score: `(B, K+1)`, sum over the looks of the logarithm of the highest score of each class.
+        highest: `(B, K+1)`, `log_evidence` of the highest score of each class in any look.
         looks: `(B,)`, number of looks.
         footprint: rule for the weight of a detection in each cell (`Presence.of_cells`).
         calibration: by which it says whether the picture holds a class; None takes the most probable cell.
@@ -63,7 +63,7 @@ class SearchBelief(DirichletBelief):
 
     following: Tensor = None  # type: ignore[assignment]
     visited: Tensor = None  # type: ignore[assignment]
-    log_score: Tensor = None  # type: ignore[assignment]
+    highest: Tensor = None  # type: ignore[assignment]
     looks: Tensor = None  # type: ignore[assignment]
     footprint: Footprint = "box_centre"
     calibration: Presence | None = None
@@ -111,8 +111,7 @@ class SearchBelief(DirichletBelief):
         Returns:
             `(B, 2)`.
         """
-        mean = pick(self.log_score, target) / self.looks.clamp(min=torch.finfo(self.looks.dtype).tiny)
-        return presence_facts(super().probability(target), mean)
+        return presence_facts(super().probability(target), pick(self.highest, target))
 
 
 class SemanticSearch(Observer):
@@ -129,7 +128,8 @@ class SemanticSearch(Observer):
 
     A search goes on only if it has not fixated its target. For the next fixation (`Belief.chance`) a detection that
     covers a fixated cell therefore loses the share ρ of its weight, the model's `refutation`. Whether the picture holds
-    the target at all is told by its most probable cell and the scores of all looks (`semfov.observation.Presence`).
+    the target at all is told by its most probable cell and by the highest score of all looks
+    (`semfov.observation.Presence`).
 
     Args:
         model: calibrates the scores, and has the odds of a miss, ρ, and the calibration of presence, if it was fitted.
@@ -193,7 +193,7 @@ class SemanticSearch(Observer):
             beta,
             following=beta,
             visited=visited,
-            log_score=beta.new_zeros(batch, self.components),
+            highest=beta.new_zeros(batch, self.components),
             looks=beta.new_zeros(batch),
             footprint=self.footprint,
             calibration=self.model.presence,
@@ -208,14 +208,13 @@ class SemanticSearch(Observer):
         weight = covered
         if self.footprint != "overlap":
             weight = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
-        highest = highest_score(detections, torch.arange(self.components)).to(ratio)
         return SearchEvidence(
             ratio,
             weight,
             covered,
             grid.distance(fixation).to(ratio),
             grid.cell_of(fixation),
-            (highest + LEAST_SCORE).log(),
+            log_evidence(detections.highest.to(ratio)),
         )
 
     def unseen(self, like: Tensor) -> Tensor:
@@ -248,7 +247,7 @@ class SemanticSearch(Observer):
             beta=torch.where(is_closer, _fusion(seen, weight, odds), old.beta),
             following=torch.where(is_closer, _fusion(seen, remaining, odds), old.following),
             visited=visited,
-            log_score=old.log_score + seen.log_score.to(old.beta),
+            highest=torch.maximum(old.highest, seen.highest.to(old.beta)),
             looks=old.looks + 1,
             closest=torch.minimum(old.closest, seen.distance),
             # That of a belief that was detached is a copy, through which the model would not learn.
@@ -268,7 +267,7 @@ class SemanticSearch(Observer):
             beta=_WEAK + keep * (old.beta - _WEAK),
             following=_WEAK + keep * (old.following - _WEAK),
             visited=visited,
-            log_score=keep * old.log_score,
+            highest=keep * old.highest,
             looks=keep * old.looks,
             closest=old.closest + farther(keep),
         )
