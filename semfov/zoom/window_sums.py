@@ -6,11 +6,14 @@ cells of the picture                        windows of 3 × 3 cells
 · · · · · · ·                               · ■ ■ ■ ·     the next time that the sums are asked for.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+_BLOCK = 1024  # windows along a side that are summed by one product
 
 Cells = NDArray[np.float32]
 """Numbers of the cells of a lattice, `(rows, columns)`, or of the windows of a level, `(down, across)`."""
@@ -79,7 +82,7 @@ class WindowSums:
         across = max(columns - self._span, 0) + 1
         self._sums = np.zeros((down, across), np.float32)
         # Column n holds the weights of a window that starts at cell n. One matrix serves both axes, in part.
-        starts = np.arange(max(down, across))
+        starts = np.arange(min(max(down, across), _BLOCK))
         self._band = np.zeros((len(starts) + self._span - 1, len(starts)), np.float32)
         self._band[starts + np.arange(self._span)[:, None], starts] = weight[:, None]
         self.changed: CellBox | None = (0, 0, columns, rows)
@@ -108,9 +111,33 @@ class WindowSums:
         bottom = min(y2, self._sums.shape[0])
         right = min(x2, self._sums.shape[1])
         cells = self._read_cells((slice(top, bottom + reach), slice(left, right + reach)))
-        down = self._band[: cells.shape[0], : bottom - top]
-        across = self._band[: cells.shape[1], : right - left]
         # NumPy would start threads for large pictures, and they would wait at full load for the next product.
-        row_sums = torch.from_numpy(cells) @ torch.from_numpy(across)
-        self._sums[top:bottom, left:right] = (torch.from_numpy(down).mT @ row_sums).numpy()
+        row_sums = self._sums_of_rows(torch.from_numpy(cells), right - left)
+        sums = [
+            torch.from_numpy(self._band[: len(part), :count]).mT @ part
+            for count, part in self._blocks(row_sums, bottom - top)
+        ]
+        self._sums[top:bottom, left:right] = torch.cat(sums).numpy()
         return self._sums
+
+    def _sums_of_rows(self, cells: Tensor, across: int) -> Tensor:
+        """Sum the cells of each row over the columns of windows, `(rows, across)`."""
+        sums = [
+            part.mT @ torch.from_numpy(self._band[: len(part), :count])
+            for count, part in self._blocks(cells.mT, across)
+        ]
+        return torch.cat(sums, 1)
+
+    def _blocks(self, cells: Tensor, windows: int) -> Iterator[tuple[int, Tensor]]:
+        """Divide windows along the first side of cells into blocks, so that the matrix stays small in a long picture.
+
+        Args:
+            cells: `(length, n)`, from the first cell of the first window.
+            windows: number of windows, each of which starts a cell after the one before.
+
+        Yields:
+            The number of windows in a block, and their cells.
+        """
+        for start in range(0, windows, _BLOCK):
+            count = min(_BLOCK, windows - start)
+            yield count, cells[start : start + count + self._span - 1]

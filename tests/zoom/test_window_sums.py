@@ -1,0 +1,44 @@
+"""Sums over windows: those of one product for short sides, of blocks for long ones."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from semfov.zoom import window_sums
+from semfov.zoom.window_sums import WindowSums
+
+
+def plain(cells, weight):
+    """The definition, with what lies beyond the picture as 0."""
+    span = len(weight)
+    rows, columns = cells.shape
+    padded = np.pad(cells.astype(np.float64), ((0, max(span - rows, 0)), (0, max(span - columns, 0))))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (span, span))
+    return np.einsum("abij,i,j->ab", windows, weight, weight)
+
+
+@pytest.mark.parametrize("shape", [(1, 50), (50, 1), (3, 40), (17, 23), (8, 8), (40, 5)])
+@pytest.mark.parametrize("span", [1, 4, 8])
+@pytest.mark.parametrize("block", [1, 5, 1024])
+def test_sums_of_blocks_are_those_of_the_definition(monkeypatch, shape, span, block):
+    monkeypatch.setattr(window_sums, "_BLOCK", block)
+    rng = np.random.default_rng(0)
+    cells = rng.random(shape, np.float32)
+    weight = rng.random(span, np.float32)
+    sums = WindowSums(weight, shape, lambda slices: cells[slices])
+    np.testing.assert_allclose(sums.update(), plain(cells, weight), rtol=1e-5)
+    x, y = shape[1] // 2, shape[0] // 2
+    cells[y, x:] += 1
+    sums.mark((x, y, shape[1], y + 1))
+    np.testing.assert_allclose(sums.update(), plain(cells, weight), rtol=1e-5)
+
+
+def test_a_long_strip_takes_memory_in_proportion_to_its_cells():
+    shape = 8, 200_000
+    cells = np.ones(shape, np.float32)
+    tracemalloc.start()
+    sums = WindowSums(np.ones(8, np.float32), shape, lambda slices: cells[slices])
+    assert tracemalloc.get_traced_memory()[1] < 16 * cells.nbytes
+    tracemalloc.stop()
+    assert (sums.update() == 64).all()
