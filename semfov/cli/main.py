@@ -102,11 +102,14 @@ def _print_all_options(name: str) -> None:
 
 def _parse_and_run(name: str, rest: Sequence[str]) -> int:
     """Read the options of a subcommand, and run it; returns the exit code."""
+    from semfov.errors import printable
     from semfov.runs.command import run_command
 
     words = partial(_in_command_words, options=_message_options(name))
     with warnings.catch_warnings():  # each is one line in the words of the command, without the place in the code
-        warnings.showwarning = lambda message, *_, **__: print(f"warning: {words(str(message))}", file=sys.stderr)
+        warnings.showwarning = lambda message, *_, **__: print(
+            f"warning: {printable(words(str(message)))}", file=sys.stderr
+        )
         return run_command(
             partial(_run, name),
             _options_of(name),

@@ -14,7 +14,7 @@ from semfov.cli.options import FIGURES
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
 from semfov.data.classes import amount
-from semfov.errors import DataError, check
+from semfov.errors import DataError, check, printable
 from semfov.io.code import package_digest
 from semfov.io.files import write_text, written_alone
 from semfov.runs.results import SceneResults
@@ -188,7 +188,7 @@ def tell_written(files: Sequence[object], finished: SceneResults | None, part: s
         part: which part of the pictures is done, such as `2 of 3`; None for all.
     """
     if files:
-        print("written:", *(f"  {path}" for path in files), sep="\n")
+        print("written:", *(f"  {printable(str(path))}" for path in files), sep="\n")
     if finished is None:
         return
     finished.flush()

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import torch
 from PIL import Image
 from pycocotools.coco import COCO
 
+import semfov.cli.main
 from semfov import read_image
 from semfov.belief import Verification
 from semfov.cli.formats import Csv
@@ -813,3 +815,12 @@ def test_the_agents_of_the_package_look_at_an_embedded_scene(options, tmp_path, 
     assert "which comes with semfov" in printed
     assert (tmp_path / "out/scanpath.png").is_file()
     assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_words_of_warnings_cannot_steer_the_terminal(capsys, monkeypatch):
+    """As of matplotlib, which names a letter of a file's name that its font lacks."""
+    monkeypatch.setattr(semfov.cli.main, "_run", lambda *_: warnings.warn("no glyph \x1b[31m", stacklevel=1) or 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        semfov.cli.main.main(["detectors"])
+    assert capsys.readouterr().err == "warning: no glyph \\x1b[31m\n"
