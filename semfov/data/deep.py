@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, cast
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,30 +39,64 @@ def is_deep(image: "ImageFile") -> bool:
     return white > 255
 
 
-def deep_values(
-    copies: tuple["ImageFile", "ImageFile"], load: Callable[["Image"], "Image"]
-) -> tuple[NDArray[np.uint16], int]:
-    """Read the values of a file that `is_deep`.
+class DeepValues(NamedTuple):
+    """The values of a file that `is_deep`, which are joined from two decoded halves when they are asked for.
 
-    Args:
-        copies: the image twice, not decoded yet.
-        load: decodes an image and turns it.
-
-    Returns:
-        The values `(H, W, C)`, an alpha last, and the largest possible one.
+    Attributes:
+        shape: `(H, W, C)`; of two or four channels, the last one is an alpha.
+        most: the largest possible value.
+        rows: makes the values of some rows, `(h, W, C)`.
     """
-    image, again = copies
-    tile = image.tile[0]
-    if tile.codec_name == "ppm":
-        return _ppm_values(image)
-    if tile.args == _GREY_AND_ALPHA:
-        image.tile = [tile._replace(args="RGBA")]
-        halves = np.asarray(load(image))
-        return halves[..., 0::2] * np.uint16(256) + halves[..., 1::2], 65535
-    again.tile = [tile._replace(args=_LOWER_BYTES[cast(str, tile.args)])]
-    upper = np.asarray(load(image))
-    lower = np.asarray(load(again))
-    return upper * np.uint16(256) + lower, 65535
+
+    shape: tuple[int, int, int]
+    most: int
+    rows: Callable[[slice], NDArray[np.uint16]]
+
+    @classmethod
+    def of(cls, copies: tuple["ImageFile", "ImageFile"], load: Callable[["Image"], "Image"]) -> Self:
+        """Decode a file.
+
+        Args:
+            copies: the image twice, not decoded yet.
+            load: decodes an image and turns it.
+
+        Returns:
+            Its values.
+        """
+        image, again = copies
+        tile = image.tile[0]
+        if tile.codec_name == "ppm":
+            values, most = _ppm_values(image)
+            return cls(values.shape, most, lambda rows: values[rows].astype(np.uint16))
+        if tile.args == _GREY_AND_ALPHA:
+            image.tile = [tile._replace(args="RGBA")]
+            both = load(image)
+            return cls((both.height, both.width, 2), 65535, lambda rows: _joined(*_every_other(rows_of(both, rows))))
+        again.tile = [tile._replace(args=_LOWER_BYTES[cast(str, tile.args)])]
+        upper = load(image)
+        lower = load(again)
+        shape = upper.height, upper.width, len(upper.getbands())
+        return cls(shape, 65535, lambda rows: _joined(rows_of(upper, rows), rows_of(lower, rows)))
+
+
+def rows_of(image: "Image", rows: slice) -> NDArray[Any]:
+    """Take some rows of a decoded image as an array."""
+    return np.asarray(cut(image, rows))
+
+
+def cut(image: "Image", rows: slice) -> "Image":
+    """Cut some rows out of a decoded image."""
+    return image.crop((0, rows.start, image.width, rows.stop))
+
+
+def _every_other(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Split channels into the first, third, … and the others."""
+    return values[..., 0::2], values[..., 1::2]
+
+
+def _joined(upper: NDArray[np.uint8], lower: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Join the two bytes of values."""
+    return upper * np.uint16(256) + lower
 
 
 def jpeg2000_bits(path: str | PathLike[str]) -> int:
@@ -76,7 +110,7 @@ def jpeg2000_bits(path: str | PathLike[str]) -> int:
     return (head[place] & 0x7F) + 1  # the first bit tells a sign
 
 
-def _ppm_values(image: "ImageFile") -> tuple[NDArray[np.uint16], int]:
+def _ppm_values(image: "ImageFile") -> tuple[NDArray[Any], int]:
     """Read the values of a PPM, which are not packed, and the value that it says is white."""
     tile = image.tile[0]
     mode, white = cast(tuple[str, int], tile.args)
@@ -85,4 +119,4 @@ def _ppm_values(image: "ImageFile") -> tuple[NDArray[np.uint16], int]:
     file.seek(tile.offset)
     content = file.read(2 * int(np.prod(shape)))
     values = np.frombuffer(content, ">u2")  # two bytes a sample, the most significant first (netpbm, ppm(5))
-    return values.reshape(shape).astype(np.uint16), white
+    return values.reshape(shape), white

@@ -2,14 +2,15 @@
 
 import logging
 import math
+import re
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 import numpy as np
 import torch
@@ -17,10 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.camera_raw import check_no_raw
-from semfov.data.deep import deep_values, is_deep, jpeg2000_bits
+from semfov.data.decoded import Decoded
+from semfov.data.deep import DeepValues, cut, is_deep, jpeg2000_bits, rows_of
+from semfov.data.jpeg_scans import MOST_SCANS, has_many_scans
 from semfov.data.signatures import kind_of
 from semfov.data.tiff_tags import HEIGHT, WHITE_IS_ZERO, WIDTH, TiffTags
-from semfov.data.tone import Values, White, between, black_and_white
+from semfov.data.tone import White
 from semfov.data.windowed import Box, LargePicture
 from semfov.errors import DataError, SemfovError, check_data, check_pixels
 from semfov.io.files import check_regular
@@ -42,7 +45,15 @@ SMALLER = "reduce it, or look at it by windows (search, find_all, explore; the l
 """What to do with a picture that is too large to be read as a whole, in words that hold for every command."""
 
 _SMALL = 2**24  # pixels of a picture that may be blank
+_TEXT_HEAD = 2**16  # bytes of the head of a PPM: its kind, its size and its white, and comments between them
+_KIND_OF_TEXT = re.compile(rb"P([1-6f])\s")
+_COMMENT = re.compile(rb"#[^\r\n]*")
 _MOST_A_BYTE = 2**11  # pixels; the best of the common packers keeps about a thousand numbers in a byte
+_SMALL_BYTES = 2**29  # that any picture may take when it is decoded as a whole
+_BYTES_A_BYTE = 200  # of decoded pixels for a byte of the file; photographs have ten to thirty
+_FLOATS = 12  # bytes of a pixel in [0, 1]
+_BYTES = 3
+_MOST_OF_BYTES = 255
 _PAGES = 64  # of a TIFF that are looked through for one that is no thumbnail
 _JPEG2000_REMEDY = 'or a name that ends in .jp2 and pip install "semfov[geo]"'
 _ORIENTATION = 0x0112  # tag of EXIF
@@ -63,32 +74,27 @@ _INVERSE = {6: 8, 8: 6}  # orientations whose moves undo each other; other moves
 SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
 """Pillow's modes of grey pictures with 16 bits."""
 
+_OF_SCANS = ("JPEG", "MPO")  # Pillow's names; the latter holds several pictures
 _PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to 8 bits
 _TRANSPARENT = ("RGBA", "LA", "PA", "RGBa", "La")  # modes with an alpha
-_ROWS = 64  # of a decoded picture that are converted at once: more leave the cache of the processor
 
 
 def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
     """Read an image file by Pillow alone; arguments, result and errors are those of `semfov.read_image`."""
     name = f"image {Path(path)}"
     with opening(Path(path), "decoded"), open_pillow(path) as image:
-        check_proportion(image.size, Path(path).stat().st_size, path)
+        held = Path(path).stat().st_size
+        check_proportion(image.size, held, path)
         check_area(image.size, name)
+        check_decoding(image.size, _FLOATS + _halves(image), held, name)
         # Pillow spreads these over 8 or 16 bits, so that what is white is no longer known.
         are_spread = white is not None and image.format == "JPEG2000" and jpeg2000_bits(path) > 8
         check_data(not are_spread, name, f"white=None beside more than 8 bits of JPEG 2000, {_JPEG2000_REMEDY}", white)
-        deep = is_deep(image)
-        sixteen_bits = deep or image.mode in SIXTEEN_BITS
-        largest = _largest_grey(image)
-        if not deep:
-            pixels = _pixels(image, name, upright=oriented, white=white)
-            colours = pixels
-    if deep:
-        pixels, colours = _deep_pixels(path, upright=oriented, white=white)
-    # The warning is given outside the silence of the decoders.
-    if sixteen_bits and white is None:
-        warn_of_range(float(colours.min()) * largest, float(colours.max()) * largest, path, largest)
-    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
+        decoded = _decoded(image, path, upright=oriented)
+        extremes = _extremes(decoded, name) if white is None else None
+        pixels = decoded.floats(white)
+    _warn_of_extremes(extremes, decoded, path)
+    return torch.from_numpy(pixels)
 
 
 def _largest_grey(image: "Image") -> int:
@@ -96,42 +102,30 @@ def _largest_grey(image: "Image") -> int:
     return 4095 if TiffTags.of_image(image).bits == (12,) else 65535
 
 
-def _deep_pixels(
-    path: str | PathLike[str], *, upright: bool, white: White | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Read a file with more than 8 bits a channel.
+def _halves(image: "ImageFile") -> int:
+    """Count the bytes of a pixel while a picture is decoded, in Pillow's images; deep ones are decoded in halves."""
+    return 8 if is_deep(image) else 4
 
-    Args:
-        path: the file.
-        upright: turn the picture upright; False leaves it as it is stored.
-        white: values that are black and white; None for the full range.
 
-    Returns:
-        Pixels `(H, W, 3)` in [0, 1] over white, and the colours alone, without alpha, `(H, W, C)`.
+def _extremes(decoded: Decoded, name: str) -> tuple[float, float] | None:
+    """Find the least and the greatest value of a picture of more than 8 bits; None for others.
+
+    Raises:
+        DataError: there are some beyond black or white.
     """
-    with opening(Path(path), "decoded"), open_pillow(path) as image, open_pillow(path) as again:
-        transparent = image.info.get("transparency")
-        values, most = deep_values((image, again), partial(_loaded, upright=upright))
-    samples = values.shape[-1]
-    has_alpha = samples in (2, 4)
-    shades = values[..., :-1] if has_alpha else values
-    full_range = (0.0, float(most))
-    limits = full_range if white is None else black_and_white(white, shades)
-    colours = between(shades, limits)
-    is_grey = colours.shape[-1] != 3
-    pixels = np.repeat(colours, 3, -1) if is_grey else colours
-    if has_alpha:
-        # Where black and white are stated, they are those of the colours, and not of the alpha.
-        alpha = between(values[..., -1:], full_range)
-        pixels = pixels * alpha + (1 - alpha)
-    elif transparent is not None:
-        pixels = _without(pixels, values == np.array(transparent))
-    return pixels, colours
+    if decoded.most == _MOST_OF_BYTES:
+        return None
+    least, greatest = decoded.extremes()
+    got = f"{least:g} to {greatest:g}; give white='auto', or the values that are black and white"
+    inside = bool(least >= 0 and greatest <= decoded.most)  # false for NaN, too
+    check_data(inside, name, f"values from 0 to {decoded.most:g}", got)
+    return least, greatest
 
 
-def _without(pixels: NDArray[np.float32], is_transparent: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Show pixels `(H, W, 3)` as white where all their channels, `(H, W, C)`, are those of the transparent colour."""
-    return np.where(is_transparent.all(-1, keepdims=True), np.float32(1), pixels)
+def _warn_of_extremes(extremes: tuple[float, float] | None, decoded: Decoded, path: str | PathLike[str]) -> None:
+    """Warn of values that show little; outside the silence of the decoders."""
+    if extremes is not None and decoded.most > 1:
+        warn_of_range(*extremes, path, int(decoded.most))
 
 
 def warn_of_range(least: float, most: float, path: str | PathLike[str], largest: int = 65535) -> None:
@@ -248,12 +242,26 @@ def open_pillow(path: str | PathLike[str]) -> Iterator["ImageFile"]:
     check_regular(path, name)
     with quiet_decoders:
         check_no_raw(path, name)
+    _check_text_head(path, name)
     # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
     with Path(path).open("rb") as file, _open_in_formats(file) as image:
         if image.format == "TIFF":
             _seek_full_page(image)
             _check_tiff(TiffTags.of_image(image), image.size, name)
         yield image
+
+
+def _check_text_head(path: str | PathLike[str], name: str) -> None:
+    """Raise `DataError` for a PPM, PGM, PBM or PFM whose head does not end soon, which Pillow reads byte by byte."""
+    with Path(path).open("rb") as file:
+        head = file.read(_TEXT_HEAD)
+    kind = _KIND_OF_TEXT.match(head)
+    if kind is None or len(head) < _TEXT_HEAD:
+        return
+    needed = 3 if kind[1] in b"14" else 4  # pictures of single bits state no white
+    words = _COMMENT.sub(b"", head).split()
+    expected = f"its size in the first {_TEXT_HEAD:,} bytes"
+    check_data(len(words) >= needed, name, expected, "longer comments; replace it")
 
 
 def _open_in_formats(file: BinaryIO) -> "ImageFile":
@@ -279,11 +287,23 @@ def _seek_full_page(image: "Image") -> None:
     """Go to the first page of a TIFF that is no reduced copy, such as a thumbnail; the first one if there is none."""
     if not TiffTags.of_image(image).is_reduced:
         return
-    for number in range(1, min(getattr(image, "n_frames", 1), _PAGES)):
-        image.seek(number)
-        if not TiffTags.of_image(image).is_reduced:
-            return
+    # Pillow would follow all pages to count them.
+    with suppress(EOFError):
+        for number in range(1, _PAGES):
+            image.seek(number)
+            if not TiffTags.of_image(image).is_reduced:
+                return
     image.seek(0)
+
+
+def has_pages(image: "Image") -> bool:
+    """Tell whether a Pillow image has a further page, or frame, without counting them; it is at the first one after."""
+    try:
+        image.seek(1)
+    except EOFError:
+        return False
+    image.seek(0)
+    return True
 
 
 def _check_tiff(tags: TiffTags, size: tuple[int, int], name: str) -> None:
@@ -324,6 +344,21 @@ def check_tile(size: int, stored: int, name: str) -> None:
     check_data(not (is_larger or is_smaller), name, f"tiles of {size:,} bytes", got)
 
 
+def check_decoding(size: tuple[int, int], a_pixel: int, held: int, name: str) -> None:
+    """Raise `DataError` for a picture that takes far more memory than a file of its size should, when it is decoded.
+
+    Args:
+        size: its `(width, height)`.
+        a_pixel: bytes that a pixel takes.
+        held: bytes of its file.
+        name: of the picture, for the message.
+    """
+    most = _SMALL_BYTES + _BYTES_A_BYTE * held
+    taken = math.prod(size) * a_pixel
+    got = f"{size[0]} × {size[1]}, which take {taken:,}; reduce it, or convert it to a tiled TIFF"
+    check_data(taken <= most, name, f"pixels of at most {most:,} bytes, in proportion to the file", got)
+
+
 def check_area(size: tuple[int, int], name: str) -> None:
     """Raise `DataError` for a picture of `(width, height)` with more pixels than are decoded as a whole."""
     got = f"{size[0]} × {size[1]}; {SMALLER}"
@@ -343,8 +378,10 @@ def from_pillow(image: "Image", name: str, white: White | None = None) -> Tensor
     """
     with opening(name, "decoded"):
         check_area(image.size, name)
-        pixels = _pixels(image, name, upright=True, white=white)
-    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
+        decoded = _decoded(image, None, upright=True)
+        if white is None:
+            _extremes(decoded, name)
+        return torch.from_numpy(decoded.floats(white))
 
 
 def _orientation(image: "Image") -> int:
@@ -361,6 +398,7 @@ def _loaded(image: "Image", *, upright: bool) -> "Image":
     from PIL.Image import Transpose
 
     stored = _orientation(image)
+    _check_scans(image)
     image.load()
     remaining = _orientation(image)  # Pillow turns some pictures when it decodes them
     if upright:
@@ -372,47 +410,42 @@ def _loaded(image: "Image", *, upright: bool) -> "Image":
     return image if orientation == _UPRIGHT else image.transpose(Transpose[_MOVES[orientation]])
 
 
-def _pixels(image: "Image", name: str, *, upright: bool, white: White | None) -> NDArray[np.float32]:
-    """Decode an image to pixels `(H, W, 3)` in [0, 1], upright or as stored."""
+def _check_scans(image: "Image") -> None:
+    """Raise `DataError` for a JPEG, not decoded yet, whose scans would take longer than its pixels."""
+    file = getattr(image, "fp", None)
+    if file is None or image.format not in _OF_SCANS:
+        return
+    name = f"image {getattr(file, 'name', 'in memory')}"
+    check_data(not has_many_scans(file), name, f"at most {MOST_SCANS} scans of a JPEG", "more; replace it")
+
+
+def _decoded(image: "Image", path: str | PathLike[str] | None, *, upright: bool) -> Decoded:
+    """Decode a Pillow image.
+
+    Args:
+        image: the image.
+        path: its file, by which colours of more than 8 bits are read; None without one.
+        upright: turn it upright; False leaves it as it is stored.
+
+    Returns:
+        The decoded picture.
+    """
+    if path is not None and is_deep(cast("ImageFile", image)):
+        with open_pillow(path) as again:
+            values = DeepValues.of((cast("ImageFile", image), again), partial(_loaded, upright=upright))
+        has_alpha = values.shape[-1] in (2, 4)
+        transparent = None if has_alpha else image.info.get("transparency")
+        return Decoded(values.shape[:2], values.rows, values.most, has_alpha, transparent)
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
     is_inverted = image.mode in SIXTEEN_BITS and TiffTags.of_image(image).photometric == WHITE_IS_ZERO
     largest = _largest_grey(image)
-    image = _loaded(image, upright=upright)
-    if image.mode == "F":
-        pixels = _grey_pixels(image, 1, name, white)
-    elif image.mode in SIXTEEN_BITS:
-        pixels = _grey_pixels(image, largest, name, white)
-    else:
-        pixels = _colour_pixels(image, white)
-    return 1 - pixels if is_inverted else pixels
-
-
-def _colour_pixels(image: "Image", white: White | None) -> NDArray[np.float32]:
-    """Convert an image of up to 8 bits a channel to pixels `(H, W, 3)` in [0, 1], over white."""
-    values = np.asarray(_over_white(image).convert("RGB"))
-    if white is None:
-        return values.astype(np.float32) / np.float32(255)
-    return between(values, black_and_white(white, values))
-
-
-def _grey_pixels(image: "Image", most: int, name: str, white: White | None) -> NDArray[np.float32]:
-    """Convert a grey image of 16 bits or of floats, whose largest value is `most`, to pixels `(H, W, 3)` in [0, 1]."""
-    values = np.asarray(image)  # (H, W)
-    shades = _shades(values, most, name) if white is None else between(values, black_and_white(white, values))
-    pixels = np.repeat(shades[..., None], 3, axis=-1)
-    if "transparency" in image.info:
-        pixels = _without(pixels, values[..., None] == image.info["transparency"])
-    return pixels
-
-
-def _shades(values: Values, most: int, name: str) -> NDArray[np.float32]:
-    """Scale grey values to [0, 1] by the largest; raises `DataError` for values whose white is not known."""
-    least = values.min()
-    greatest = values.max()
-    got = f"{least:g} to {greatest:g}; give white='auto', or the values that are black and white"
-    inside = bool(least >= 0 and greatest <= most)  # false for NaN, too
-    check_data(inside, name, f"values from 0 to {most}", got)
-    return values.astype(np.float32) / np.float32(most)
+    loaded = _loaded(image, upright=upright)
+    shape = loaded.height, loaded.width
+    if loaded.mode in (*SIXTEEN_BITS, "F"):
+        most = 1 if loaded.mode == "F" else largest
+        transparent = loaded.info.get("transparency")
+        return Decoded(shape, lambda rows: rows_of(loaded, rows)[..., None], most, False, transparent, is_inverted)
+    return Decoded(shape, lambda rows: np.asarray(_over_white(cut(loaded, rows)).convert("RGB")), _MOST_OF_BYTES)
 
 
 def _over_white(image: "Image") -> "Image":
@@ -449,22 +482,20 @@ class PhotographPicture(LargePicture):
         x1, y1, x2, y2 = box
         if self._array is None:
             self._array = self._decoded_bytes()
-        if self._array is None:
-            self._array = to_bytes(read_photograph(self.path, white=self._white))  # which may warn
         return self._array[y1:y2, x1:x2]
 
-    def _decoded_bytes(self) -> NDArray[np.uint8] | None:
-        """Decode a picture of no more than 8 bits a channel, without floats in between; None for others."""
+    def _decoded_bytes(self) -> NDArray[np.uint8]:
+        """Decode the picture, without floats in between."""
+        name = f"image {self.path}"
         with opening(self.path, "decoded"), open_pillow(self.path) as image:
             if image.mode not in _PLAIN or self._white is not None or is_deep(image):
-                return None
-            upright = _loaded(image, upright=True)
-            width, height = upright.size
-            pixels = np.empty((height, width, 3), np.uint8)
-            for top in range(0, height, _ROWS):
-                rows = upright.crop((0, top, width, min(top + _ROWS, height)))
-                pixels[top : top + _ROWS] = np.asarray(_over_white(rows).convert("RGB"))
-            return pixels
+                check_area(image.size, name)
+            check_decoding(image.size, _BYTES + _halves(image), self.path.stat().st_size, name)
+            decoded = _decoded(image, self.path, upright=True)
+            extremes = _extremes(decoded, name) if self._white is None else None
+            pixels = decoded.bytes(self._white)
+        _warn_of_extremes(extremes, decoded, self.path)
+        return pixels
 
 
 def upright_size(image: "Image") -> tuple[int, int]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from semfov.data.images import SIXTEEN_BITS, check_area, open_pillow, quiet_decoders, read_photograph
+from semfov.data.images import SIXTEEN_BITS, check_area, has_pages, open_pillow, quiet_decoders, read_photograph
 from semfov.data.rasters import open_by_windows
 from semfov.data.tiff_tags import UPRIGHT, TiffTags
 from semfov.data.tone import White, check_white
@@ -60,7 +60,7 @@ def _is_read_by_windows(path: str | PathLike[str], white: White | None, oriented
     if kind not in BY_WINDOWS:
         return False
     with suppress(Exception), quiet_decoders, open_pillow(path) as image:
-        is_grey = image.mode in (*SIXTEEN_BITS, "F") and getattr(image, "n_frames", 1) == 1
+        is_grey = image.mode in (*SIXTEEN_BITS, "F") and not has_pages(image)
         is_precise = is_grey and white is None
         # Readers by windows turn pictures upright.
         is_turned = not oriented and TiffTags.of_image(image).orientation != UPRIGHT

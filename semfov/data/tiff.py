@@ -52,6 +52,7 @@ _NAMED = re.compile(r'<Item name="COLORINTERP" sample="(\d{1,5})" role="colorint
 _BITS = {np.dtype(np.uint8): 8, np.dtype(np.uint16): 16}  # of values without a sign that need no `white`
 _MOST_PAGES = 64  # that are looked through for the first that is no thumbnail
 _MOST_LAYERS = 64  # pages that are channels of one picture
+_MOST_OF_SERIES = 2**14  # pages whose series are looked for, which takes a second for some thousand
 _ROWS = 64  # of a picture that is stored in one strip, which are read at once
 _INFLATED = 2**18  # bytes of a tile that is inflated for a look first: fewer inflate to 270 MB at most
 
@@ -166,6 +167,8 @@ class TiffPicture(LargePicture):
         """Tell whether the file has no reduced copies and no masks of the picture, of which tifffile knows nothing."""
         # The channels of GDAL are those of one page.
         has_copies = bool(self.page.subifds) and not self._tiles.has_layers
+        if len(self.file.pages) > _MOST_PAGES:  # GDAL would list them all
+            return True
         return not has_copies and not any(kind & (REDUCED | MASK) for kind in self._kinds())
 
     def has_mask(self) -> bool:
@@ -175,7 +178,7 @@ class TiffPicture(LargePicture):
     def _kinds(self) -> list[int]:
         """List what the pages after the first are; one that has the tags of the first has none of its own."""
         with opening(self.path, "opened"):
-            return [getattr(page, "subfiletype", 0) for page in self.file.pages[1:]]
+            return [getattr(page, "subfiletype", 0) for page in self.file.pages[1:_MOST_PAGES]]
 
     def _values(self, box: Box) -> Values:
         """Read the values of the channels in a window, the alpha last, `(h, w, C)`."""
@@ -418,6 +421,9 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
     Returns:
         The pages, and the number of pictures in the stack.
     """
+    count = len(file.pages)
+    if count > _MOST_OF_SERIES:
+        return [page], count
     if not file.series or file.series[0].keyframe.index != page.index:
         return [page], 1
     series = file.series[0]

@@ -1,6 +1,7 @@
 """Files take memory in proportion to their size, and one file has one answer; values that are no bytes are shown."""
 
 import io
+import struct
 import sys
 import tracemalloc
 import zlib
@@ -53,6 +54,29 @@ def test_a_jpeg_that_claims_more_than_its_file_may_hold(tmp_path):
         DataError, match=r"at most 178,956,970 pixels of a file.*, got more; convert it to a tiled TIFF"
     ):
         open_large(claims(tmp_path / "b.jpg", 20_000, 20_000))
+
+
+@pytest.mark.parametrize("fill", [b"#" + b"x" * 2**16, b" " * 2**16, b"#\n" * 2**15])
+@pytest.mark.parametrize("kind", ["P1", "P2", "P3", "P4", "P5", "P6"])
+def test_heads_of_text_that_do_not_end_are_refused(tmp_path, kind, fill):
+    """Pillow reads them byte by byte, at every opening."""
+    path = tmp_path / "a.ppm"
+    path.write_bytes(kind.encode() + b"\n8 " + fill + b"\n8 255\n" + b"0 " * 2000)
+    for read in (read_image, lambda path: open_large(path).size):
+        unusable(r"its size in the first 65,536 bytes, got longer comments", read, path)
+
+
+@pytest.mark.parametrize(("kind", "mode"), [("P4", "1"), ("P5", "L"), ("P6", "RGB")])
+@pytest.mark.parametrize("value", [0, 32, 255])
+def test_heads_of_text_with_comments_are_read(tmp_path, kind, mode, value):
+    """Whatever bytes follow them, also those of spaces."""
+    path = tmp_path / "a.ppm"
+    Image.new(mode, (800, 800), value if mode != "RGB" else (value,) * 3).save(path)
+    content = path.read_bytes().replace(b"800 800", b"# 1 2 3\n800 # x\n800", 1)
+    assert content.startswith(kind.encode())
+    path.write_bytes(content)
+    expected = np.asarray(Image.open(path).convert("RGB"))
+    assert (whole(open_large(path)) == expected.transpose(2, 0, 1)).all()
 
 
 def test_blank_pictures_are_in_proportion(tmp_path):
@@ -340,3 +364,55 @@ def test_what_is_no_white_and_no_band_is_refused(tmp_path):
     for white in (np.float32(40), np.int64(40), torch.tensor(40.0), np.array(40)):
         assert int(open_large(tmp_path / "a.tif", white=white).pixels((0, 0, 1, 1))[0, 0, 0]) == 128
     refused("bands: expected None but for TIFFs", open_large, np.zeros((4, 5, 3), np.uint8), bands=1)
+
+
+def test_a_tiff_of_very_many_pages_is_read_without_following_them(tmp_path, monkeypatch):
+    """As many pages as take GDAL and Pillow most of a minute; all but the first say that they are reduced copies."""
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as writer:
+        writer.write(pixels(64, 48), photometric="rgb")
+    content = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        place = file.pages.first.offset
+    (tags,) = struct.unpack_from("<H", content, place)
+    last = place + 2 + 12 * tags
+    fields = (254, 1), (256, 8), (257, 8), (273, 8), (279, 64)
+    page = struct.pack("<H", len(fields)) + b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in fields)
+    for _ in range(20_000):
+        struct.pack_into("<I", content, last, len(content))
+        content += page + bytes(4)
+        last = len(content) - 4
+    path.write_bytes(content)
+    monkeypatch.setattr(RasterPicture, "__init__", lambda *_, **__: pytest.fail("GDAL lists all pages"))
+    with pytest.warns(UserWarning, match="20001"):
+        assert (whole(open_large(path)) == pixels(64, 48).transpose(2, 0, 1)).all()
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "grey"])
+def test_pictures_of_16_bits_take_little_more_than_their_values(tmp_path, mode):
+    """Decoded, they were copied as floats of 8 bytes a channel, several times."""
+    channels = {"RGB": 3, "RGBA": 4, "grey": 1}[mode]
+    array = np.random.default_rng(0).integers(0, 65_536, (1500, 1000, channels), dtype=np.uint16)
+    path = tmp_path / "a.png"
+    path.write_bytes(png16(array))
+    picture = open_large(path)
+    tracemalloc.start()
+    shown = whole(picture)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 8 * array.shape[0] * array.shape[1]
+    values = array.astype(np.float64) / 65_535
+    colours = values[..., :3] * values[..., 3:] + 1 - values[..., 3:] if mode == "RGBA" else values
+    assert abs(shown.transpose(1, 2, 0) - colours * 255).max() <= 0.5 + 1e-3
+
+
+def png16(array):
+    """Encode values of 16 bits as a PNG (W3C, 11.2.2)."""
+    height, width, channels = array.shape
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in array)
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 3: 2, 4: 6}[channels], 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows, 1)) + chunk(b"IEND", b"")
