@@ -269,6 +269,6 @@ def _tags_of(path: str | PathLike[str]) -> TiffTags:
         with suppress(Exception):
             import tifffile
 
-            with tifffile.TiffFile(path) as file:
+            with tifffile.TiffFile(path, _multifile=False) as file:
                 return TiffTags.of_page(file.pages.first)
     return TiffTags({})

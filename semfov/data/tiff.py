@@ -126,7 +126,8 @@ class TiffPicture(LargePicture):
             import tifffile
         self.path = Path(path)
         with opening(self.path, "opened"):
-            self.file = tifffile.TiffFile(path)
+            # A series of OME may name other files.
+            self.file = tifffile.TiffFile(path, _multifile=False)
             weakref.finalize(self, self.file.close)
             self.page = _first_page(self.file)
             layers, pictures = _layers_of(self.file, self.page)
@@ -422,7 +423,8 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
         The pages, and the number of pictures in the stack.
     """
     count = len(file.pages)
-    if count > _MOST_OF_SERIES:
+    # Those of Micro-Manager are spread over files beside this one, which are not opened.
+    if count > _MOST_OF_SERIES or file.is_mmstack or file.is_ndtiff:
         return [page], count
     if not file.series or file.series[0].keyframe.index != page.index:
         return [page], 1

@@ -279,6 +279,31 @@ def test_metadata_of_a_tiff_lead_nowhere(folders, address, domain, bigtiff):
             check_alone(folders, address, shown, {"a.tif"}, read=False)
 
 
+@pytest.mark.parametrize("name", ["../private/secret.tif", "beside.tif"])
+def test_a_series_of_ome_opens_no_other_file(folders, address, name):
+    """Its planes may be in files that it names."""
+    public, _ = folders
+    picture(public / "beside.tif")
+    (public / "a.tif").write_bytes(b"")
+    planes = f'<TiffData IFD="0" PlaneCount="3"><UUID FileName="{name}">urn:uuid:1</UUID></TiffData>'
+    sizes = f'SizeX="{SIDE}" SizeY="{SIDE}" SizeC="3" SizeZ="1" SizeT="1"'
+    pixels = f'<Pixels ID="Pixels:0" DimensionOrder="XYCZT" Type="uint8" {sizes}>{planes}</Pixels>'
+    scheme = "http://www.openmicroscopy.org/Schemas/OME/2016-06"
+    text = f'<?xml version="1.0"?><OME xmlns="{scheme}"><Image ID="Image:0">{pixels}</Image></OME>'
+    array = np.full((SIDE, SIDE), 60, np.uint8)
+    tifffile.imwrite(public / "a.tif", array, description=text, metadata=None)
+    check_alone(folders, address, public / "a.tif", set())
+
+
+@pytest.mark.parametrize("kind", ["mmstack", "ndtiff"])
+def test_no_series_of_micro_manager_is_followed(folders, address, monkeypatch, kind):
+    """tifffile finds its planes in files beside it, or by the names in an index beside it."""
+    path = picture(folders[0] / "a.tif")
+    monkeypatch.setattr(tifffile.TiffFile, f"is_{kind}", True)
+    monkeypatch.setattr(tifffile.TiffFile, f"_series_{kind}", lambda _: pytest.fail("other files are opened"))
+    check_alone(folders, address, path, set())
+
+
 @pytest.mark.parametrize("kind", ["grids of a datum", "grids of a projection"])
 def test_a_reference_system_opens_no_file(folders, kind):
     """PROJ would open the files of its grids."""
