@@ -29,6 +29,7 @@ from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.report import performance
 from eval.search.run import SearchConfig, SearchRun
 from semfov.data.scene import Scenes
+from semfov.detection import Detections
 from semfov.errors import check, lookup
 from semfov.eye import Eye
 from semfov.io.files import plain_name, write_text
@@ -207,7 +208,8 @@ def _five_looks(run: SearchRun, model: FovealObservationModel | None, classes: i
         chosen, present = _classes(run.scenes, index, classes, run.config.protocol.seed)
         if model is not None:
             distance = grid.box_distance(detections.boxes, grid.centres[cells])
-            detections = replace(detections, scores=model.calibrate(detections.scores, distance), highest=None)
+            calibrated = model.calibrate(detections.scores, distance)
+            detections = Detections(detections.boxes, calibrated, detections.mask, detections.confidence)
         highest = detections.highest[:, torch.tensor(chosen, dtype=torch.int64)]
         scores.append(torch.stack([highest[0], highest.amax(0)], -1))
         there.append(present)

@@ -289,7 +289,7 @@ class WindowEye(nn.Module):
         background = torch.zeros_like(detections.scores[..., :1, :])
         background[..., 0] = 1
         scores = torch.where(cut[..., None], background, detections.scores)
-        return replace(detections, scores=scores, confidence=detections.confidence * ~cut, highest=None), cut
+        return Detections(detections.boxes, scores, detections.mask, detections.confidence * ~cut), cut
 
     def forward(self, picture: Tensor, fixations: Tensor) -> Detections:
         """Open a picture, look at it and detect.
