@@ -53,6 +53,7 @@ _DETECTIONS = {
     "mask": Field(("M",), dtype=torch.bool),
     "confidence": Field(("M",), mixed=True),
 }
+_HIGHEST = {"highest": Field(("N", "C"), mixed=True)}  # of each look
 _OPTIONAL = {
     "box": Field((4,), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
     "closer_boxes": Field(("Q", 4), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
@@ -142,7 +143,7 @@ class Format:
 
     def __init__(self, kind: str, tensors: Mapping[str, Field], record: Mapping[str, Json]) -> None:
         self.kind = kind
-        self.schema = Schema({**tensors, **_DETECTIONS, **_OPTIONAL}, {**_SHARED, **record})
+        self.schema = Schema({**tensors, **_DETECTIONS, **_HIGHEST, **_OPTIONAL}, {**_SHARED, **record})
 
     def write(
         self,
@@ -237,6 +238,7 @@ def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
     for name in _DETECTIONS:
         # Batches of one become rows, one look after the other.
         tensors[name] = torch.cat([getattr(look, name)[0] for look in outcome.detections])
+    tensors["highest"] = torch.cat([look.highest for look in outcome.detections])
     if outcome.decision is not None and outcome.decision.box is not None:
         tensors["box"] = outcome.decision.box
     if outcome.photograph is not None:
@@ -250,12 +252,12 @@ def _separated(tensors: Mapping[str, Tensor], lengths: list[int]) -> tuple[Detec
     """Separate the detections of the looks, which stand in a row in a file; return batches of one.
 
     Args:
-        tensors: boxes `(M, 4)`, scores, mask and confidence of all looks.
+        tensors: boxes `(M, 4)`, scores, mask and confidence of all N looks, and their highest scores `(N, C)`.
         lengths: number of detections of each look, with sum M.
     """
     columns = [tensors[name].split(lengths) for name in _DETECTIONS]
     looks = []
-    for parts in zip(*columns, strict=True):
+    for parts in zip(*columns, tensors["highest"], strict=True):
         batch_of_one = [part[None] for part in parts]
         looks.append(Detections(*batch_of_one))
     return tuple(looks)
@@ -269,6 +271,7 @@ def _check_shared(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> N
     check(target is None or _is_class(target, classes), "target", "the index of a class", target)
     rows = len(tensors["mask"])
     check(sum(lengths) == rows, "lengths", f"a sum of {rows}", sum(lengths))
+    check(len(lengths) == len(tensors["highest"]), "lengths", f"{len(tensors['highest'])} looks", len(lengths))
     targets = record["targets"]
     check(all(_is_class(label, classes) for label in targets), "targets", "indices of classes", targets)
     if "photograph" in tensors:

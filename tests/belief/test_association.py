@@ -372,7 +372,7 @@ def test_presence_is_checked(told):
     for wrong in (torch.tensor([0.5, 1.0, 0.5]), torch.tensor([0.0, 0.5, 0.5])):
         refused("shares: expected numbers above 0 and below 1", Presence, offset, weight, wrong)
     refused("offset: expected a floating-point tensor", Presence, torch.tensor(1), weight, shares)
-    refused("weight: expected shape", Presence, offset, torch.ones(3), shares)
+    refused("slopes: expected shape", Presence, offset, torch.ones(3), shares)
     refused("centre: expected shape", partial(Presence, centre=torch.ones(3)), offset, weight, shares)
     refused("thresholds: expected Thresholds or None", Presence, offset, weight, shares, (0.5, 0.1))
     refused(

@@ -15,7 +15,7 @@ from PIL import Image
 from torch.nn import functional
 
 from semfov import InputError, read_image
-from semfov.data import images
+from semfov.data import decoded, images
 from semfov.data.large import ArrayPicture, open_large
 from semfov.data.rasters import RasterPicture
 from semfov.data.tiff import TiffPicture
@@ -65,7 +65,7 @@ def test_a_photograph_whose_decoding_was_interrupted_is_decoded_anew(tmp_path, m
         return over_white(rows)
 
     monkeypatch.setattr(images, "_over_white", interrupted)
-    monkeypatch.setattr(images, "_ROWS", 100)
+    monkeypatch.setattr(decoded, "_ROWS", 100)
     with pytest.raises(KeyboardInterrupt):
         picture.pixels((0, 0, 20, 600))
     assert np.array_equal(picture.pixels((0, 0, 20, 600)), array)

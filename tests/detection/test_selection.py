@@ -98,11 +98,11 @@ def test_the_highest_scores_are_those_of_all_candidates_that_are_not_too_faint(f
 
 
 def test_a_detector_reads_candidates_that_are_too_faint_for_a_detection():
-    boxes, classes = torch.rand(1, 3, 4).cumsum(-1) * 9, torch.tensor([[[0.9, 0.1], [0.1, 0.9], [0.8, 0.2]]])
+    boxes, classes = torch.rand(1, 3, 4).cumsum(-1) * 9, torch.tensor([[[1.0, 0.0], [0.1, 0.9], [0.8, 0.2]]])
     detector = Fixed(candidates=Candidates(boxes, classes, torch.tensor([[0.5, 0.01, 0.0001]])))
     seen = detector(torch.rand(1, 3, 8, 8))
     assert seen.count.tolist() == [1]
-    torch.testing.assert_close(seen.highest[0, 1:], torch.tensor([0.45, 0.009]))
+    torch.testing.assert_close(seen.highest[0, 1:], torch.tensor([0.5, 0.009]))
 
 
 def test_boxes_outside_the_image_are_dropped():

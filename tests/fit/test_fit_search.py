@@ -61,11 +61,11 @@ def searched_alone(model, run, index, drawn):
         chance = belief.chance(drawn.target)[0].tolist()
         fixated = max(cells[each] for each in visited)
         left = {each: chance[each] for each in range(CELLS) if each not in visited}
-        highest += math.log(max(scores_of(seen, cell, drawn.target), default=0.0) + 1e-3)
+        highest = max([highest, *scores_of(seen, cell, drawn.target)])
         facts.append(
             (
                 math.log(max(cells) / (1 - max(cells))),
-                highest / (look + 1),
+                math.log(1 + highest / 3e-4),
                 fixated,
                 max(left.values()),
                 bool(drawn.goal[cells.index(max(cells))]),
