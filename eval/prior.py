@@ -96,10 +96,11 @@ class PriorRun(SceneRun):
     def __init__(self, config: PriorConfig) -> None:
         self.config = config
         check_sources(config.data, config.detector)
-        self.eye = WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
-        self.scenes = make_scenes(config.data, self.eye.detector.classes)
-        name = self.eye.detector.name if config.windows is None else config.windows
+        detector = make_detector(config.detector)
+        self.scenes = make_scenes(config.data, detector.classes)
+        name = detector.name if config.windows is None else config.windows
         self.evidence = GlimpseEvidence.from_pretrained(name).requires_grad_(False)
+        self.eye = WindowEye(detector, stretch=self.evidence.stretch).eval().requires_grad_(False)
         self.evidence.check_compatible(self.eye.settings())
         held = torch.zeros(len(self.scenes.classes))
         for index in range(len(self.scenes)):

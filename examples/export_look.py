@@ -67,7 +67,7 @@ def export_look(
 
     Example::
 
-        eye = WindowEye(semfov.load_detector("yolox-nano"))
+        eye = WindowEye(semfov.load_detector("yolox-nano"), stretch=False)
         export_look(eye, "look.onnx", GlimpseEvidence.from_pretrained("yolox-nano"))
     """
     try:
@@ -250,7 +250,7 @@ def main() -> None:
     try:
         detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
         evidence = None if options.evidence is None else GlimpseEvidence.from_pretrained(options.evidence)
-        export_look(WindowEye(detector).eval(), options.output, evidence, cells=options.cells)
+        export_look(WindowEye(detector, stretch=False).eval(), options.output, evidence, cells=options.cells)
     except SemfovError as error:
         parser.exit(1, f"error: {error}\n")
     print(f"written: {options.output}")

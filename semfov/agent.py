@@ -275,7 +275,9 @@ class ActivePerception(MovableModule):
     @property
     def zoom(self) -> ZoomAgent:
         """The part of the agent that looks at windows."""
-        return ZoomAgent(WindowEye(self.eye.detector), self.windows, self.photographs).train(self.training)
+        stretch = None if self.windows is None else self.windows.stretch
+        eye = WindowEye(self.eye.detector, stretch=stretch)
+        return ZoomAgent(eye, self.windows, self.photographs).train(self.training)
 
     @property
     def head(self) -> HeadAgent:

@@ -20,7 +20,9 @@ from semfov.fit.training import training_of
 from semfov.fit.windows import RefitPart
 from semfov.io.files import inside
 from semfov.runs.command import command
+from semfov.runs.setup import make_detector
 from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
 from train.outputs import write_outputs
 from train.zoom_pictures import FitZoomConfig, PicturesFit
 
@@ -28,13 +30,15 @@ from train.zoom_pictures import FitZoomConfig, PicturesFit
 def fit_zoom(config: FitZoomConfig) -> None:
     """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
-    fit = PicturesFit(config)
     model = None
+    eye = None
     parts = get_args(RefitPart)
     if config.evidence is not None:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
-        model.check_compatible(fit.eye.settings())
+        eye = WindowEye(make_detector(config.detector), stretch=model.stretch).eval().requires_grad_(False)
+        model.check_compatible(eye.settings())
         parts = config.refit
+    fit = PicturesFit(config, eye)
     model, lines = fit.fit(parts, model)
     settings = training_of(config, fit.mosaics["near"])["training"]
     # The evidence for photographs notes its own metadata.

@@ -13,6 +13,7 @@ from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.io.ranges import Count
 from semfov.runs.tables import table
 from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import WindowEye
 from train.scattered import Scattered
 from train.zoom_choice import choose_foresight, judge_survey
 
@@ -55,8 +56,8 @@ class FitZoomConfig(FitMosaicsConfig):
 class PicturesFit(MosaicFit):
     """A fit on mosaics and on pictures of other kinds."""
 
-    def __init__(self, config: FitZoomConfig) -> None:
-        super().__init__(config)
+    def __init__(self, config: FitZoomConfig, eye: WindowEye | None = None) -> None:
+        super().__init__(config, eye)
         self.kinds = config.kinds
         self.mosaics |= {
             "judged far": self.mosaic(self.held_out, 8, 6, config.judged_far, 3),

@@ -149,10 +149,11 @@ class DecisionRun(ComparedLooking):
         if config.closer and (config.verification or config.belief.search_model is None):
             self.verification = if_shipped(make_verification, config.verification, self.eye)
         self.verified = {AGENT, RANDOM} if self.verification is not None else set()
-        self.by_windows = WindowEye(self.eye.detector).eval().requires_grad_(False)
         self.windows = None
         if config.belief.search_model is None or config.windows is not None:
             self.windows = if_shipped(_window_evidence, config.windows, self.eye)
+        stretch = None if self.windows is None else self.windows.stretch
+        self.by_windows = WindowEye(self.eye.detector, stretch=stretch).eval().requires_grad_(False)
         learned, random = Strategy(observer, Policy("non-predictive")), Strategy(observer, Policy("random"))
         self.compared: dict[str, tuple[Strategy, _Rule]] = {AGENT: (learned, self._by_thresholds)}
         if not config.references:

@@ -108,9 +108,9 @@ class StreamRun:
     def __init__(self, config: StreamConfig) -> None:
         self.config = config
         check_sources(config.data, config.detector)
-        self.eye = WindowEye(make_detector(config.detector)).eval().requires_grad_(False)
-        detector = self.eye.detector
+        detector = make_detector(config.detector)
         evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
+        self.eye = WindowEye(detector, stretch=evidence.stretch).eval().requires_grad_(False)
         self.agent = ZoomAgent(self.eye, evidence)
         self.target = class_index(config.target, detector.classes, "target")
 

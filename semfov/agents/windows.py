@@ -63,6 +63,9 @@ class ZoomAgent(nn.Module):
             kinds = len(eye.detector.classes)
             check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
             evidence.check_compatible(eye.settings())
+            if evidence.metadata:  # of a fit
+                expected = f"one with stretch={evidence.stretch}, as in the fit of the evidence"
+                check(eye.stretch == evidence.stretch, "eye", expected, f"stretch={eye.stretch}")
         self.eye, self.evidence = eye, evidence
         self.classes = ("background", *eye.detector.classes)
         self._photographs = photographs
@@ -90,8 +93,10 @@ class ZoomAgent(nn.Module):
             DataError: the weights cannot be downloaded, or they are damaged.
         """
         check_options(options, ["finest", "cut", *loader_options()], "the agent or of semfov.load_detector")
-        eye = WindowEye(load_detector(name, **options), finest=finest, cut=cut)
-        return cls(eye, GlimpseEvidence.from_pretrained(eye.detector.name)).eval().requires_grad_(False)
+        detector = load_detector(name, **options)
+        evidence = GlimpseEvidence.from_pretrained(detector.name)
+        eye = WindowEye(detector, finest=finest, cut=cut, stretch=evidence.stretch)
+        return cls(eye, evidence).eval().requires_grad_(False)
 
     def search(self, picture: _Picture, target: str | int, settings: SearchSettings | None = None) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one.

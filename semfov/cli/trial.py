@@ -33,17 +33,17 @@ class Trial:
 
     @classmethod
     @torch.inference_mode()
-    def of(cls, detector: Detector, photo: Path) -> "Trial":
+    def of(cls, eye: WindowEye, photo: Path) -> "Trial":
         """Run the bare detector: its best class of each box, and non-maximum suppression.
 
         Args:
-            detector: the detector.
+            eye: looks at the photograph with the detector.
             photo: the photograph.
 
         Returns:
             What the detector shows.
         """
-        eye = WindowEye(detector)
+        detector = eye.detector
         view = eye.open(photo)
         overview = torch.tensor([Window.overview(view.lattice).fixation])
         canvas, frames = eye.glimpse(view, overview)
@@ -71,7 +71,8 @@ def try_detector(agent: ActivePerception, photo: Path) -> None:
         photo: the photograph.
     """
     detector = agent.eye.detector
-    bare = Trial.of(detector, photo)
+    eye = agent.zoom.eye
+    bare = Trial.of(eye, photo)
     record = agent.find_all(photo, how="windows", passes=1, score_threshold=SCORE_THRESHOLD)
     rows = _rows(bare, record.objects, agent.classes)
     listed = sum("-" not in row[1:3] for row in rows)
@@ -82,7 +83,7 @@ def try_detector(agent: ActivePerception, photo: Path) -> None:
     )
     if rows:
         print("\n".join(table_lines([["class", "bare", record.words.measure, "box"], *rows])))
-    for word in (*_about_scores(bare, detector), *_about_colours(bare, detector, photo)):
+    for word in (*_about_scores(bare, detector), *_about_colours(bare, eye, photo)):
         print(f"note: {word}")
 
 
@@ -156,15 +157,16 @@ def _about_low_scores(confidence: Tensor) -> str:
     )
 
 
-def _about_colours(bare: Trial, detector: Detector, photo: Path) -> list[str]:
+def _about_colours(bare: Trial, eye: WindowEye, photo: Path) -> list[str]:
     """Whether an ONNX file shows more with the other order of the channels."""
+    detector = eye.detector
     if not isinstance(detector, OnnxDetector):
         return []
     usual = detector.preprocessing
     other: Literal["rgb", "bgr"] = "bgr" if usual.channels == "rgb" else "rgb"
     detector.preprocessing = replace(usual, channels=other)
     try:
-        swapped = Trial.of(detector, photo)
+        swapped = Trial.of(eye, photo)
     finally:
         detector.preprocessing = usual
     shows_more = float(swapped.scores.sum()) >= _MORE * float(bare.scores.sum())

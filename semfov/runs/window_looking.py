@@ -68,8 +68,9 @@ class WindowLooking:
     def __init__(self, config: WindowLookingConfig) -> None:
         self.config = config
         detector = make_detector(config.detector)
-        self.eye = WindowEye(detector, cut=config.cut).eval().requires_grad_(False)
         self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
+        eye = WindowEye(detector, cut=config.cut, stretch=self.evidence.stretch)
+        self.eye = eye.eval().requires_grad_(False)
         self.evidence.check_compatible(self.eye.settings())
         photographs = self.open_scenes(detector.classes)
         if not len(photographs):

@@ -282,6 +282,11 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         """
         check_same_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
 
+    @property
+    def stretch(self) -> bool:
+        """Whether windows that reach beyond the picture filled the canvas in the fit (`WindowEye`)."""
+        return bool(self.metadata.get("sensor", {}).get("stretch", False))
+
     def _record(self) -> dict[str, Any]:
         return {
             "classes": self.classes,

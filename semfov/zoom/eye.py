@@ -30,6 +30,7 @@ Resampled = tuple[Tensor, list[_Frame]]
 BORDER = 2.0  # a box this near to the border of its window, in canvas pixels, counts as cut by it
 # The same in a photograph, where a box that a border cuts often ends well before it (docs/zoom.md).
 _PHOTOGRAPH_BORDER = 16.0
+_MOST_STRETCHED = 4.0  # largest change of proportions; beyond it nothing was measured, and memory would grow
 
 
 @dataclass(frozen=True)
@@ -76,10 +77,17 @@ class WindowEye(nn.Module):
     Such boxes can be kept (`keep`), left out (`drop`), or kept with the scores of background (`background`). The border
     of the picture cuts no object.
 
+    A window that reaches beyond the picture shows less than the canvas holds. Padding surrounds what it shows, or it
+    fills the canvas, with other proportions by a factor of 4 at most: as the detector was trained.
+
     Args:
         detector: any detector.
         finest: largest magnification, in canvas pixels per picture pixel; 1 ends at native pixels.
         cut: treatment of boxes that the border of a window cuts.
+        stretch: whether what is shown fills the canvas; None for what the detector was trained with.
+
+    Attributes:
+        stretch: whether what is shown fills the canvas.
 
     Raises:
         InputError: a setting is outside its range.
@@ -91,13 +99,16 @@ class WindowEye(nn.Module):
         eye.look(view, torch.tensor([[2000.0, 1500.0, 0.5]])).boxes
     """
 
-    def __init__(self, detector: Detector, *, finest: float = 1.0, cut: Cut = "keep") -> None:
+    def __init__(
+        self, detector: Detector, *, finest: float = 1.0, cut: Cut = "keep", stretch: bool | None = None
+    ) -> None:
         super().__init__()
         check_number(finest, "finest", 0, 64)
         check(finest > 0, "finest", "a positive magnification", finest)
         self.detector = detector
         self.finest = finest
         self.cut: Cut = lookup(cut, get_args(Cut), "treatment of cut boxes")
+        self.stretch = detector.stretch if stretch is None else stretch
 
     def open(self, picture: LargePicture | ImageLike) -> WindowView:
         """Open a picture to look at it.
@@ -260,6 +271,12 @@ class WindowEye(nn.Module):
         # First and end in the picture, and on the canvas.
         x1, x2, u1, u2 = _window_pixels(x, magnification, width, picture_width, left, right, reduction)
         y1, y2, v1, v2 = _window_pixels(y, magnification, height, picture_height, top, bottom, reduction)
+        if self.stretch:
+            stretched = width / (u2 - u1), height / (v2 - v1)
+            if max(stretched) <= _MOST_STRETCHED * min(stretched):
+                u1, v1, u2, v2 = 0, 0, width, height
+                # The axis that is stretched needs more pixels of the picture.
+                reduction = picture.reduction(min((x2 - x1) / width, (y2 - y1) / height))
         window = picture.read((x1, y1, x2, y2), reduction)
         pixels = resized(window, (v2 - v1, u2 - u1)).to(padding.dtype)
         frame = x1, y1, x2, y2, u1, v1, u2, v2
@@ -310,6 +327,8 @@ class WindowEye(nn.Module):
             JSON values.
         """
         sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
+        if self.stretch:
+            sensor["stretch"] = True
         return {"sensor": sensor, "detector": self.detector.settings()}
 
 

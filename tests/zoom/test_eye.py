@@ -56,6 +56,49 @@ def test_the_whole_picture_equals_a_resize_by_pillow(detector):
     assert float(canvas[0, :, 96:].abs().max()) == 0
 
 
+@pytest.mark.parametrize("size", [(512, 384), (300, 500), (1200, 310)])
+def test_a_stretched_picture_fills_the_canvas_as_a_resize_by_pillow(detector, size):
+    """Also one that is read from a reduced copy; boxes are in pixels of the picture."""
+    width, height = size
+    pixels = np.random.default_rng(0).integers(256, size=(height, width, 3), dtype=np.uint8)
+    eye = WindowEye(detector, stretch=True)
+    view = eye.open(pixels)
+    canvas, frames = eye.glimpse(view, view.lattice.fixations(view.lattice.actions[:1]))
+    expected = np.asarray(Image.fromarray(pixels).resize((128, 128), Image.Resampling.BILINEAR))
+    assert np.abs((canvas[0] * 255).permute(1, 2, 0).numpy() - expected).max() <= 1
+    assert frames.tolist() == [[0, 0, width, height, 0, 0, 128, 128]]
+    seen = detector(torch.from_numpy(expected.copy()).permute(2, 0, 1)[None] / 255)
+    placed = eye.look(view, view.lattice.fixations(view.lattice.actions[:1]))
+    scale = torch.tensor([width, height] * 2) / 128
+    torch.testing.assert_close(placed.boxes[placed.mask], seen.boxes[seen.mask] * scale, atol=1e-3, rtol=1e-5)
+
+
+def test_windows_inside_the_picture_and_long_strips_are_not_stretched(detector):
+    for size, fixation, expected in (
+        ((400, 300), [199.5, 149.5, 1.0], [136, 86, 264, 214, 0, 0, 128, 128]),
+        ((1280, 200), [639.5, 99.5, 0.1], [0, 0, 1280, 200, 0, 54, 128, 74]),
+    ):
+        eye = WindowEye(detector, stretch=True)
+        _, frames = eye.glimpse(eye.open(torch.rand(3, *reversed(size))), torch.tensor([fixation]))
+        assert frames[0].tolist() == expected
+
+
+def test_windows_are_stretched_as_the_detector_was_trained_or_as_in_the_fit_of_the_evidence(detector):
+    assert not WindowEye(detector).stretch
+    trained = Coloured(stretch=True)
+    assert WindowEye(trained).stretch
+    assert WindowEye(trained).settings()["sensor"]["stretch"]
+    assert not WindowEye(trained, stretch=False).stretch
+    for stretch in (True, False):
+        eye = WindowEye(trained, stretch=stretch)
+        evidence = GlimpseEvidence(2, metadata=eye.settings())
+        assert evidence.stretch == stretch
+        assert ZoomAgent(eye, evidence).eye is eye
+        refused(
+            f"eye: expected one with stretch={stretch}", ZoomAgent, WindowEye(trained, stretch=not stretch), evidence
+        )
+
+
 @pytest.mark.parametrize("magnification", [0.5, 1.0])
 def test_boxes_are_in_pixels_of_the_picture(detector, picture, magnification):
     eye = WindowEye(detector)
