@@ -64,6 +64,7 @@ def look_files(draw: Draw, folder: Path) -> Case:
         "boxes": torch.rand(3, 4, generator=generator) * 30,
         "scores": torch.rand(3, 3, generator=generator).softmax(-1),
         "confidence": torch.rand(3, generator=generator),
+        "highest": torch.rand(2, 3, generator=generator).softmax(-1),
         "count": torch.tensor([1, 2]),
         "actions": torch.tensor([[0.0, 0, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=torch.float64),
     }
@@ -76,7 +77,7 @@ def look_files(draw: Draw, folder: Path) -> Case:
         kinds = (torch.bfloat16, torch.float16, torch.float64, torch.int32, torch.uint8, torch.bool)
         tensors[name] = tensors[name].to(draw.choose(kinds, "dtype"))
     elif damage == "value":
-        numbers = (torch.nan, torch.inf, *([-1, 2] if name == "scores" else []))
+        numbers = (torch.nan, torch.inf, *([-1, 2] if name in ("scores", "highest") else []))
         tensors[name].view(-1)[0] = draw.choose((-1, 10**6) if name == "count" else numbers, "number")
     elif damage == "shape":
         shapes = (tensors[name][:1].clone(), tensors[name][None], tensors[name].new_zeros(0))
@@ -99,6 +100,7 @@ def look_files(draw: Draw, folder: Path) -> Case:
         assert [*looks] == [0, 1], damage
         assert torch.cat([look.boxes[0] for look in looks.values()]).equal(whole["boxes"]), damage
         assert torch.cat([look.scores[0] for look in looks.values()]).equal(whole["scores"]), damage
+        assert torch.cat([look.highest for look in looks.values()]).equal(whole["highest"]), damage
         assert [int(look.count) for look in looks.values()] == [1, 2], damage
         return None
 

@@ -12,6 +12,8 @@ from eval.decide.run import DecideConfig, DecisionRun, landing, overlap, quarter
 from semfov import DataError, Detections, DirichletBelief, FovealObservationModel, Grid, InputError
 from semfov.belief.observers import Semantic, SemanticSearch
 from semfov.decision import OUTCOMES, decide, decision_without_closer_looks
+from semfov.detection import score_vectors
+from semfov.detection.detector import FAINT
 from semfov.episode import StoredLooks, rollout
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
@@ -58,6 +60,14 @@ def run(config):
     return DecisionRun(config)
 
 
+def scores_of_candidates(detector, image, target):
+    """Scores of the target in all boxes of the detector's head that are not too faint."""
+    candidates = detector.propose(detector.fit(image)[0])
+    vectors = score_vectors(candidates, detector.background)[0]
+    rows = zip(vectors[:, target].tolist(), candidates.confidence[0].tolist(), strict=True)
+    return [score for score, confidence in rows if confidence >= FAINT]
+
+
 def scores_in_quarters(run, index, target):
     """Scores of the target in the four quarters of a scene."""
     image = run.scenes[index].image
@@ -65,8 +75,7 @@ def scores_in_quarters(run, index, target):
     scores = []
     for top, left in ((0, 0), (0, width), (height, 0), (height, width)):
         bottom, right = (height if top == 0 else None), (width if left == 0 else None)
-        seen = run.eye.detector(image[None, :, top:bottom, left:right])
-        scores += [float(seen.scores[0, d, target]) for d in range(seen.scores.shape[1]) if seen.mask[0, d]]
+        scores += scores_of_candidates(run.eye.detector, image[None, :, top:bottom, left:right], target)
     return scores
 
 
@@ -106,12 +115,12 @@ def test_records_match_searches_run_step_by_step(run):
             (target, policy) for target in targets for policy in ("non-predictive-learned", "random gaze", *FUSED)
         ]
         assert [r["present"] for r in records] == [True] * 4 + [False] * 4
-        detections, sharp = run.detections(index), run.eye.detector(run.scenes[index].image[None])
+        detections = run.detections(index)
         for record in records:
             target = record["target"]
             assert record["scene"] == scene
             assert record["present"] == (target in annotation.labels.tolist())
-            largest = [float(sharp.scores[0, d, target]) for d in range(sharp.scores.shape[1]) if sharp.mask[0, d]]
+            largest = scores_of_candidates(run.eye.detector, run.scenes[index].image[None], target)
             assert record["sharp"] == pytest.approx(max(largest, default=0.0))
             assert record["tiled"] == pytest.approx(
                 max([*largest, *scores_in_quarters(run, index, target)], default=0.0)
