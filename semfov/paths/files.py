@@ -52,8 +52,9 @@ _DETECTIONS = {
     "scores": Field(("M", "C"), mixed=True),
     "mask": Field(("M",), dtype=torch.bool),
     "confidence": Field(("M",), mixed=True),
+    "highest": Field(("N", "C"), mixed=True),
 }
-_HIGHEST = {"highest": Field(("N", "C"), mixed=True)}  # of each look
+_ROWS = ("boxes", "scores", "mask", "confidence")  # of M detections; the highest scores are of N looks
 _OPTIONAL = {
     "box": Field((4,), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
     "closer_boxes": Field(("Q", 4), mixed=True, low=-FARTHEST, high=FARTHEST, optional=True),
@@ -143,7 +144,7 @@ class Format:
 
     def __init__(self, kind: str, tensors: Mapping[str, Field], record: Mapping[str, Json]) -> None:
         self.kind = kind
-        self.schema = Schema({**tensors, **_DETECTIONS, **_HIGHEST, **_OPTIONAL}, {**_SHARED, **record})
+        self.schema = Schema({**tensors, **_DETECTIONS, **_OPTIONAL}, {**_SHARED, **record})
 
     def write(
         self,
@@ -235,7 +236,7 @@ def _shared_fields(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> 
 def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
     """Collect the tensors that all records have: detections, the photograph, and boxes of decision and closer looks."""
     tensors = {}
-    for name in _DETECTIONS:
+    for name in _ROWS:
         # Batches of one become rows, one look after the other.
         tensors[name] = torch.cat([getattr(look, name)[0] for look in outcome.detections])
     tensors["highest"] = torch.cat([look.highest for look in outcome.detections])
@@ -255,7 +256,7 @@ def _separated(tensors: Mapping[str, Tensor], lengths: list[int]) -> tuple[Detec
         tensors: boxes `(M, 4)`, scores, mask and confidence of all N looks, and their highest scores `(N, C)`.
         lengths: number of detections of each look, with sum M.
     """
-    columns = [tensors[name].split(lengths) for name in _DETECTIONS]
+    columns = [tensors[name].split(lengths) for name in _ROWS]
     looks = []
     for parts in zip(*columns, tensors["highest"], strict=True):
         batch_of_one = [part[None] for part in parts]

@@ -111,17 +111,13 @@ class DetectionStore(SceneStore):
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Any]) -> list[Any]:
         """Split the tensors of `pack` into the detections of each look, a batch of one without padding."""
         counts = tensors["count"].tolist()
-        looks = zip(*(tensors[name].split(counts) for name in ("boxes", "scores", "confidence")), strict=True)
-        return [
-            Detections(
-                boxes[None].clone(),
-                scores[None].clone(),
-                torch.ones(1, len(boxes), dtype=torch.bool),
-                confidence[None].clone(),
-                highest[None].clone(),
-            )
-            for (boxes, scores, confidence), highest in zip(looks, tensors["highest"], strict=True)
-        ]
+        columns = [tensors[name].split(counts) for name in ("boxes", "scores", "confidence")]
+        looks = []
+        for parts in zip(*columns, tensors["highest"], strict=True):
+            boxes, scores, confidence, highest = (part[None].clone() for part in parts)
+            mask = torch.ones(1, boxes.shape[1], dtype=torch.bool)
+            looks.append(Detections(boxes, scores, mask, confidence, highest))
+        return looks
 
 
 def cell_store(
