@@ -155,17 +155,23 @@ def _plain(part: str) -> str:
     return normalize("NFC", unquote(part)).casefold()
 
 
-def _uploaded(part: str) -> str:
-    """Write a part of a path plainly, without what programs add to the names of pictures that are uploaded to them.
+def _without_address(part: str) -> str:
+    """Write the name of a picture plainly, without a question behind it, or Label Studio's server before it.
 
-    Label Studio puts eight digits before a name, `0b51f2a7-kitchen.jpg`, and the address of its own server,
-    `?d=photos%5Ckitchen.jpg`; others put a question behind it, `kitchen.jpg?token=1`, and Roboflow its own suffix,
-    `kitchen_jpg.rf.4a1cdeb7f3.jpg`.
+    `kitchen.jpg?token=1` and `?d=photos%5Ckitchen.jpg` are both `kitchen.jpg`.
     """
     address, _, question = part.partition("?")
     asked_for = question[2:] if question.startswith("d=") else address
-    plain = re.split(r"[/\\]", _plain(asked_for))[-1]
-    plain = re.sub(r"^[0-9a-f]{8}-(?=.)", "", plain)
+    return re.split(r"[/\\]", _plain(asked_for))[-1]
+
+
+def _uploaded(part: str) -> str:
+    """Write a part of a path plainly, without what programs add to the names of pictures that are uploaded to them.
+
+    Label Studio puts eight digits before a name, `0b51f2a7-kitchen.jpg`, and Roboflow its own suffix behind it,
+    `kitchen_jpg.rf.4a1cdeb7f3.jpg`.
+    """
+    plain = re.sub(r"^[0-9a-f]{8}-(?=.)", "", _without_address(part))
     return re.sub(r"_(jpe?g|png|bmp|tiff?|webp)\.rf\.[0-9a-z]+\.[a-z]+$", r".\1", plain)
 
 
@@ -180,7 +186,7 @@ def _letters(plain: str) -> str:
 
 
 def _spellings(part: str) -> set[str]:
-    """Write a part of a path in all ways in which it may agree with another one."""
+    """Write a part of a path in all its ways: two parts that `_agree_plainly` or in another way share one of them."""
     plain, uploaded = _plain(part), _uploaded(part)
     return {plain, uploaded, _stem(plain), _letters(plain), _letters(uploaded)}
 
