@@ -601,12 +601,14 @@ def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
         unusable(message, ZoomPath.load, file)
     moment().save(file)
     tensors, values = read(file, "moment")
-    for name, wrong, message in (
-        ("cell", 8, "cell: expected a cell number below 8"),
-        ("grid", [4, 3], "visited: expected 12 cells"),
-        ("lengths", [1, 1], "lengths: expected one look"),
+    of_two_looks = {**tensors, "highest": tensors["highest"].repeat(2, 1)}
+    for parts, name, wrong, message in (
+        (tensors, "cell", 8, "cell: expected a cell number below 8"),
+        (tensors, "grid", [4, 3], "visited: expected 12 cells"),
+        (tensors, "lengths", [1, 1], "lengths: expected 1 looks"),
+        (of_two_looks, "lengths", [1, 1], "lengths: expected one look"),
     ):
-        write_file(file, tensors, {**values, name: wrong})
+        write_file(file, parts, {**values, name: wrong})
         unusable(message, FoveaMoment.load, file)
     head_path().save(file)
     tensors, values = read(file, "head path")
