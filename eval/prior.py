@@ -26,6 +26,7 @@ from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_summary
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
+from semfov.agents.windows import window_eye
 from semfov.belief.prior import PriorLike
 from semfov.data.classes import class_index
 from semfov.episode.stopwatch import Stopwatch
@@ -44,7 +45,6 @@ from semfov.runs.tables import plus_minus, share, table
 from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.settings import DecisionSettings
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import WindowLooks
 
 RANDOM, PAIR = "a class drawn from all", "one there, one not"
@@ -100,7 +100,7 @@ class PriorRun(SceneRun):
         self.scenes = make_scenes(config.data, detector.classes)
         name = detector.name if config.windows is None else config.windows
         self.evidence = GlimpseEvidence.from_pretrained(name).requires_grad_(False)
-        self.eye = WindowEye(detector, stretch=self.evidence.stretch).eval().requires_grad_(False)
+        self.eye = window_eye(detector, self.evidence).eval().requires_grad_(False)
         self.evidence.check_compatible(self.eye.settings())
         held = torch.zeros(len(self.scenes.classes))
         for index in range(len(self.scenes)):

@@ -11,7 +11,7 @@ from semfov.agents.fovea import FoveaAgent
 from semfov.agents.head import HeadAgent
 from semfov.agents.kinds import KINDS_OF_LOOK, KindOfLook
 from semfov.agents.picture import OpenedPicture, PictureLike, check_order
-from semfov.agents.windows import ZoomAgent, knows_photographs
+from semfov.agents.windows import ZoomAgent, knows_photographs, window_eye
 from semfov.belief.grid import check_cells
 from semfov.belief.observers import Observer, SemanticMap, SemanticSearch
 from semfov.belief.observers.any_of import TargetLike
@@ -49,7 +49,7 @@ from semfov.settings import (
 )
 from semfov.strategy import Strategy, classes_named
 from semfov.words import AGENT, missing
-from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom import GlimpseEvidence
 
 _Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes
 
@@ -275,8 +275,7 @@ class ActivePerception(MovableModule):
     @property
     def zoom(self) -> ZoomAgent:
         """The part of the agent that looks at windows."""
-        stretch = None if self.windows is None else self.windows.stretch
-        eye = WindowEye(self.eye.detector, stretch=stretch)
+        eye = window_eye(self.eye.detector, self.windows)
         return ZoomAgent(eye, self.windows, self.photographs).train(self.training)
 
     @property

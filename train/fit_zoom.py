@@ -15,6 +15,7 @@ import json
 import sys
 from typing import get_args
 
+from semfov.agents.windows import window_eye
 from semfov.errors import check
 from semfov.fit.training import training_of
 from semfov.fit.windows import RefitPart
@@ -22,7 +23,6 @@ from semfov.io.files import inside
 from semfov.runs.command import command
 from semfov.runs.setup import make_detector
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import WindowEye
 from train.outputs import write_outputs
 from train.zoom_pictures import FitZoomConfig, PicturesFit
 
@@ -35,7 +35,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     parts = get_args(RefitPart)
     if config.evidence is not None:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
-        eye = WindowEye(make_detector(config.detector), stretch=model.stretch).eval().requires_grad_(False)
+        eye = window_eye(make_detector(config.detector), model).eval().requires_grad_(False)
         model.check_compatible(eye.settings())
         parts = config.refit
     fit = PicturesFit(config, eye)

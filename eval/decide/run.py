@@ -18,6 +18,7 @@ from eval.comparison.telling import class_frequencies
 from eval.decide.plain import plain_looks
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
+from semfov.agents.windows import window_eye
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer, Semantic
@@ -56,7 +57,6 @@ from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.settings import DecisionSettings
 from semfov.strategy import Strategy
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import WindowLooks
 
 _Rule = Callable[[Step, int, Grid], Tensor]
@@ -152,8 +152,7 @@ class DecisionRun(ComparedLooking):
         self.windows = None
         if config.belief.search_model is None or config.windows is not None:
             self.windows = if_shipped(_window_evidence, config.windows, self.eye)
-        stretch = None if self.windows is None else self.windows.stretch
-        self.by_windows = WindowEye(self.eye.detector, stretch=stretch).eval().requires_grad_(False)
+        self.by_windows = window_eye(self.eye.detector, self.windows).eval().requires_grad_(False)
         learned, random = Strategy(observer, Policy("non-predictive")), Strategy(observer, Policy("random"))
         self.compared: dict[str, tuple[Strategy, _Rule]] = {AGENT: (learned, self._by_thresholds)}
         if not config.references:

@@ -15,7 +15,7 @@ from eval.stream.identity import Identities, IdentityCounts
 from eval.stream.plain import PlainRule
 from eval.stream.ways import AllSlices, Live, Oracle, RoundRobin, TrackedSlices, Way, WholeFrame
 from semfov.agents.window_episode import LIKELY
-from semfov.agents.windows import ZoomAgent
+from semfov.agents.windows import ZoomAgent, window_eye
 from semfov.data.classes import class_index
 from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
@@ -29,7 +29,6 @@ from semfov.runs.settings import Settings
 from semfov.runs.setup import check_sources, make_detector, make_scenes
 from semfov.settings import StreamSettings
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import WindowEye
 
 WayName = Literal["whole", "slices", "bytetrack", "in-turn", "in-turn-carried", "plain", "live", "live-known", "oracle"]
 _Length = Annotated[int, Range(64, 16_384)]
@@ -110,7 +109,7 @@ class StreamRun:
         check_sources(config.data, config.detector)
         detector = make_detector(config.detector)
         evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
-        self.eye = WindowEye(detector, stretch=evidence.stretch).eval().requires_grad_(False)
+        self.eye = window_eye(detector, evidence).eval().requires_grad_(False)
         self.agent = ZoomAgent(self.eye, evidence)
         self.target = class_index(config.target, detector.classes, "target")
 

@@ -10,6 +10,7 @@ from semfov.agents.window_episode import PASSES, WindowEpisode, WindowStream, Wi
 from semfov.data.classes import class_index, class_numbers
 from semfov.data.inputs import ImageLike
 from semfov.data.windowed import LargePicture
+from semfov.detection import Detector
 from semfov.detection.load import load_detector, loader_options
 from semfov.errors import check, check_options
 from semfov.kinds import WINDOWS
@@ -27,6 +28,23 @@ _Picture = LargePicture | ImageLike
 def knows_photographs(evidence: GlimpseEvidence | None) -> bool:
     """Tell whether there is evidence, and for photographs, too."""
     return evidence is not None and evidence.photograph is not None
+
+
+def window_eye(
+    detector: Detector, evidence: GlimpseEvidence | None, *, finest: float = 1.0, cut: Cut = "keep"
+) -> WindowEye:
+    """Make the eye of a detector that shows it windows as in the fit of the evidence.
+
+    Args:
+        detector: any detector.
+        evidence: what was fitted for it; without evidence it is shown windows as it was trained.
+        finest: largest magnification, in canvas pixels per picture pixel.
+        cut: treatment of boxes that the border of a window cuts (`WindowEye`).
+
+    Returns:
+        The eye.
+    """
+    return WindowEye(detector, finest=finest, cut=cut, stretch=None if evidence is None else evidence.stretch)
 
 
 class ZoomAgent(nn.Module):
@@ -95,8 +113,7 @@ class ZoomAgent(nn.Module):
         check_options(options, ["finest", "cut", *loader_options()], "the agent or of semfov.load_detector")
         detector = load_detector(name, **options)
         evidence = GlimpseEvidence.from_pretrained(detector.name)
-        eye = WindowEye(detector, finest=finest, cut=cut, stretch=evidence.stretch)
-        return cls(eye, evidence).eval().requires_grad_(False)
+        return cls(window_eye(detector, evidence, finest=finest, cut=cut), evidence).eval().requires_grad_(False)
 
     def search(self, picture: _Picture, target: str | int, settings: SearchSettings | None = None) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one.

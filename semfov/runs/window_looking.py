@@ -6,6 +6,7 @@ from typing import Annotated
 
 from torch import Tensor
 
+from semfov.agents.windows import window_eye
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.errors import DataError
@@ -16,7 +17,7 @@ from semfov.runs.scene_run import store_folder
 from semfov.runs.setup import make_detector, make_scenes
 from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.eye import Cut, WindowEye
+from semfov.zoom.eye import Cut
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.looks import WindowLook
 from semfov.zoom.objects import merge
@@ -69,8 +70,7 @@ class WindowLooking:
         self.config = config
         detector = make_detector(config.detector)
         self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
-        eye = WindowEye(detector, cut=config.cut, stretch=self.evidence.stretch)
-        self.eye = eye.eval().requires_grad_(False)
+        self.eye = window_eye(detector, self.evidence, cut=config.cut).eval().requires_grad_(False)
         self.evidence.check_compatible(self.eye.settings())
         photographs = self.open_scenes(detector.classes)
         if not len(photographs):

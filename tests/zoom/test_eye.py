@@ -14,6 +14,7 @@ from torch import Tensor
 from eval.zoom.orders import adaptive_slices
 from semfov import Detector, InputError, Selection, WindowEye, ZoomAgent
 from semfov.agents.episode import EpisodeLimits
+from semfov.agents.windows import window_eye
 from semfov.data.large import open_large
 from semfov.detection import Candidates
 from semfov.detection.detector import FAINT
@@ -89,11 +90,13 @@ def test_windows_are_stretched_as_the_detector_was_trained_or_as_in_the_fit_of_t
     assert WindowEye(trained).stretch
     assert WindowEye(trained).settings()["sensor"]["stretch"]
     assert not WindowEye(trained, stretch=False).stretch
+    assert window_eye(trained, None).stretch
     for stretch in (True, False):
         eye = WindowEye(trained, stretch=stretch)
         evidence = GlimpseEvidence(2, metadata=eye.settings())
         assert evidence.stretch == stretch
         assert ZoomAgent(eye, evidence).eye is eye
+        assert window_eye(trained, evidence).stretch == stretch
         refused(
             f"eye: expected one with stretch={stretch}", ZoomAgent, WindowEye(trained, stretch=not stretch), evidence
         )
