@@ -107,6 +107,7 @@ def look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Se
     Returns:
         The looks.
     """
+    # Looks are compared by their number, and a person makes no closer ones.
     settings = SearchSettings(closer=0)
     with torch.inference_mode():
         episode = agent.fovea.open_search(image[None].to(agent.eye.sensor.like), target, settings, cells)

@@ -110,8 +110,8 @@ def jpeg2000_bits(path: str | PathLike[str]) -> int:
     return (head[place] & 0x7F) + 1  # the first bit tells a sign
 
 
-def _ppm_values(image: "ImageFile") -> tuple[NDArray[Any], int]:
-    """Read the values of a PPM, which are not packed, and the value that it says is white."""
+def _ppm_values(image: "ImageFile") -> tuple[NDArray[np.uint16], int]:
+    """Read the values of a PPM, which are not packed, in the file's order of bytes, and the value that is white."""
     tile = image.tile[0]
     mode, white = cast(tuple[str, int], tile.args)
     shape = image.height, image.width, _CHANNELS[mode]

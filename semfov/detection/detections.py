@@ -144,7 +144,7 @@ class Detections:
             rows: the rows of the detections: their numbers, or a boolean `(L,)`.
 
         Returns:
-            The detections, in the order of the rows.
+            The detections, in the order of the rows. Their highest scores are still those of the whole images.
         """
         return type(self)(
             self.boxes[..., rows, :],
