@@ -1,7 +1,6 @@
 """Closer looks of a search in a large picture: the boxes they are made at, and the windows that show these."""
 
 import math
-from dataclasses import replace
 from functools import cached_property, reduce
 from typing import NamedTuple
 
@@ -303,7 +302,9 @@ class PhotographPlaces(CandidateBoxes):
         if window not in self._shown:
             self._shown[window] = self._next, super().look_at(candidate, close_up)
         self._index, detections = self._shown[window]
-        return replace(detections, mask=detections.mask & ~self._are_examined(detections.boxes[0]))
+        others = detections.mask & ~self._are_examined(detections.boxes[0])
+        # Not a copy with another mask, whose highest scores would be those of what was examined, too.
+        return Detections(detections.boxes, detections.scores, others, detections.confidence * others)
 
     def wait(self, passed: float = FRAME) -> None:
         """Let seconds pass; closer looks at earlier frames show other pixels where the scene changes."""

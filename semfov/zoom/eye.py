@@ -300,7 +300,7 @@ class WindowEye(nn.Module):
             return detections, cut
         if self.cut == "drop":
             uncut = detections.mask & ~cut
-            looks = [detections[look : look + 1].take(rows) for look, rows in enumerate(uncut)]
+            looks = [detections[look, rows][None] for look, rows in enumerate(uncut)]
             remaining = Detections.stack(looks)
             return remaining, torch.zeros_like(remaining.mask)
         background = torch.zeros_like(detections.scores[..., :1, :])

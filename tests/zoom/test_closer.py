@@ -470,6 +470,21 @@ def test_a_closer_look_is_not_at_an_object_that_was_examined():
     assert torch.equal(box, second.box)
 
 
+def test_the_score_of_an_object_that_was_examined_does_not_count_for_another_place():
+    boxes = torch.tensor([[[10.0, 10, 30, 30], [60.0, 10, 80, 30]]])
+    places = PhotographPlaces(1, OVER)
+    whole = Detections(boxes, torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
+    places.see(TargetFacts(whole, 1, 0.8, 0.5, 0.0))
+    closely = Detections(boxes + 1, torch.tensor([[[0, 0.9, 0], [0, 0.2, 0]]]), torch.ones(1, 2).bool())
+    places.examine(places.due(Thresholds(1.0, 0.1), last=True), lambda box: closely)
+    second = places.due(Thresholds(1.0, 0.1), last=True)
+    assert torch.equal(second.box, boxes[0, 1])
+    features, _ = places.examine(second, lambda box: closely)
+    only = Detections(closely.boxes[:, 1:], closely.scores[:, 1:], closely.mask[:, 1:])
+    expected, _ = closer_features(0.8, second.probability, 0.3, only, second.box, 1)
+    assert torch.equal(features, expected)
+
+
 def test_the_window_of_a_closer_look_shows_other_places_too():
     x1, y1, x2, y2 = closer_window(OVER, torch.tensor([150.0, 100, 160, 110])).within
     assert (x2 - x1, y2 - y1) == pytest.approx((0.6 * 192, 0.6 * 192))

@@ -118,7 +118,10 @@ def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, p
     keep, drop, nothing = (WindowEye(detector, cut=cut) for cut in ("keep", "drop", "background"))
     seen = keep.detect(keep.open(picture), fixation)
     assert bool(seen.cut.any())
-    assert int(drop.look(drop.open(picture), fixation).count) == int(seen.detections.count) - int(seen.cut.sum())
+    dropped = drop.look(drop.open(picture), fixation)
+    assert int(dropped.count) == int(seen.detections.count) - int(seen.cut.sum())
+    uncut = seen.detections.scores * ~seen.cut[..., None]
+    assert torch.equal(dropped.highest, uncut.amax(1))
     background = nothing.look(nothing.open(picture), fixation)
     assert float(background.confidence[seen.cut].max()) == 0
     torch.testing.assert_close(background.boxes, seen.detections.boxes)
