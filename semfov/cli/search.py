@@ -1,12 +1,11 @@
 """Subcommands that look at pictures: search, find and explore."""
 
-import math
 import os
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import fields, replace
 from os import PathLike, fspath
@@ -22,11 +21,10 @@ from semfov.cli.options import AgentKind, ExploreOptions, FindOptions, PictureOp
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import held_outputs
 from semfov.cli.sources import EXAMPLE
+from semfov.cli.totals import found_in_all
 from semfov.cli.written import PictureFiles
-from semfov.data.classes import amount, counted, plural
 from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
 from semfov.paths.conversion import Values
-from semfov.paths.words import number_with_error
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
 
@@ -235,51 +233,13 @@ def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Val
 
 def _totals(files: PictureFiles, endings: Counter[str], skipped: int) -> str:
     """Say how all pictures ended, what was found in them, how many were skipped, and what the searches assume."""
-    totals = [", ".join(f"{times} {name}" for name, times in endings.items()), _found_in_all(files)]
+    totals = [
+        ", ".join(f"{times} {name}" for name, times in endings.items()),
+        found_in_all(files.job, files.rows.values()),
+    ]
     if skipped:
         totals.append(f"{skipped} skipped")
     return f"{len(files.job.sources)} pictures: {'; '.join(filter(None, totals))}\n{_assumed_in_all(files)}"
-
-
-def _found_in_all(files: PictureFiles) -> str:
-    """Count the objects of each class in all pictures of a find, also of one that was looked for and is nowhere."""
-    if not files.job.every:
-        return ""
-    counts = Counter[str]()
-    for row in files.rows.values():
-        counts.update(dict.fromkeys(row.get("targets", ()), 0))
-        counts.update(line["class"] for line in row.get("objects", ()))
-    if not counts:
-        return ""
-    found = ", ".join(counted(number, name) for name, number in counts.most_common())
-    return "; ".join(filter(None, [f"{found} found", _expected_in_all(files.rows.values())]))
-
-
-def _expected_in_all(rows: Iterable[Values]) -> str:
-    """Say how many objects of each class that was looked for to expect in all pictures; empty where not known.
-
-    The errors of pictures are independent: the square of that of the sum is the sum of their squares.
-    """
-    looked_at = [row for row in rows if "error" not in row]
-    targets = list(dict.fromkeys(name for row in looked_at for name in row["targets"]))
-    # A sum without the pictures of which no number is expected would be too small.
-    known = [name for name in targets if all(row["expected"].get(name) is not None for row in looked_at)]
-    texts = []
-    for target in known:
-        noun = f" {plural(target)}" if len(targets) > 1 else ""
-        text = f"expect {_sum_with_error(looked_at, target)}{noun} in all"
-        guesses = [row for row in looked_at if row["expected_guessed"][target]]
-        if guesses:
-            text += f", of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
-        texts.append(text)
-    return "; ".join(texts)
-
-
-def _sum_with_error(rows: Sequence[Values], target: str) -> str:
-    """Write the sum of the expected numbers of a class in some pictures, with its error."""
-    mean = sum(row["expected"][target] for row in rows)
-    error = math.hypot(*(row["expected_error"][target] for row in rows))
-    return number_with_error(mean, error)
 
 
 def _only(values: set[_Value]) -> _Value | None:

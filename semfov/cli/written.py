@@ -15,6 +15,7 @@ from semfov.cli.results import (
     tell_written,
     unfinished,
 )
+from semfov.cli.totals import found_in_all
 from semfov.errors import SemfovError
 from semfov.io.files import check_apart, plain_name, write_bytes
 from semfov.paths.conversion import Values
@@ -156,7 +157,8 @@ class PictureFiles:
         written += self._written
         if options.report is not None and self._episodes:
             episodes = [self._episodes[number] for number in sorted(self._episodes)]
-            written.append(write_page(options.report, f"semfov: {self.job.title}", episodes))
+            total = found_in_all(self.job, self.rows.values())
+            written.append(write_page(options.report, f"semfov: {self.job.title}", episodes, total=total))
         written += [folder for folder in (options.crops, options.labels) if folder is not None]
         part = None if complete else f"{len(self.rows)} of {len(self.job.sources)}"
         tell_written(written, self.finished, part)

@@ -46,13 +46,16 @@ class OverviewRow(NamedTuple):
     kind: str = ""
 
 
-def overview_section(headline: str, columns: Sequence[OverviewColumn], rows: Sequence[OverviewRow]) -> str:
+def overview_section(
+    headline: str, columns: Sequence[OverviewColumn], rows: Sequence[OverviewRow], total: str = ""
+) -> str:
     """Make the section of a page that lists its pictures.
 
     Args:
         headline: what came of all of them.
         columns: those after the name of the picture.
         rows: the pictures, in the order in which they are listed.
+        total: numbers of all of them together; empty for none.
 
     Returns:
         HTML.
@@ -62,19 +65,22 @@ def overview_section(headline: str, columns: Sequence[OverviewColumn], rows: Seq
         for column in (OverviewColumn("picture"), *columns)
     )
     lines = "".join(_row_html(row, columns) for row in rows)
+    numbers = f"<p>In all: {escape(total)}.</p>" if total else ""
     return (
         f'<section id="overview" aria-labelledby="overview-title"><h2 id="overview-title">{escape(headline)}</h2>'
+        f"{numbers}"
         f'<div class="wide" tabindex="0" role="region" aria-label="All pictures"><table class="objects">'
         f"<thead><tr><td></td>{heads}</tr></thead><tbody>{lines}</tbody></table></div></section>\n"
     )
 
 
-def overview_html(episodes: Sequence[Data], places: Sequence[str]) -> str:
+def overview_html(episodes: Sequence[Data], places: Sequence[str], total: str = "") -> str:
     """Make the overview of searches and explorations, those with a find first.
 
     Args:
         episodes: data of the records, each with its `verdict` (`semfov.report.episode.object_data`).
         places: ids of their parts of the page.
+        total: numbers of all of them together; empty for none.
 
     Returns:
         HTML.
@@ -84,7 +90,7 @@ def overview_html(episodes: Sequence[Data], places: Sequence[str]) -> str:
     order = sorted(range(len(episodes)), key=lambda number: _ORDER.index(verdicts[number]))
     rows = [_row_of_episode(episodes[number], places[number]) for number in order]
     columns = (OverviewColumn("result"), OverviewColumn("objects", "number count"))
-    return overview_section(_headline(verdicts), columns, rows)
+    return overview_section(_headline(verdicts), columns, rows, total)
 
 
 def small_picture(uri: str | None, marks: str = "") -> str:

@@ -20,7 +20,7 @@ from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 _OPACITY = 0.82  # opacity over the photograph of colours that do not stand for probabilities
 
 
-def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: str = "") -> Path:
+def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: str = "", total: str = "") -> Path:
     """Write a page on which a reader steps through episodes.
 
     Args:
@@ -28,6 +28,7 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: st
         title: plain text.
         episodes: data of the episodes, from `episode_data` and `zoom_data`, in any order.
         sections: HTML to insert above the episodes, with special characters already escaped.
+        total: what came of all episodes together, for the overview.
 
     Returns:
         The path of the file.
@@ -40,10 +41,10 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], *, sections: st
         path = agent.explore("harbour.tif", passes=16)
         write_page(Path("harbour.html"), "Harbour", [zoom_data(path, "harbour.tif", name="harbour")])
     """
-    return write_html(path, page_html(title, episodes, sections=sections))
+    return write_html(path, page_html(title, episodes, sections=sections, total=total))
 
 
-def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> str:
+def page_html(title: str, episodes: Sequence[Data], *, sections: str = "", total: str = "") -> str:
     """Make a page on which a reader steps through episodes.
 
     Args:
@@ -51,6 +52,7 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
         episodes: data of the episodes, from `episode_data` and `zoom_data`, in any order.
         sections: HTML to insert above the episodes, with special characters already escaped. Without it, several
             episodes have an overview (`semfov.report.overview`).
+        total: what came of all episodes together, for the overview.
 
     Returns:
         The HTML of the page.
@@ -64,7 +66,7 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "") -> st
     is_single = len(episodes) == 1 and not sections
     contents = _of_single(episodes[0]) if is_single else _of_several(episodes)
     if len(episodes) > 1 and not sections:
-        sections = overview_html(episodes, [part.article for part in parts])
+        sections = overview_html(episodes, [part.article for part in parts], total)
     has_fixations = not parts or any(isinstance(part, EpisodePart) for part in parts)
     contents |= {
         "title": escape(title),

@@ -20,7 +20,8 @@ from semfov import DataError, InputError, read_image
 from semfov.cli import outcome, written
 from semfov.cli.jobs import FindJob
 from semfov.cli.options import FindOptions
-from semfov.cli.search import _assumed_in_all, _expected_in_all, _found_in_all
+from semfov.cli.search import _assumed_in_all
+from semfov.cli.totals import expected_in_all, found_in_all
 from semfov.gaze.policies import Policy
 from semfov.paths import Record
 from semfov.runs.command import run_command
@@ -327,13 +328,13 @@ def test_the_sum_of_what_is_expected_has_the_error_of_independent_pictures():
 
     skipped = {"picture": "c.jpg", "error": "not an image"}
     two = [row("person", 12.0, 6.0), skipped, row("person", 11.0, 8.0)]
-    assert _expected_in_all(two) == "expect 23 ± 10 in all"  # 6, 8, 10
-    assert _expected_in_all([row("person", 0.5, 0.3), row("person", 0.25, 0.4)]) == "expect 0.8 ± 0.5 in all"
-    assert _expected_in_all([*two, row("person", None, None)]) == ""
-    assert _expected_in_all([*two, row("cup", 1.0, 1.0)]) == ""
+    assert expected_in_all(two) == "expect 23 ± 10 in all"  # 6, 8, 10
+    assert expected_in_all([row("person", 0.5, 0.3), row("person", 0.25, 0.4)]) == "expect 0.8 ± 0.5 in all"
+    assert expected_in_all([*two, row("person", None, None)]) == ""
+    assert expected_in_all([*two, row("cup", 1.0, 1.0)]) == ""
     guesses = [row("person", 3.0, 24.0, guessed=True), row("person", 8.0, 7.0, guessed=True)]  # 7, 24, 25
-    assert _expected_in_all([*two, guesses[0]]) == "expect 26 ± 26 in all, of which 3 ± 24 at a guess in 1 picture"
-    assert _expected_in_all([*two, *guesses]) == "expect 34 ± 27 in all, of which 11 ± 25 at a guess in 2 pictures"
+    assert expected_in_all([*two, guesses[0]]) == "expect 26 ± 26 in all, of which 3 ± 24 at a guess in 1 picture"
+    assert expected_in_all([*two, *guesses]) == "expect 34 ± 27 in all, of which 11 ± 25 at a guess in 2 pictures"
 
 
 def test_a_find_of_several_classes_ends_with_the_sum_of_each():
@@ -350,8 +351,7 @@ def test_a_find_of_several_classes_ends_with_the_sum_of_each():
     rows = [row(12.0, 2.0, None), row(20.0, 5.0, 1.0)]
     people = "expect 32 ± 4 people in all"
     cups = "expect 7.0 ± 4.2 cups in all, of which 5.0 ± 3.0 at a guess in 1 picture"
-    assert _expected_in_all(rows) == f"{people}; {cups}"
-    files = SimpleNamespace(job=SimpleNamespace(every=True), rows=dict(enumerate(rows)))
-    assert _found_in_all(files) == f"32 people, no cup, no dog found; {people}; {cups}"
-    skipped = SimpleNamespace(job=files.job, rows={0: {"picture": "c.jpg", "error": "not an image"}})
-    assert _found_in_all(skipped) == ""
+    assert expected_in_all(rows) == f"{people}; {cups}"
+    job = SimpleNamespace(every=True)
+    assert found_in_all(job, rows) == f"32 people, no cup, no dog found; {people}; {cups}"
+    assert found_in_all(job, [{"picture": "c.jpg", "error": "not an image"}]) == ""

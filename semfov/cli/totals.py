@@ -1,0 +1,66 @@
+"""What was found in all pictures of a command, and how many objects of each class to expect in them."""
+
+import math
+from collections import Counter
+from collections.abc import Collection, Sequence
+
+from semfov.cli.jobs import PictureJob
+from semfov.cli.options import PictureOptions
+from semfov.data.classes import amount, counted, plural
+from semfov.paths.conversion import Values
+from semfov.paths.words import number_with_error
+
+
+def found_in_all(job: PictureJob[PictureOptions], rows: Collection[Values]) -> str:
+    """Count the objects of each class in all pictures of a find, also of one that was looked for and is nowhere.
+
+    Args:
+        job: what was to be done.
+        rows: those of the pictures so far.
+
+    Returns:
+        The numbers found, and the expected ones where they are known; empty for other tasks, and where none was found.
+    """
+    if not job.every:
+        return ""
+    counts = Counter[str]()
+    for row in rows:
+        counts.update(dict.fromkeys(row.get("targets", ()), 0))
+        counts.update(line["class"] for line in row.get("objects", ()))
+    if not counts:
+        return ""
+    found = ", ".join(counted(number, name) for name, number in counts.most_common())
+    return "; ".join(filter(None, [f"{found} found", expected_in_all(rows)]))
+
+
+def expected_in_all(rows: Collection[Values]) -> str:
+    """Say how many objects of each class that was looked for to expect in all pictures.
+
+    The errors of pictures are independent: the square of that of the sum is the sum of their squares.
+
+    Args:
+        rows: those of the pictures; ones that were left out have an `error`.
+
+    Returns:
+        The sums with their errors; empty where none is known in every picture.
+    """
+    looked_at = [row for row in rows if "error" not in row]
+    targets = list(dict.fromkeys(name for row in looked_at for name in row["targets"]))
+    # A sum without the pictures of which no number is expected would be too small.
+    known = [name for name in targets if all(row["expected"].get(name) is not None for row in looked_at)]
+    texts = []
+    for target in known:
+        noun = f" {plural(target)}" if len(targets) > 1 else ""
+        text = f"expect {_sum_with_error(looked_at, target)}{noun} in all"
+        guesses = [row for row in looked_at if row["expected_guessed"][target]]
+        if guesses:
+            text += f", of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
+        texts.append(text)
+    return "; ".join(texts)
+
+
+def _sum_with_error(rows: Sequence[Values], target: str) -> str:
+    """Write the sum of the expected numbers of a class in some pictures, with its error."""
+    mean = sum(row["expected"][target] for row in rows)
+    error = math.hypot(*(row["expected_error"][target] for row in rows))
+    return number_with_error(mean, error)
