@@ -348,7 +348,8 @@ class Conversion(Outcome, OtherWords):
         """Convert the objects to labels in the format of YOLO: a line of class, x, y, width and height for each.
 
         Classes are numbered from 0, without background. `x` and `y` are the middle of the box, and all four are shares
-        of the width and height of the picture. Boxes end at its borders.
+        of the width and height of the picture. Boxes end at its borders. The format has no scores: what the decision or
+        a closer look confirmed is among the labels with any score (`confirmed`).
 
         Args:
             path: the file to write; None writes none.
