@@ -131,7 +131,7 @@ class Detections:
         """
         return self._mapped(lambda tensor: tensor.to(device))
 
-    def __getitem__(self, index: int | slice | Tensor | tuple[Tensor, ...] | None) -> Self:
+    def __getitem__(self, index: int | slice | Tensor | tuple[int | Tensor, ...] | None) -> Self:
         """Return the detections of some images of the batch; single rows, by a tuple, are no whole image any more."""
         if isinstance(index, tuple):
             return type(self)(*(column[index] for column in self._columns()))
