@@ -20,6 +20,7 @@ from semfov.errors import check
 
 CELLS = 8  # cells along a side of the closest window
 MOST_CELLS = 1 << 22  # cells of a picture, for each of which a belief keeps some numbers by level: a gigabyte in all
+MOST_IN_LINE = 1 << 14  # cells along a side; sums over the windows of a strip take kilobytes for each
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,12 @@ class Lattice:
         while magnifications[-1] * 2 <= finest * (1 + 1e-9):
             magnifications.append(magnifications[-1] * 2)
         lattice = cls(size, canvas, tuple(magnifications))
-        cells = lattice.columns * lattice.rows
+        columns = lattice.columns
+        rows = lattice.rows
+        expected = f"at most {MOST_CELLS:,} cells of a belief, {MOST_IN_LINE:,} along a side"
         remedy = f"divide the picture, or look less closely, finest={finest / 2:g}"
-        got = f"{cells:,} in {width} × {height} px; {remedy}"
-        check(cells <= MOST_CELLS, "picture", f"at most {MOST_CELLS:,} cells of a belief", got)
+        got = f"{columns:,} × {rows:,} in {width} × {height} px; {remedy}"
+        check(columns * rows <= MOST_CELLS and max(columns, rows) <= MOST_IN_LINE, "picture", expected, got)
         return lattice
 
     def __post_init__(self) -> None:

@@ -1,17 +1,22 @@
 """Belief and policy: sums against plain loops, no look twice, jointly chosen batches."""
 
+import tracemalloc
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from semfov.agents import ZoomAgent
 from semfov.settings import FindSettings, SearchSettings
-from semfov.zoom import GlimpseEvidence, WindowEye
+from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import look_for
+from semfov.zoom.hints import Gist
 from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.policy import best_find, jointly
 from semfov.zoom.window_sums import WindowSums
+from tests.refusals import refused
 from tests.zoom import plain
 
 
@@ -149,3 +154,29 @@ def test_a_search_looks_where_most_objects_are_expected(detector, picture, evide
     assert [look.window for look in search.window_looks] == [look.window for look in finding.window_looks]
     expected = np.array([look.value for look in finding.looks[1:]])
     np.testing.assert_allclose([look.value for look in search.looks[1:]], 1 - np.exp(-expected), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(16_000_000, 1), (1, 16_000_000), (20_000_000, 1000), (20_000_000, 20_000_000)])
+def test_a_picture_with_too_many_cells_in_all_or_along_a_side_is_refused(size):
+    refused("picture: expected at most .* cells of a belief, 16,384 along a side", Lattice.over, size, (416, 416))
+
+
+@pytest.mark.parametrize("size", [(52 << 14, 1), (1, 52 << 14), (3, 50_000), (900, 700)])
+def test_strips_are_valued_in_half_a_gigabyte(size):
+    lattice = Lattice.over(size, (416, 416))
+    tracemalloc.start()
+    belief = ZoomBelief(lattice, GlimpseEvidence(3).eval().requires_grad_(False), 1)
+    belief.add(overview_look(lattice))
+    assert best_find(belief, set(), belief.foresight) is not None
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**29
+
+
+def overview_look(lattice):
+    """A look at the whole picture, in whose every cell there may be something."""
+    scale = max(1, lattice.span(0) // 32)
+    rows, columns = -(-lattice.rows // scale), -(-lattice.columns // scale)
+    scores = torch.full((rows, columns, 3), 0.5)
+    gist = Gist(0, (0, 0), scale, scores, torch.ones(rows, columns), scores > 1)
+    return SimpleNamespace(gist=gist)
