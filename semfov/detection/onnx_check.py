@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from onnx import ModelProto, NodeProto, TensorProto
 
 _MOST_METADATA = 2**20  # largest number of characters of a model's metadata
+_MOST_TENSORS = 2**16  # stored in a model, also in its nodes; detectors have thousands
 _MOST_NODES = 2**14  # after functions of the model are put where they are called
 _MOST_REASON = 400  # largest number of characters of a reason that a message has
 _HOLDERS = {f"{kind}Proto" for kind in ("Graph", "Function", "Node", "Attribute", "SparseTensor", "Tensor")}
@@ -48,6 +49,7 @@ def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
     try:
         model = onnx.load(path, load_external_data=False)
         stored = [*_tensors(model)]
+        check_data(len(stored) <= _MOST_TENSORS, name, f"at most {_MOST_TENSORS:,} stored tensors", f"{len(stored):,}")
         files = {path, *_files_of_weights(path.parent, stored)}
         for tensor in stored:
             check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)

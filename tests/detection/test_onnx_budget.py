@@ -73,6 +73,15 @@ def test_small_files_that_ask_for_much_are_refused_within_a_gigabyte(tmp_path):
     assert max(kilobytes for _, _, kilobytes in lines) < 2**20
 
 
+def test_a_model_of_very_many_stored_tensors_is_refused(tmp_path):
+    path = write(tmp_path / "model.onnx", "functions that end")
+    model = onnx.load(path)
+    one = numpy_helper.from_array(np.ones(1, np.float32))
+    model.graph.initializer.extend([one] * 2**16)
+    onnx.save(model, str(path))
+    unusable("at most 65,536 stored tensors, got 65,5", check_file, path)
+
+
 def test_own_functions_are_counted_as_what_they_call_and_must_end(tmp_path):
     path = write(tmp_path / "model.onnx", "functions that end")
     assert not check_file(path)
