@@ -129,8 +129,10 @@ def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
 def _is_made_here(path: Path) -> bool:
     """Tell whether a picture has the comment of those that semfov writes."""
     try:
+        if not path.is_file():
+            return False  # to open a pipe would wait for its writer
         with path.open("rb") as file:
-            return path.is_file() and MADE_HERE.encode() in file.read(_HEAD)
+            return MADE_HERE.encode() in file.read(_HEAD)
     except OSError:
         return False  # it is skipped when it is opened
 
