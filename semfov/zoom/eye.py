@@ -275,8 +275,8 @@ class WindowEye(nn.Module):
             stretched = width / (u2 - u1), height / (v2 - v1)
             if max(stretched) <= _MOST_STRETCHED * min(stretched):
                 u1, v1, u2, v2 = 0, 0, width, height
-                # The axis that is stretched needs more pixels of the picture.
-                reduction = picture.reduction(min((x2 - x1) / width, (y2 - y1) / height))
+                # The axis that is stretched needs more pixels of the picture; edges stay multiples of the reduction.
+                reduction = min(reduction, picture.reduction(min((x2 - x1) / width, (y2 - y1) / height)))
         window = picture.read((x1, y1, x2, y2), reduction)
         pixels = resized(window, (v2 - v1, u2 - u1)).to(padding.dtype)
         frame = x1, y1, x2, y2, u1, v1, u2, v2

@@ -28,6 +28,7 @@ from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.slices import ranked, raw, usual_slices
+from tests import small
 from tests.data.test_large import pixels
 from tests.refusals import refused
 from tests.small import Coloured
@@ -82,6 +83,17 @@ def test_windows_inside_the_picture_and_long_strips_are_not_stretched(detector):
         eye = WindowEye(detector, stretch=True)
         _, frames = eye.glimpse(eye.open(torch.rand(3, *reversed(size))), torch.tensor([fixation]))
         assert frames[0].tolist() == expected
+
+
+def test_a_window_that_fills_the_canvas_is_the_same_with_and_without_stretching(monkeypatch):
+    """Its edges are rounded to pixels of the reduced copy from which it is read."""
+    monkeypatch.setattr("semfov.data.windowed._LARGE", 1 << 15)
+    pixels = np.random.default_rng(0).integers(256, size=(1000, 1000, 3), dtype=np.uint8)
+    fixation = torch.tensor([[500.0, 500.0, 1 / 11.93]])
+    eyes = [WindowEye(small.Fixed(("cup",)), stretch=stretch) for stretch in (False, True)]
+    (canvas, frames), (stretched, same_frames) = (eye.resample(eye.open(pixels), fixation) for eye in eyes)
+    assert frames == same_frames == [(308, 308, 692, 692, 0, 0, 32, 32)]
+    assert torch.equal(canvas, stretched)
 
 
 def test_windows_are_stretched_as_the_detector_was_trained_or_as_in_the_fit_of_the_evidence(detector):
