@@ -54,6 +54,8 @@ def look_live(options: LiveOptions) -> int:
     agent = make_agent(options)
     settings = {setting.name: getattr(options, setting.name) for setting in fields(StreamSettings)}
     live = agent.live(_sought(options, agent.classes[1:]), **settings)
+    have_tracks = options.tracks is None or live.how != "fovea"
+    check(have_tracks, "tracks", "looks at windows, as with --how windows, for objects with numbers", live.how)
     path = _video_path(options.out)
     check_apart(path, [Path(source)] if isinstance(source, str) else [])
     with held_outputs(options):

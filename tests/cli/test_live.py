@@ -150,6 +150,15 @@ def large_video(tmp_path):
     return write(tmp_path / "large.avi", [large] * 6)
 
 
+def test_tracks_of_a_fovea_are_refused_before_the_first_frame(run, large_video, tmp_path):
+    arguments = "live", large_video, "--how", "fovea", "--tracks", tmp_path / "tracks.txt", "--out", tmp_path / "a.avi"
+    code, printed = run(*arguments)
+    assert code == 1
+    assert "tracks: expected looks at windows, as with --how windows" in printed.err
+    assert not printed.out
+    assert not list(tmp_path.glob("a.*"))
+
+
 @pytest.mark.slow
 def test_a_stream_ends_with_the_number_of_different_objects(tmp_path, capsys):
     """It is the number of different identities in the tracks that are written beside it, but of no other class."""
