@@ -46,6 +46,9 @@ _MOST_SECONDS = 10.0  # longest pass of such a model for one image, and longest 
 _MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 _MOST_BATCH = 1024  # largest fixed batch size of a model
 
+_PLANES_OF_FLOATS = "export it with such an input, as tf2onnx does with --inputs-as-nchw"
+_WITHOUT_SELECTION = "export it without non-maximum suppression, or with a first dimension for the images"
+
 Provider = str | tuple[str, Mapping[str, object]]
 """An execution provider of onnxruntime: its name, alone or with its options."""
 
@@ -171,10 +174,10 @@ class OnnxSession:
         got = ", ".join(descriptions)
         images = list(filter(_takes_images, inputs))
         expected = "one floating-point input (B, 3, H, W)"
-        check(len(images) == 1, self.path.name, expected, got)
+        check(len(images) == 1, self.path.name, expected, f"{got}; {_PLANES_OF_FLOATS}")
         image = images[0]
         shape = _sizes(image["shape"])
-        check(shape[1] in (3, None), self.path.name, expected, got)
+        check(shape[1] in (3, None), self.path.name, expected, f"{got}; {_PLANES_OF_FLOATS}")
         others = tuple(port["name"] for port in inputs if port is not image)
         are_known = set(others) <= set(_EXTRA_INPUTS)
         check(are_known, self.path.name, f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}", got)
@@ -228,8 +231,10 @@ class OnnxSession:
             raise DataError(f"{self.path.name}: fails on images of shape {tuple(image.shape)}: {reason}") from error
         outputs = {}
         for name, array in zip(names, arrays, strict=True):
-            rows = f"a row for each of {len(image)} images"
-            check(array.shape[:1] == (len(image),), f"{self.path.name}: output {name!r}", rows, f"shape {array.shape}")
+            has_rows = array.shape[:1] == (len(image),)
+            expected = f"a row for each of {len(image)} images"
+            got = f"shape {array.shape}; {_WITHOUT_SELECTION}"
+            check(has_rows, f"{self.path.name}: output {name!r}", expected, got)
             outputs[name] = torch.from_numpy(array)
         return outputs
 

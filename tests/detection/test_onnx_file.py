@@ -383,6 +383,25 @@ def test_boolean_and_scalar_outputs_are_refused_by_name(tmp_path):
     refused(r"output 'score': expected a row for each of 1 images, got shape \(\)", load_onnx, path)
 
 
+def test_rows_of_all_images_together_are_refused_with_a_remedy(tmp_path):
+    """As YOLOv7's, Paddle's and torchvision's own selections return them, image by image in no dimension."""
+    rows = helper.make_node("Reshape", ["image", "shape"], ["rows"])
+    stored = {"shape": np.array([-1, 6])}
+    path = save(tmp_path / "selected.onnx", [rows], {"rows": ["boxes", 6]}, stored)
+    refused(r"'rows': expected a row for each of 1 images, got .*; export it without non-maximum", load_onnx, path)
+
+
+@pytest.mark.parametrize(("kind", "shape"), [(TensorProto.FLOAT, [1, 32, 32, 3]), (TensorProto.UINT8, [1, 3, 32, 32])])
+def test_images_in_other_forms_are_refused_with_a_remedy(tmp_path, kind, shape):
+    image = helper.make_tensor_value_info("image", kind, shape)
+    cast = helper.make_node("Cast", ["image"], ["out"], to=TensorProto.FLOAT)
+    graph = helper.make_graph([cast], "g", [image], [helper.make_tensor_value_info("out", TensorProto.FLOAT, shape)])
+    opset = helper.make_opsetid("", 17)
+    path = tmp_path / "other.onnx"
+    path.write_bytes(helper.make_model(graph, opset_imports=[opset], ir_version=8).SerializeToString())
+    refused(r"one floating-point input \(B, 3, H, W\), got .*; export it with such an input", load_onnx, path)
+
+
 @pytest.mark.parametrize("side", [100_000, 2**40])
 def test_too_large_tensors_are_refused_before_memory_is_allocated(tmp_path, side):
     identity = helper.make_node("Identity", ["image"], ["out"])
