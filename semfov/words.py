@@ -181,7 +181,7 @@ AGENT = _by_word(
 
 DECISION = _by_word(
     {
-        "decision.outcome == 'found'": "found present result success",
+        "decision.outcome == 'found'": "found is_found is_present present result success",
         "decision.probability": "conf confidence p prob score",
         "decision.box": "bbox boxes xyxy",
         "record.found_at": "at location point x y",
@@ -255,7 +255,9 @@ GAZE_PREDICTION = _by_word(
 )
 
 
-def missing(owner: str, name: str, words: Mapping[str, str], known: Iterable[str] = ()) -> AttributeError:
+def missing(
+    owner: str, name: str, words: Mapping[str, str], known: Iterable[str] = (), of_class: str = ""
+) -> AttributeError:
     """Make the error of an attribute that is not there, with ours where others have another word for it.
 
     Args:
@@ -263,11 +265,13 @@ def missing(owner: str, name: str, words: Mapping[str, str], known: Iterable[str
         name: the attribute.
         words: our words by those of others, such as `RECORD`.
         known: the attributes that there are, of which near ones are suggested.
+        of_class: what has the objects of a class, where the name is that of one.
 
     Returns:
         The error, to raise.
     """
-    remedy = f"; use {words[name]}" if name in words else _near(name, known)
+    ours = words.get(name, of_class)
+    remedy = f"; use {ours}" if ours else _near(name, known)
     return AttributeError(f"{owner} has no attribute {name!r}{remedy}")
 
 
@@ -280,9 +284,13 @@ def _near(name: str, known: Iterable[str]) -> str:
 
 
 class OtherWords:
-    """Base of classes that answer others' words for their attributes with ours (`_other_words`)."""
+    """Base of classes that answer others' words for their attributes with ours (`_other_words`).
+
+    Those that hold objects also answer the name of a class, with what has its objects (`_objects`).
+    """
 
     _other_words: ClassVar[Mapping[str, str]]
+    _objects: ClassVar[str] = ""
 
     if not TYPE_CHECKING:  # to which any name would be an attribute
 
@@ -293,4 +301,10 @@ class OtherWords:
             if present is not None and hasattr(self, present):
                 warnings.warn(note_of_former(name, present), FutureWarning, stacklevel=2)
                 return getattr(self, present)
-            raise missing(type(self).__name__, name, self._other_words, dir(type(self)))
+            raise missing(type(self).__name__, name, self._other_words, dir(type(self)), self._of_class(name))
+
+        def _of_class(self, name: str) -> str:
+            """Say what has the objects of a class, whose name may be in the plural; empty for other names."""
+            classes = vars(self).get("classes", ())
+            named = get_close_matches(name.replace("_", " "), classes, n=1, cutoff=0.8) if self._objects else []
+            return f"{self._objects}.of({named[0]!r})" if named else ""

@@ -53,6 +53,7 @@ class Objects(OtherWords):
     track_ids: Tensor | None = None
 
     _other_words = OBJECTS
+    _objects = "objects"
 
     def __len__(self) -> int:
         return len(self.boxes)

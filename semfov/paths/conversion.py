@@ -50,6 +50,7 @@ class Conversion(Outcome, OtherWords):
     """Conversion of a record to words, of its looks and objects to tables, and of objects to other formats."""
 
     _other_words = RECORD
+    _objects = "record.objects"
 
     _words: ClassVar[type[Words]]
     """Class of the words for the record."""
