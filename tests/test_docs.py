@@ -367,6 +367,23 @@ def test_a_page_runs_as_printed(page, filled, monkeypatch, capsys, one_thread):
                 assert main(shlex.split(line)[1:]) == 0, capsys.readouterr().err
 
 
+def test_the_table_of_counts_sums_what_has_a_number_that_is_no_guess(tmp_path, monkeypatch, capsys):
+    lines = [
+        "picture,class,object,expected,expected_error,expected_guessed,error",
+        "a.jpg,person,0,10,3,False,",
+        "a.jpg,person,1,10,3,False,",
+        "b.jpg,person,0,,,False,",  # without a number
+        "c.jpg,person,0,9,10,True,",
+        "d.jpg,,,,,,not an image",
+    ]
+    (tmp_path / "people.csv").write_text("\n".join(lines), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (TASKS / "count.md").read_text(encoding="utf-8"), re.DOTALL)
+    (block,) = [block for block in blocks if "read_csv" in block]
+    exec(compile(block, "count.md", "exec"), {})
+    assert capsys.readouterr().out.endswith("\n10 in 1 of 3 pictures\n")
+
+
 def test_every_page_is_in_the_index_and_on_the_site():
     index, site = (TASKS / "index.md").read_text(encoding="utf-8"), (TASKS.parents[1] / "mkdocs.yml").read_text()
     for page in TASK_PAGES:

@@ -36,23 +36,26 @@ def found_in_all(job: PictureJob[PictureOptions], rows: Collection[Values]) -> s
 def expected_in_all(rows: Collection[Values]) -> str:
     """Say how many objects of each class that was looked for to expect in all pictures.
 
-    The errors of pictures are independent: the square of that of the sum is the sum of their squares.
+    The errors of pictures are independent: the square of that of the sum is the sum of their squares. Where pictures
+    are without a number, the sum is of the others, and says of how many.
 
     Args:
         rows: those of the pictures; ones that were left out have an `error`.
 
     Returns:
-        The sums with their errors; empty where none is known in every picture.
+        The sums with their errors; empty where no picture has a number.
     """
     looked_at = [row for row in rows if "error" not in row]
     targets = list(dict.fromkeys(name for row in looked_at for name in row["targets"]))
-    # A sum without the pictures of which no number is expected would be too small.
-    known = [name for name in targets if all(row["expected"].get(name) is not None for row in looked_at)]
     texts = []
-    for target in known:
+    for target in targets:
+        known = [row for row in looked_at if row["expected"].get(target) is not None]
+        if not known:
+            continue
         noun = f" {plural(target)}" if len(targets) > 1 else ""
-        text = f"expect {_sum_with_error(looked_at, target)}{noun} in all"
-        guesses = [row for row in looked_at if row["expected_guessed"][target]]
+        where = "all" if len(known) == len(looked_at) else f"{len(known)} of {amount(len(looked_at), 'picture')}"
+        text = f"expect {_sum_with_error(known, target)}{noun} in {where}"
+        guesses = [row for row in known if row["expected_guessed"][target]]
         if guesses:
             text += f", of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
         texts.append(text)

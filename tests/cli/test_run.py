@@ -330,15 +330,17 @@ def test_the_sum_of_what_is_expected_has_the_error_of_independent_pictures():
     two = [row("person", 12.0, 6.0), skipped, row("person", 11.0, 8.0)]
     assert expected_in_all(two) == "expect 23 ± 10 in all"  # 6, 8, 10
     assert expected_in_all([row("person", 0.5, 0.3), row("person", 0.25, 0.4)]) == "expect 0.8 ± 0.5 in all"
-    assert expected_in_all([*two, row("person", None, None)]) == ""
-    assert expected_in_all([*two, row("cup", 1.0, 1.0)]) == ""
+    assert expected_in_all([row("person", None, None)] * 2) == ""
+    assert expected_in_all([*two, row("person", None, None)]) == "expect 23 ± 10 in 2 of 3 pictures"
+    of_two = "expect 23 ± 10 people in 2 of 3 pictures; expect 1.0 ± 1.0 cups in 1 of 3 pictures"
+    assert expected_in_all([*two, row("cup", 1.0, 1.0)]) == of_two
     guesses = [row("person", 3.0, 24.0, guessed=True), row("person", 8.0, 7.0, guessed=True)]  # 7, 24, 25
     assert expected_in_all([*two, guesses[0]]) == "expect 26 ± 26 in all, of which 3 ± 24 at a guess in 1 picture"
     assert expected_in_all([*two, *guesses]) == "expect 34 ± 27 in all, of which 11 ± 25 at a guess in 2 pictures"
 
 
 def test_a_find_of_several_classes_ends_with_the_sum_of_each():
-    """Also of one of which nothing is listed; a class whose number is not known in every picture has no sum."""
+    """Also of one of which nothing is listed, and of one whose number is known in some of the pictures alone."""
 
     def row(people, cups, dogs):
         numbers = {"person": people, "cup": cups, "dog": dogs}
@@ -351,7 +353,8 @@ def test_a_find_of_several_classes_ends_with_the_sum_of_each():
     rows = [row(12.0, 2.0, None), row(20.0, 5.0, 1.0)]
     people = "expect 32 ± 4 people in all"
     cups = "expect 7.0 ± 4.2 cups in all, of which 5.0 ± 3.0 at a guess in 1 picture"
-    assert expected_in_all(rows) == f"{people}; {cups}"
+    dogs = "expect 1.0 ± 3.0 dogs in 1 of 2 pictures"
+    assert expected_in_all(rows) == f"{people}; {cups}; {dogs}"
     job = SimpleNamespace(every=True)
-    assert found_in_all(job, rows) == f"32 people, no cup, no dog found; {people}; {cups}"
+    assert found_in_all(job, rows) == f"32 people, no cup, no dog found; {people}; {cups}; {dogs}"
     assert found_in_all(job, [{"picture": "c.jpg", "error": "not an image"}]) == ""
