@@ -65,6 +65,7 @@ REFUSED = {
     "fit my.pt": "yolo export model=my.pt format=onnx",
     "search --target cup --detector my.pt": "read as 'torchvision:MODEL' with --weights my.pt and --classes",
     "detectors yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
+    "detectors yolox": "unknown detector 'yolox'; did you mean 'yolox-s' or 'yolox-tiny' or 'yolox-nano'",
     "fit": "model: expected the name or the file of a detector, got none",
 }
 
