@@ -83,7 +83,7 @@ class WindowWords(Words):
         "found": "The probability is high enough, and a detection shows the target.",
         "absent": "No remaining look is worth a pass, and the target is probably absent.",
         "undecided": "No remaining look is worth a pass, but the target is too probable to call it absent.",
-        "unseen": "No look shows anything like it: what was assumed before, and what a detector misses, is left.",
+        "unseen": "No look shows anything like it: the probability that is left is that the detector missed it.",
         "first found": "The first look shows the target closely enough.",
         "closer found": "A closer look confirmed the target.",
         "closer absent": "No closer look was sure enough, and the target is probably absent.",
