@@ -304,6 +304,20 @@ def test_a_moment_keeps_the_bytes_of_its_frame_also_where_the_next_one_takes_its
     assert torch.equal(moment.photograph, pixels)
 
 
+@pytest.mark.parametrize("sought", ["person", ["person"]])
+def test_the_window_that_a_moment_names_is_looked_at_in_the_next_frame_of_a_moving_camera(sought):
+    live = ActivePerception.recommended("yolox-nano").live(sought, how="windows")
+    sheet = F.interpolate(semfov.example("sheet")[None], size=(1200, 1800), mode="bilinear")[0].clamp(0, 1)
+    moments = []
+    for number in range(8):
+        left = 36 * number
+        frame = sheet[:, 100:1000, left : left + 1500]
+        moments.append(live.step(frame, pose=[[1.0, 0.0, float(-left)], [0.0, 1.0, 0.0]]))
+    pairs = [(first, then) for first, then in pairwise(moments) if then.examined is None]
+    assert len(pairs) >= 4
+    assert [then.window for _, then in pairs] == [first.next_window for first, _ in pairs]
+
+
 def test_fainter_objects_are_listed_from_the_probability_that_is_asked_for():
     agent = ActivePerception.recommended()
     frame = semfov.example("sheet")

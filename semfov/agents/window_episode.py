@@ -215,6 +215,8 @@ class WindowSession:
 
     def follow(self, camera: CameraStep) -> None:
         """Carry closer looks along with the camera, or set them aside where a frame fits none before."""
+        if self.decisions.candidate is not None and self.step is not None:
+            self.step.choose_anew()  # a closer look is due in this frame, and the choice is for one after it
         carry = partial(carry_along, lattice=self.source.lattice)
         self._closer_looks = self._lost_looks.follow(self._closer_looks, camera, carry)
         self.decisions.follow(camera)

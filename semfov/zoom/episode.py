@@ -122,7 +122,7 @@ class WindowStep(Generic[_StepBelief_co]):
         return self._choose()
 
     def choose_anew(self) -> None:
-        """Forget the choices, as the looks that count have moved."""
+        """Forget the choices, as they are of another scene, or other frames have passed since."""
         self.__dict__.pop("choices", None)
 
     @property
@@ -173,7 +173,9 @@ class _Recent(Generic[_Belief]):
         """Carry the looks along with the camera, or set them aside where the frame fits none before."""
         self.kept = self.lost.follow(self.kept, camera, partial(carry_along, lattice=self.source.lattice))
         self._believe_anew()
-        if self.step is not None:
+        # Else the window that was chosen after the last look is looked at: a camera moves little in a frame.
+        is_other_scene = camera.motion is None or camera.recovered is not None
+        if self.step is not None and is_other_scene:
             self.step.choose_anew()
 
     def _believe_anew(self) -> None:
