@@ -33,7 +33,7 @@ class SearchEvidence(Evidence):
         covered: the cells under each detection, `(B, L, X·Y)`.
         distance: from the fixation to each cell, `(B, X·Y)`, in longer sides of the image.
         fixated: the fixated cell, `(B,)`.
-        highest: `log_evidence` of the highest score of each class, `(B, K+1)`.
+        evidence: `log_evidence` of the highest score of each class, `(B, K+1)`.
     """
 
     by_detection = ("ratio", "weight", "covered")
@@ -43,7 +43,7 @@ class SearchEvidence(Evidence):
     covered: Tensor
     distance: Tensor
     fixated: Tensor
-    highest: Tensor
+    evidence: Tensor
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class SearchBelief(DirichletBelief):
         following: `(B, X·Y, K+1)`, Dirichlet parameters given that no fixated cell holds the target (`chance`); `beta`
             are those given the looks alone.
         visited: `(B, X·Y)` boolean, the fixated cells.
-        highest: `(B, K+1)`, `log_evidence` of the highest score of each class in any look.
+        evidence: `(B, K+1)`, `log_evidence` of the highest score of each class in any look.
         looks: `(B,)`, number of looks.
         footprint: rule for the weight of a detection in each cell (`Presence.of_cells`).
         calibration: by which it says whether the picture holds a class; None takes the most probable cell.
@@ -63,7 +63,7 @@ class SearchBelief(DirichletBelief):
 
     following: Tensor = None  # type: ignore[assignment]
     visited: Tensor = None  # type: ignore[assignment]
-    highest: Tensor = None  # type: ignore[assignment]
+    evidence: Tensor = None  # type: ignore[assignment]
     looks: Tensor = None  # type: ignore[assignment]
     footprint: Footprint = "box_centre"
     calibration: Presence | None = None
@@ -111,7 +111,7 @@ class SearchBelief(DirichletBelief):
         Returns:
             `(B, 2)`.
         """
-        return presence_facts(super().probability(target), pick(self.highest, target))
+        return presence_facts(super().probability(target), pick(self.evidence, target))
 
 
 class SemanticSearch(Observer):
@@ -193,7 +193,7 @@ class SemanticSearch(Observer):
             beta,
             following=beta,
             visited=visited,
-            highest=beta.new_zeros(batch, self.components),
+            evidence=beta.new_zeros(batch, self.components),
             looks=beta.new_zeros(batch),
             footprint=self.footprint,
             calibration=self.model.presence,
@@ -247,7 +247,7 @@ class SemanticSearch(Observer):
             beta=torch.where(is_closer, _fusion(seen, weight, odds), old.beta),
             following=torch.where(is_closer, _fusion(seen, remaining, odds), old.following),
             visited=visited,
-            highest=torch.maximum(old.highest, seen.highest.to(old.beta)),
+            evidence=torch.maximum(old.evidence, seen.evidence.to(old.beta)),
             looks=old.looks + 1,
             closest=torch.minimum(old.closest, seen.distance),
             # That of a belief that was detached is a copy, through which the model would not learn.
@@ -267,7 +267,7 @@ class SemanticSearch(Observer):
             beta=_WEAK + keep * (old.beta - _WEAK),
             following=_WEAK + keep * (old.following - _WEAK),
             visited=visited,
-            highest=keep * old.highest,
+            evidence=keep * old.evidence,
             looks=keep * old.looks,
             closest=old.closest + farther(keep),
         )
