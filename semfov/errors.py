@@ -231,7 +231,8 @@ def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
     if name in names:
         return names[names.index(name)]
     # Names that begin with it come first: of `yolox`, `yolox-nano` differs in more letters than `yolov3`.
-    longer = get_close_matches(str(name), [each for each in names if name and each.startswith(name)], n=3, cutoff=0.0)
+    beginning = [each for each in names if name and each.startswith(str(name))]
+    longer = get_close_matches(str(name), beginning, n=3, cutoff=0.0)
     similar = list(dict.fromkeys([*longer, *get_close_matches(str(name), names, n=3, cutoff=0.5)]))[:3]
     hint = f"did you mean {' or '.join(map(repr, similar))}?" if similar else f"known: {', '.join(names) or 'none'}"
     raise InputError(f"unknown {what} {name!r}; {hint}")

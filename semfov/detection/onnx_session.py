@@ -46,7 +46,7 @@ _MOST_SECONDS = 10.0  # longest pass of such a model for one image, and longest 
 _MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 _MOST_BATCH = 1024  # largest fixed batch size of a model
 
-_PLANES_OF_FLOATS = "export it with such an input, as tf2onnx does with --inputs-as-nchw"
+_PLANES_OF_FLOATS = "export it with such an input, as the option inputs-as-nchw of tf2onnx does"
 _WITHOUT_SELECTION = "export it without non-maximum suppression, or with a first dimension for the images"
 
 Provider = str | tuple[str, Mapping[str, object]]

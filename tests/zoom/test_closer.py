@@ -529,7 +529,7 @@ def test_a_search_of_a_photograph_decides_after_closer_looks(detector, photograp
     nothing = agent.search(photograph, "blue")
     assert nothing.decision.outcome == "absent"
     assert nothing.passes == 1
-    assert "what a detector misses" in nothing.why_it_ended()
+    assert "the detector missed it" in nothing.why_it_ended()
     seen = torch.tensor([0.0, 0.0, PhotographPlaces.least + 1e-6])
     looks = tuple(replace(look, shown=replace(look.shown, show=seen)) for look in nothing.looks)
     shown = replace(nothing, looks=looks)
