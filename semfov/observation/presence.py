@@ -25,7 +25,7 @@ EVEN = 0.5
 """Share of the searches whose target is there that a `Presence` assumes."""
 
 FAINT_SCORE = 3e-4
-"""Score ε below which a highest score hardly counts (`log_evidence`); no threshold, as `Detector.faint` is one."""
+"""Score ε below which a highest score hardly counts (`log_evidence`); no threshold, as `faint` of a detector is."""
 
 _SURE = 1e-6  # probabilities nearer to 0 or 1 count as this far from them
 
