@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _MOST_METADATA = 2**20  # largest number of characters of a model's metadata
 _MOST_TENSORS = 2**16  # stored in a model, also in its nodes; detectors have thousands
+_MOST_FUNCTIONS = 2**12  # of a model's own; exporters write one for each kind of layer
+_MOST_PORTS = 2**10  # inputs and outputs, beside inputs that are stored as older models have them
 _MOST_NODES = 2**14  # after functions of the model are put where they are called
 _MOST_REASON = 400  # largest number of characters of a reason that a message has
 _HOLDERS = {f"{kind}Proto" for kind in ("Graph", "Function", "Node", "Attribute", "SparseTensor", "Tensor")}
@@ -48,8 +50,13 @@ def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
         path.stat()
     try:
         model = onnx.load(path, load_external_data=False)
+        functions = len(model.functions)
+        check_data(functions <= _MOST_FUNCTIONS, name, f"at most {_MOST_FUNCTIONS:,} functions", f"{functions:,}")
         stored = [*_tensors(model)]
         check_data(len(stored) <= _MOST_TENSORS, name, f"at most {_MOST_TENSORS:,} stored tensors", f"{len(stored):,}")
+        ports = len(model.graph.input) + len(model.graph.output)
+        most = _MOST_PORTS + len(stored)
+        check_data(ports <= most, name, f"at most {most:,} inputs and outputs", f"{ports:,}")
         files = {path, *_files_of_weights(path.parent, stored)}
         for tensor in stored:
             check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)

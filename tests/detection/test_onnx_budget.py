@@ -8,9 +8,11 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
+from operator import attrgetter
 
 import numpy as np
 import onnx
+import onnx.inliner
 import pytest
 import torch
 from onnx import TensorProto, numpy_helper
@@ -80,6 +82,18 @@ def test_a_model_of_very_many_stored_tensors_is_refused(tmp_path):
     model.graph.initializer.extend([one] * 2**16)
     onnx.save(model, str(path))
     unusable("at most 65,536 stored tensors, got 65,5", check_file, path)
+
+
+@pytest.mark.parametrize("part", ["functions", "graph.input", "graph.output"])
+def test_a_model_of_very_many_parts_is_refused_before_they_are_read(tmp_path, part, monkeypatch):
+    path = write(tmp_path / "model.onnx", "functions that end")
+    model = onnx.load(path)
+    entries = attrgetter(part)(model)
+    entries.extend([entries[0]] * 2**13)
+    onnx.save(model, str(path))
+    monkeypatch.setattr(onnx.inliner, "inline_local_functions", None)
+    monkeypatch.setattr(onnx.shape_inference, "infer_shapes", None)
+    unusable("functions, got 8,19|inputs and outputs, got 8,19", check_file, path)
 
 
 def test_own_functions_are_counted_as_what_they_call_and_must_end(tmp_path):
