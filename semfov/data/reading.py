@@ -6,11 +6,21 @@ from pathlib import Path
 
 from torch import Tensor
 
-from semfov.data.images import SIXTEEN_BITS, check_area, has_pages, open_pillow, quiet_decoders, read_photograph
+from semfov.data.images import (
+    SIXTEEN_BITS,
+    check_area,
+    check_decoding,
+    has_pages,
+    open_pillow,
+    quiet_decoders,
+    read_photograph,
+)
 from semfov.data.rasters import open_by_windows
 from semfov.data.tiff_tags import UPRIGHT, TiffTags
 from semfov.data.tone import White, check_white
 from semfov.data.windowed import BY_WINDOWS
+
+_BYTES_A_PIXEL = 16  # of a picture that is read by windows: floats, and the bytes that they are made of
 
 
 def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
@@ -46,6 +56,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     if _is_read_by_windows(path, white, oriented):
         picture = open_by_windows(path, white=white)
         check_area(picture.size, f"image {Path(path)}")
+        check_decoding(picture.size, _BYTES_A_PIXEL, Path(path).stat().st_size, f"image {Path(path)}")
         return picture.read((0, 0, *picture.size)).float().div_(255)
     return read_photograph(path, oriented=oriented, white=white)
 

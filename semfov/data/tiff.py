@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from semfov.data.description import Description, as_rgb, named_colours
 from semfov.data.gdal import check_size
-from semfov.data.images import check_tile, opening
+from semfov.data.images import check_decoding, check_tile, opening
 from semfov.data.tiff_tags import (
     GDAL_METADATA,
     GDAL_NODATA,
@@ -341,6 +341,9 @@ class _Tiles:
         samples = 1 if self.separate else self._page.samplesperpixel
         size = self.width * self.height * samples * self._page.dtype.itemsize
         check_tile(size, stored, f"image {self._path}")
+        if self._is_one_strip:  # is there unpacked, decoded, and as the bytes that are shown
+            a_pixel = 2 * samples * self._page.dtype.itemsize + 3
+            check_decoding(self._size, a_pixel, stored, f"image {self._path}")
         data = self.read_bytes(layer.dataoffsets[number], stored)
         self._check_inflation(data, size)
         tile: Values = self._page.decode(data, number, jpegtables=self._page.jpegtables)[0][0]

@@ -372,3 +372,11 @@ def test_without_its_reader_a_mask_is_missed_with_a_word(tmp_path, monkeypatch):
     for read in (open_large, read_image):
         with pytest.warns(UserWarning, match=r'its mask is not read; pip install "semfov\[geo\]"'):
             read(path)
+
+
+def test_one_strip_that_takes_far_more_memory_than_its_file_is_refused(tmp_path):
+    path = tmp_path / "a.tif"
+    plain = np.zeros((9000, 9000, 3), np.uint8)
+    tifffile.imwrite(path, plain, photometric="rgb", rowsperstrip=9000, compression="zlib")
+    unusable("at most .* bytes, in proportion to the file, got 9000 × 9000", read_image, path)
+    unusable("at most .* bytes, in proportion to the file, got 9000 × 9000", open_large(path).pixels, (0, 0, 9, 9))
