@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import nan
+from math import isnan, nan
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
@@ -258,13 +258,13 @@ class Outcome(ABC):
         return NumberByClass({name: variance**0.5 for name, (_, variance) in self._claimed().items()})
 
     @property
-    def expected_guessed(self) -> dict[str, bool]:
-        """Whether the expected number of objects is a guess, by the name of their class.
+    def expected_guessed(self) -> dict[str, bool | None]:
+        """Whether the expected number of objects is a guess, by the name of their class; None where it is not known.
 
         It is where the words of the record say `at a guess`: the detector hardly reacts to the class
         (`semfov.paths.ZoomPath.reacts`), and an object of it is listed, or at least one half is expected.
         """
-        return dict.fromkeys(self._claimed(), False)
+        return {name: None if isnan(mean) else False for name, (mean, _) in self._claimed().items()}
 
     def _claimed(self) -> dict[str, tuple[float, float]]:
         """Estimate mean and variance of the number of objects of each class; NaN for those without one."""

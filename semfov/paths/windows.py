@@ -322,13 +322,14 @@ class ZoomPath(Record):
         return len(self._shown_objects[0].of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
 
     @property
-    def expected_guessed(self) -> dict[str, bool]:
+    def expected_guessed(self) -> dict[str, bool | None]:
         """Whether the expected number of objects is a guess, by the name of their class (`semfov.paths.Record`)."""
         if self.unseen is None:
             return super().expected_guessed
-        guessed = {}
+        guessed: dict[str, bool | None] = {}
         for label, (mean, _) in self._numbers().items():
-            guessed[self.classes[label]] = self._is_said(label, mean) and not self._reacts_to([label])
+            is_guess = self._is_said(label, mean) and not self._reacts_to([label])
+            guessed[self.classes[label]] = None if math.isnan(mean) else is_guess
         return guessed
 
     def _is_said(self, label: int, mean: float) -> bool:

@@ -242,7 +242,7 @@ def test_a_photograph_has_a_number_where_the_detector_hardly_reacts():
     assert listed.describe() == "1 cup, no cat found; expect at a guess 0.4 ± 1.5 cups in all. 0 looks"
     assert listed.expected_guessed == {"cup": True, "cat": False}
     assert replace(listed, score_threshold=0.5).expected_guessed == {"cup": False, "cat": False}
-    assert replace(listed, unseen=None).expected_guessed == {"cup": False, "cat": False}
+    assert replace(listed, unseen=None).expected_guessed == {"cup": None, "cat": None}  # no number is known
     assert isnan(replace(path, targets=()).expected["cup"])  # which nobody asked for
     fewer = replace(path, candidates=faint[:1])
     assert fewer.describe() == "No cup, no cat found; expect at a guess 0.6 ± 1.7 cups in all. 0 looks"
@@ -298,7 +298,7 @@ def test_a_number_is_claimed_class_by_class():
     assert isnan(path.expected_error["cat"])
     values = path.to_dict()
     assert (values["expected"]["cat"], values["expected_error"]["cat"]) == (None, None)
-    assert values["expected_guessed"] == {"cup": False, "cat": False}
+    assert values["expected_guessed"] == {"cup": False, "cat": None}  # which no number can be
     json.dumps(values, allow_nan=False)
 
 
