@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from semfov.agent import ActivePerception
 from semfov.data.annotations import read_annotations
@@ -24,7 +23,7 @@ from semfov.io.files import write_text
 from semfov.io.manifest import PARTS
 from semfov.runs.config import DataConfig, DetectorConfig
 from semfov.runs.looking import Looking
-from semfov.runs.progress import WholeBar
+from semfov.runs.progress import WholeBar, track
 from semfov.runs.scene_run import finish
 from semfov.runs.setup import check_sources, make_detector
 from semfov.threads import available_cores
@@ -232,7 +231,7 @@ def _check_photographs(run: Looking) -> list[int]:
     cells = len(run.grid(0))
     unseen = [index for index in range(len(run.scenes)) if len(run.store.load(run.digest(index))) < cells]
     faults = []
-    for index in tqdm(unseen, "decoding photographs", unit="photograph", leave=False, dynamic_ncols=True):
+    for index in track(unseen, "decoding photographs", "photograph"):
         try:
             run.scenes[index]
         except DataError as error:

@@ -11,7 +11,6 @@ from typing import Annotated, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import tqdm
 
 from semfov.data.fixations import Fixations, by_picture
 from semfov.data.pictures import Pictures
@@ -24,6 +23,7 @@ from semfov.io.files import sha256
 from semfov.io.ranges import Count, Range
 from semfov.io.schema import Field, Schema
 from semfov.runs.looks import LOOK_SOURCES
+from semfov.runs.progress import track
 from semfov.runs.scene_run import digest_of, store_folder
 from semfov.runs.settings import Settings
 from semfov.runs.store import SceneStore
@@ -212,7 +212,7 @@ _ViewedPicture = tuple[FeatureMaps, Sequence[Fixations]]  # the maps of a pictur
 
 def _looks(store: "_MapStore", scenes: Pictures, people: Mapping[str, Sequence[Fixations]]) -> Iterator[_ViewedPicture]:
     """Look at the pictures of a data set, one after the other."""
-    for index, name in enumerate(tqdm(scenes.ids, desc="looking", unit="picture")):
+    for index, name in enumerate(track(scenes.ids, "looking", "picture")):
         yield store.maps(scenes, index), people[str(name)]
 
 

@@ -16,6 +16,8 @@ _Item = TypeVar("_Item")
 
 _TRUST = 0.02  # share of the work for which the pace that was expected counts beside the pace so far
 
+_SELDOM = 60.0  # seconds between two lines of a bar in a log
+
 _open_bar: ContextVar[WholeBar | None] = ContextVar("open bar", default=None)
 
 
@@ -39,7 +41,7 @@ class WholeBar:
         self._began = monotonic()
         self._tasks = dict[str, float]()
         form = "{desc} {percentage:3.0f} % |{bar}| {elapsed} < {left}{postfix}"
-        self._bar = _Bar(self, total=1.0, desc=title, bar_format=form, dynamic_ncols=True)
+        self._bar = _Bar(self, total=1.0, desc=title, bar_format=form, dynamic_ncols=True, mininterval=_pause())
         self._closed = threading.Event()
         threading.Thread(target=self._tick, daemon=True).start()
 
@@ -132,7 +134,12 @@ def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> tq
     bar = _open_bar.get()
     if bar is not None:
         return bar.task(title, total)
-    return tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden)
+    return tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden, mininterval=_pause())
+
+
+def _pause() -> float:
+    """Seconds between two drawings of a bar: in a log, which keeps each of them, there are few."""
+    return 0.1 if sys.stderr.isatty() else _SELDOM
 
 
 def track(items: Iterable[_Item], title: str, unit: str) -> Iterator[_Item]:

@@ -4,6 +4,7 @@ import itertools
 import json
 import re
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -534,6 +535,19 @@ def test_one_progress_bar_covers_all_stages(capsys):
     # Outside the stages a task has its own bar again.
     assert list(track(range(2), "alone", "unit")) == [0, 1]
     assert "alone" in capsys.readouterr().err
+
+
+def test_a_bar_fills_no_log(capsys):
+    """Where the errors go to a file, a bar is drawn when it opens and when it is done, and seldom between."""
+    for _ in track(range(5), "alone", "unit"):
+        time.sleep(0.12)
+    alone = capsys.readouterr().err
+    assert alone.count("alone") == 2
+    assert "5/5" in alone
+    with WholeBar("all", {"one": {"a": 1}}) as whole, whole.stage("one"):
+        for _ in track(range(5), "a", "unit"):
+            time.sleep(0.12)
+    assert capsys.readouterr().err.count("all") <= 4  # it opens, its stage begins and ends, and it is done
 
 
 def test_the_time_left_is_that_of_all_work_and_not_of_one_task(monkeypatch, capsys):
