@@ -56,6 +56,16 @@ class Course:
     shake: float = 0.0
     pasted: int = 0
 
+    def describe(self) -> str:
+        """Describe the course in a few words, as `12 px a frame, turning, zooming`."""
+        words = [f"{self.speed:g} px a frame" if self.speed else "still"]
+        words += ["turning"] * (self.turn > 0) + ["zooming"] * (self.zoom > 0)
+        if self.shake:
+            words.append(f"a shake of {self.shake:g} px")
+        if self.pasted:
+            words.append(f"{self.pasted} objects more that move")
+        return ", ".join(words)
+
 
 COURSES: dict[CourseName, Course] = {
     "still": Course(),

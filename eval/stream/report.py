@@ -79,7 +79,11 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         precisions.append([way, *cells, str(outcomes[0].costs[way].passes), f"{milliseconds:.0f}"])
         listed.append([way, *map(listed_cell, chosen)])
     objects = sum(record["objects"] for group in next(iter(by.values())).values() for record in group)
-    what = "The frames of a film" if course == FILM else f"Course “{course}”, {len(outcomes)} flights"
+    what = (
+        "The frames of a film"
+        if course == FILM
+        else f"Course “{course}” ({outcomes[0].title}), {len(outcomes)} flights"
+    )
     return [
         f"{what}: AP50 of {config.target} at the judged frames, with {objects} annotated objects. ± is the standard "
         "error by bootstrap over flights, and ms are of the processor.",
@@ -191,14 +195,15 @@ def plot_passes(outcomes: Sequence[StreamOutcome], after: int) -> Figure:
     figure = Figure(figsize=(4.2 * len(courses), 4), layout="constrained")
     all_axes = figure.subplots(1, len(courses), sharey=True, squeeze=False)[0]
     for axes, course in zip(all_axes, courses, strict=True):
-        lines = precision_over_passes([outcome for outcome in outcomes if outcome.course == course], after)
+        on_course = [outcome for outcome in outcomes if outcome.course == course]
+        lines = precision_over_passes(on_course, after)
         for way, line in lines.items():
             axes.errorbar(*zip(*line, strict=True), marker="o", capsize=2, label=way)
         counts = sorted({point.passes for line in lines.values() for point in line})
         axes.set_xscale("log")
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.minorticks_off()
-        axes.set(xlabel="passes a frame", title=course, ylim=(0, 1))
+        axes.set(xlabel="passes a frame", title=on_course[0].title, ylim=(0, 1))
     all_axes[0].set_ylabel("AP50")
     all_axes[0].legend(fontsize="small")
     return figure
@@ -216,13 +221,15 @@ def drift_table(outcomes: Sequence[StreamOutcome]) -> list[str]:
     for outcome in outcomes:
         groups[outcome.course].append(outcome)
     rows = [["", "frames", "lost", "mean drift in px", "largest", "ms a frame"]]
-    for course, group in groups.items():
+    for group in groups.values():
         drifts = [outcome.drift for outcome in group]
         pixels = [value for drift in drifts for value in drift.pixels]
         far = [f"{sum(pixels) / len(pixels):.1f}", f"{max(pixels):.1f}"] if pixels else ["-", "-"]
         frames = sum(drift.frames for drift in drifts)
         milliseconds = 1000 * sum(drift.seconds for drift in drifts) / frames
-        rows.append([course, str(frames), str(sum(drift.lost for drift in drifts)), *far, f"{milliseconds:.1f}"])
+        rows.append(
+            [group[0].title, str(frames), str(sum(drift.lost for drift in drifts)), *far, f"{milliseconds:.1f}"]
+        )
     return [
         "The motion by `semfov.motion.CameraMotion`: frames that it found to fit none before, and how far the centre "
         "of a frame has drifted from its known place since the first frame.",

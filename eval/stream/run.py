@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import process_time
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, cast
 
 import torch
 
@@ -99,6 +99,11 @@ class StreamOutcome(NamedTuple):
     costs: Mapping[str, Cost]
     drift: Drift
     identities: Mapping[str, IdentityCounts]
+
+    @property
+    def title(self) -> str:
+        """The course in words."""
+        return FILM if self.course == FILM else COURSES[cast(CourseName, self.course)].describe()
 
 
 class StreamRun:

@@ -19,7 +19,7 @@ from eval.stream.report import (
     precision_over_passes,
     reliability_cells,
 )
-from eval.stream.run import Cost, StreamOutcome, judged_objects
+from eval.stream.run import FILM, Cost, StreamOutcome, judged_objects
 from eval.stream.ways import AllSlices, Oracle, RoundRobin, WholeFrame, whole_and_slices
 from semfov import WindowEye
 from semfov.data.scene import Annotation, Scene
@@ -215,10 +215,21 @@ def test_precision_is_told_by_way_in_the_order_of_passes():
     assert lines["live"][0].error > 0 == lines["live"][1].error
     assert precision_over_passes(outcomes[:1], after=8)["live"][0].error == 0
     figure = plot_passes([*outcomes, outcome("fast", {"live"}, {"live": 1})], after=8)
-    assert [axes.get_title() for axes in figure.axes] == ["still", "fast"]
+    assert [axes.get_title() for axes in figure.axes] == ["still", "30 px a frame"]
     drawn = figure.axes[0].containers[0].lines[0]
     assert [*drawn.get_xdata()] == [1, 2]
     assert [*drawn.get_ydata()] == pytest.approx([0.5, 1], abs=0.01)
+
+
+def test_a_course_is_told_by_what_the_camera_does():
+    """Each course of the study in other words, with its numbers."""
+    words = {name: outcome(name, (), {}).title for name in (*COURSES, FILM)}
+    assert len(set(words.values())) == len(words)
+    assert words["usual"] == "12 px a frame"
+    assert words["turning"] == "12 px a frame, turning, zooming"
+    assert words["shaking"] == "4 px a frame, a shake of 3 px"
+    assert words["moving-slow"] == "4 px a frame, 24 objects more that move"
+    assert words["film"] == FILM
 
 
 def test_a_small_run_writes_its_tables(tmp_path, capsys):
