@@ -200,6 +200,16 @@ def border_of(density: Tensor, share: float) -> float:
     return float(ordered[min(last, len(ordered) - 1)])
 
 
+def percentage_points(difference: float) -> str:
+    """Write the difference of two shares in percentage points, with its sign.
+
+    >>> percentage_points(0.0123), percentage_points(-0.048), percentage_points(-0.0001)
+    ('+1.2', '\N{MINUS SIGN}4.8', '+0.0')
+    """
+    rounded = round(100 * difference, 1) + 0.0  # which has no negative zero
+    return f"{rounded:+.1f}".replace("-", "\N{MINUS SIGN}")
+
+
 def percent(share: float) -> str:
     """Write a share in percent, without a decimal from one percent on.
 

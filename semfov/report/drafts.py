@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from semfov.paths.areas import AreasLike, percent
+from semfov.paths.areas import AreasLike, percent, percentage_points
 from semfov.paths.drafts import Drafts
 from semfov.report.markup import figure_html
 from semfov.viz.drafts import plot_difference
@@ -50,13 +50,13 @@ def _table(drafts: Drafts, areas: AreasLike | None) -> str:
         return ""
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td>{percent(shares.first)}</td><td>{percent(shares.second)}</td>'
-        f"<td>{100 * shares.difference:+.1f}</td></tr>"
+        f"<td>{percentage_points(shares.difference)}</td></tr>"
         for name, shares in drafts.shares(areas).items()
     )
     first, second = (escape(name) for name in drafts.names)
     return (
-        '<div class="wide" tabindex="0" role="region" aria-label="Areas"><table>'
-        "<caption>Share of all fixations in each area</caption>"
+        '<div class="wide" tabindex="0" role="region" aria-label="Areas"><table class="wraps">'
+        "<caption>Share of all fixations in each area; the change is in percentage points</caption>"
         f'<thead><tr><th scope="col">Area</th><th scope="col">{first}</th><th scope="col">{second}</th>'
-        f'<th scope="col">Difference in percentage points</th></tr></thead><tbody>{rows}</tbody></table></div>'
+        f'<th scope="col">Change</th></tr></thead><tbody>{rows}</tbody></table></div>'
     )

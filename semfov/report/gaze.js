@@ -49,7 +49,11 @@ function drawAreas() {
   const unit = Math.max(...picture.size) / 250;
   for (const [words, left, top, right, bottom] of picture.areas) {
     drawn("rect", { class: "area", x: left, y: top, width: right - left, height: bottom - top });
-    write(words, { x: left + 2 * unit, y: top + 8 * unit, "font-size": 7 * unit, "stroke-width": unit });
+    // Above the box, where it hides nothing of it, unless there is no room.
+    const y = top > 10 * unit ? top - 2.5 * unit : top + 8 * unit;
+    // To the side of the picture that has more room for a long name.
+    const [x, anchor] = left + right < picture.size[0] ? [left, "start"] : [right, "end"];
+    write(words, { x, y, "text-anchor": anchor, "font-size": 7 * unit, "stroke-width": unit });
   }
 }
 

@@ -103,7 +103,9 @@ def test_the_figure_and_the_page_have_both_maps_and_what_differs(tmp_path):
     page = path.read_text(encoding="utf-8")
     assert "35 % of the fixations move between the drafts" in page
     difference = 100 * drafts.shares({"right": RIGHT})["right"].difference
-    assert f'<th scope="row">&lt;right&gt;</th><td>40 %</td><td>75 %</td><td>{difference:+.1f}</td>' in page
+    assert f'<th scope="row">&lt;right&gt;</th><td>40 %</td><td>75 %</td><td>+{difference:.1f}</td>' in page
+    fewer = drafts_section(Drafts(drafts.second, drafts.first), {"right": RIGHT})
+    assert f"<td>75 %</td><td>40 %</td><td>\N{MINUS SIGN}{difference:.1f}</td>" in fewer
     assert page.count("<figure>") == 3
     refused("html", drafts.report, tmp_path / "drafts.pdf")
 

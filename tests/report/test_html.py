@@ -18,6 +18,7 @@ from semfov.decision import Decision
 from semfov.detection import Placement
 from semfov.gaze.saliency import FixationDensity
 from semfov.paths import GazePrediction
+from semfov.paths.drafts import Drafts
 from semfov.paths.stimulus import Stimulus, in_bytes
 from semfov.report import notebook, page_html, write_page
 from semfov.report.episode import episode_data
@@ -324,6 +325,37 @@ def test_an_overview_has_shares_of_areas_and_cautions_where_there_are_some():
     assert "caution" not in gaze_page_html("two", [without, without]).split("</section>")[0].split('id="overview"')[1]
     assert 'id="overview"' not in gaze_page_html("one", [with_area])
     assert 'id="overview"' not in gaze_page_html("compared", [without, without], "<section>both</section>")
+
+
+def test_names_of_areas_cover_none_of_them_and_stay_in_the_picture(chromium, tmp_path):  # noqa: F811
+    """Only at the upper border, where there is no room above, is the name in its area."""
+    name = "the button that leads to the shop"
+    areas = {name: (70, 50, 100, 60), "headline": (6, 12, 60, 20), "top": (2, 1, 40, 9)}
+    prediction = predicted("a.png")
+    part = gaze_part(prediction, prediction.scanpaths(2, seed=0), areas)
+    path = write_html(tmp_path / "gaze.html", gaze_page_html("areas", [part]))
+    with watched(chromium, path) as page:
+        picture = page.locator("#drawing").bounding_box()
+        boxes = [each.bounding_box() for each in page.locator("#drawing .area").all()]
+        names = page.locator("#drawing text:not(.order)")
+        assert [text.rpartition(" %")[0].rpartition(" ")[0] for text in names.all_text_contents()] == [*areas]
+        labels = [each.bounding_box() for each in names.all()]
+    for label in labels:
+        assert label["x"] >= picture["x"]
+        assert label["x"] + label["width"] <= picture["x"] + picture["width"]
+    for label, box in zip(labels[:2], boxes[:2], strict=True):
+        assert label["y"] + label["height"] <= box["y"] + 2  # a part of the height is below the letters
+    assert labels[2]["y"] >= boxes[2]["y"] - 2
+
+
+def test_the_table_of_two_drafts_fits_a_telephone(chromium, tmp_path):  # noqa: F811
+    drafts = Drafts(predicted("before-the-new-layout.png"), predicted("after-the-new-layout.png", seed=1))
+    areas = {"the button that leads to the shop": (70, 50, 100, 60), "headline": (6, 12, 60, 20)}
+    path = drafts.report(tmp_path / "drafts.html", areas=areas)
+    with watched(chromium, path) as page:
+        page.set_viewport_size({"width": 390, "height": 844})
+        table = page.locator("table.wraps").bounding_box()
+        assert table["x"] + table["width"] <= 390
 
 
 def test_another_picture_can_be_chosen(opened, hostile):
