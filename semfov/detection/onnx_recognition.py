@@ -13,7 +13,7 @@ from semfov.detection.onnx_signature import Signature
 from semfov.errors import InputError, check
 
 _Outputs = Mapping[str, Tensor]
-"""_Outputs of a model by name, in its order."""
+"""Outputs of a model by name, in its order."""
 
 _OTHER_TASKS = ("segment", "pose", "obb", "classify")
 """Tasks in Ultralytics' metadata whose outputs are other ones than those of detection."""
