@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -34,6 +34,7 @@ from semfov.decision import (
     decide,
     decision_without_closer_looks,
 )
+from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Step, StoredLooks, rollout
 from semfov.episode.stopwatch import Stopwatch
@@ -178,18 +179,14 @@ class DecisionRun(ComparedLooking):
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
-    def _verifier(
-        self, closer: Callable[[tuple[float, ...]], Detections], grid: Grid, target: int, prior: Prior
-    ) -> Verifier[Step]:
-        """Return the closer looks of one search, with a share of the searches whose target is there."""
+    def _verifier(self, grid: Grid, target: int, prior: Prior) -> Verifier[Step]:
+        """Make what decides one search by closer looks, with a share of the searches whose target is there."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
         config = self.config
         thresholds = self.verification.thresholds.changed(config.confirm, config.stop_below, config.place)
         candidates = CandidateCells(grid, target, prior=prior)
-        return Verifier(
-            self.verification, candidates, lambda box: closer(tuple(box.tolist())), thresholds, config.closer
-        )
+        return Verifier(self.verification, candidates, thresholds, config.closer)
 
     def _by_windows(self, source: WindowLooks, search: DrawnSearch, grid: Grid, annotation: Annotation) -> ResultRecord:
         """Return what the agent that looks at windows makes of a search."""
@@ -245,6 +242,10 @@ class DecisionRun(ComparedLooking):
             lambda: photograph_looks(self.eye, lambda: image, grid), store, lambda: self.digest(index)
         )
         source = StoredWindowLooks(self.by_windows, self.scenes, index, None)
+
+        def close_up(box: Tensor) -> Detections:
+            return remembered(tuple(box.tolist()))
+
         for search in searches:
             target, goal = search.target, search.goal
             common = {
@@ -266,7 +267,7 @@ class DecisionRun(ComparedLooking):
             with_prior_of_fit: dict[Observer, tuple[Strategy, Prior]] = {}
             for name, (compared, judge) in self.compared.items():
 
-                def rule(step: Step, judge: _Rule = judge, target: int = target) -> Tensor:
+                def by_thresholds(step: Step, judge: _Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
                 if compared.observer not in with_prior_of_fit:
@@ -274,12 +275,17 @@ class DecisionRun(ComparedLooking):
                     with_prior_of_fit[compared.observer] = compared.with_prior("fit", target)
                 changed, prior = with_prior_of_fit[compared.observer]
                 strategy = Strategy(changed.observer, compared.policy)
-                verifier = self._verifier(remembered, grid, target, prior) if name in self.verified else None
+                verifier = self._verifier(grid, target, prior) if name in self.verified else None
+                rule: Callable[[Step], Tensor] = by_thresholds
+                if verifier is not None:
+                    rule = partial(_by_closer_looks, verifier=verifier, close_up=close_up)
                 with torch.inference_mode():
-                    steps = _search_steps(looks, strategy, target, search.start, search.noise, verifier or rule)
+                    steps = _search_steps(looks, strategy, target, search.start, search.noise, rule)
                     last, path = steps[-1], torch.cat([step.cell for step in steps])
                     if verifier is not None:
-                        decision = verifier.finish()
+                        verifier.end()
+                        verifier.look_closely(close_up)
+                        decision = verifier.final_decision()
                     else:
                         # If a detection at the gaze has ended the search, the target's place is the fixated cell.
                         place = int(last.cell) if judge is at_the_gaze else None
@@ -415,6 +421,13 @@ def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
         means = [sum(column) / len(column) for column in zip(*(pair for pair, _ in group), strict=True)]
         cells += [str(len(group)), " → ".join(f"{value:.3f}" for value in means) or "-"]
     return cells
+
+
+def _by_closer_looks(step: Step, verifier: Verifier[Step], close_up: LookAt) -> Tensor:
+    """Decide after a step `(1,)` and the closer looks that are due then: the number of the outcome, 0 to go on."""
+    verifier.see(step)
+    verifier.look_closely(close_up)
+    return torch.full_like(step.cell, verifier.outcome())
 
 
 def _search_steps(

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from numpy.typing import ArrayLike
@@ -158,19 +159,34 @@ class GazePlan:
             return Viewer(self._viewed.model, self._viewed.terms, grid, first, self._generator)
         return Greedy(drawn_by(self._generator, len(grid), like))
 
-    def criterion(self, grid: Grid, close_up: Callable[[Tensor], Detections]) -> StoppingCriterion:
-        """Make the usual stopping criterion: by closer looks where they are fitted, else by the presence.
-
-        Args:
-            grid: the cells.
-            close_up: looks closely at a box.
-        """
+    def criterion(self, grid: Grid) -> StoppingCriterion:
+        """Make the usual stopping criterion: by closer looks where they are fitted, else by the presence."""
         if self.target is None or self.thresholds is None:
             return StoppingCriterion()
         if self.verification is not None:
             places = CandidateCells(grid, self.target, self.forgetting, self.prior)
-            return ByCloserLooks(Verifier(self.verification, places, close_up, self.thresholds, self.most_closer))
+            return ByCloserLooks(Verifier(self.verification, places, self.thresholds, self.most_closer))
         return ByPresence(grid, self.target, self.thresholds, self.forgetting)
+
+
+class _CloserLook(NamedTuple):
+    """A closer look at a place that seems to hold the target.
+
+    Attributes:
+        cell: cell of the place.
+        region: `[x1, y1, x2, y2]` in pixels, the enlarged window.
+        detections: what it shows, a batch of one.
+        seconds: seconds by stage.
+        value: probability that the target is at the place, before the look.
+        verdict: what the look says of the target.
+    """
+
+    cell: int
+    region: list[float]
+    detections: Detections
+    seconds: dict[str, float]
+    value: float
+    verdict: CloseUp
 
 
 class FoveaGaze:
@@ -179,8 +195,6 @@ class FoveaGaze:
     Args:
         plan: how it moves.
         image: `(1, 3, H, W)`, the picture or the first frame.
-        looked_closely: is called after each closer look with its cell, region, detections, seconds by stage, and the
-            probability of the place before it.
         criterion: makes another stopping criterion than the plan's from the cells; None takes that of the plan.
 
     Attributes:
@@ -194,15 +208,13 @@ class FoveaGaze:
         self,
         plan: GazePlan,
         image: Tensor,
-        looked_closely: Callable[[int, list[float], Detections, dict[str, float], float], object],
         criterion: Callable[[Grid], StoppingCriterion] | None = None,
     ) -> None:
         eye = plan.agent.eye
         self._eye = eye
-        self._looked_closely = looked_closely
         self.image = image
         self.grid = plan.grid(image)
-        self.criterion = plan.criterion(self.grid, self._close_up) if criterion is None else criterion(self.grid)
+        self.criterion = plan.criterion(self.grid) if criterion is None else criterion(self.grid)
         self.step: Step | None = None
         # The belief of one episode is on the CPU, wherever the eye is.
         self._source = LiveLooks(eye, eye.open(image), self.grid, plan.target, device=torch.device("cpu"))
@@ -230,18 +242,18 @@ class FoveaGaze:
             self.criterion.see(step)
         return step
 
-    def _close_up(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)` for the stopping criterion."""
+    def look_closely(self) -> _CloserLook:
+        """Look closely at the candidate of the stopping criterion, of which there must be one."""
         candidate = self.criterion.candidate
         assert candidate is not None
         assert candidate.cell is not None
         watch = Stopwatch()
-        detections = self._eye.close_up(self.image, box)
+        detections = self._eye.close_up(self.image, candidate.box)
         watch.lap("detect")
         size = self.image.shape[-1], self.image.shape[-2]
-        region = window_around(box.to(self.image.dtype), size).tolist()
-        self._looked_closely(candidate.cell, region, detections, watch.seconds, candidate.probability)
-        return detections
+        region = window_around(candidate.box.to(self.image.dtype), size).tolist()
+        verdict = self.criterion.examine(detections)
+        return _CloserLook(candidate.cell, region, detections, watch.seconds, candidate.probability, verdict)
 
 
 class FoveaEpisode(PictureEpisode[Scanpath]):
@@ -266,7 +278,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
         super().__init__(plan.goal, limits)
         eye = plan.agent.eye
         self._trace = Trace(plan.grid(image), self.goal.classes, plan.target, plan.beside, eye.detector.score_threshold)
-        self._gaze = FoveaGaze(plan, image, self._trace.look_closely, criterion)
+        self._gaze = FoveaGaze(plan, image, criterion)
         self._plan = plan
         self._stimulus = Stimulus.of(eye, image)
         self._photograph = reduced_copy(image[0])
@@ -288,7 +300,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
         """Fixate the next cell, or look closely at a place that seems to hold the target."""
         criterion = self._gaze.criterion
         if criterion.candidate is not None:
-            criterion.look()
+            self._look_closely()
         elif not self._fixate():
             return None
         if criterion.outcome and criterion.candidate is None:
@@ -302,11 +314,20 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
             self._trace.add(step)
         return step is not None
 
+    def _look_closely(self) -> None:
+        """Look closely at the place that is due."""
+        look = self._gaze.look_closely()
+        self._trace.look_closely(look.cell, look.region, look.detections, look.seconds, look.value)
+
     def _end(self, limit: Ending | None) -> None:
         step = self._gaze.step
         assert step is not None
         criterion = self._gaze.criterion
-        criterion.end_search(self.limits.room(self.passes) if limit in (None, "passes") else 0)
+        room = self.limits.room(self.passes) if limit in (None, "passes") else 0
+        criterion.end_search()
+        while criterion.candidate is not None and room > 0:
+            self._look_closely()
+            room -= 1
         usual: Ending = "cells" if bool(step.visited.all()) else "shifts"
         self.ending = criterion.ending if criterion.outcome else limit or usual
 
@@ -351,7 +372,6 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         self._gaze: FoveaGaze | None = None  # from the first frame on
         self._pixels = torch.zeros(0)  # of the present frame, as they came
         self._since_fixation = 0.0  # seconds
-        self._closer_look: tuple[int, Detections, dict[str, float]] | None = None  # cell, what it shows, and its time
 
     @property
     def looks(self) -> tuple[FoveaLook, ...]:
@@ -386,22 +406,15 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
     def _look_closely(self, gaze: FoveaGaze, image: Tensor) -> None:
         """Spend a frame on a closer look."""
         gaze.image = image
-        close_up = gaze.criterion.look()
-        assert self._closer_look is not None
-        cell, detections, seconds = self._closer_look
+        look = gaze.look_closely()
         self._passes += 1
-        self._keep(self._made(gaze, cell, detections, seconds, closer=(close_up,)))
-
-    def _keep_closer_look(
-        self, cell: int, region: list[float], detections: Detections, seconds: dict[str, float], value: float
-    ) -> None:
-        self._closer_look = cell, detections, seconds
+        self._keep(self._made(gaze, look.cell, look.detections, look.seconds, closer=(look.verdict,)))
 
     def _fixate(self, image: Tensor) -> None:
         """Spend a frame on a fixation."""
         watch = Stopwatch()
         if self._gaze is None:
-            self._gaze = FoveaGaze(self.plan, image, self._keep_closer_look)
+            self._gaze = FoveaGaze(self.plan, image)
         else:
             self._gaze.show(image, self._since_fixation)
         self._since_fixation = 0.0

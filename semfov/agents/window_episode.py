@@ -22,8 +22,8 @@ from semfov.belief.prior import Prior
 from semfov.data.inputs import Color, ImageLike
 from semfov.data.large import ArrayPicture, open_large
 from semfov.data.windowed import LargePicture
-from semfov.decision import CloseUp, Decision
-from semfov.detection import SCORE_THRESHOLD, Detections, Objects
+from semfov.decision import CandidatePlace, CloseUp, Decision
+from semfov.detection import SCORE_THRESHOLD, Objects
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check
 from semfov.motion import CameraMotion, CameraStep, KnownPoses, LostScene, Motion
@@ -152,7 +152,7 @@ class WindowSession:
             return self._slices()
         if target is not None:
             belief = ZoomBelief(source.lattice, evidence, target, source.blank)
-            self.decisions = decisions_of(belief, self._close_up, task.decisions, self.forgetting)
+            self.decisions = decisions_of(belief, task.decisions, self.forgetting)
             return search_windows(source, belief, forgetting=self.forgetting)
         return find_everything(
             source,
@@ -182,8 +182,7 @@ class WindowSession:
     def look(self) -> KeptLook | None:
         """Look at the next window, or closely at a place that seems to hold the target; None if no window is left."""
         if self.decisions.candidate is not None:
-            self.decisions.look()
-            return self.newest
+            return self._look_closely(self.decisions.candidate)
         step = next(self._steps, None)
         if step is None:
             return None
@@ -195,14 +194,17 @@ class WindowSession:
         self.decisions.see(step, self.passes, self.limits.room(self.passes))
         return step.newest
 
-    def _close_up(self, box: Tensor) -> Detections:
-        """Spend a pass on a closer look at the box `(4,)` of the candidate."""
-        candidate = self.decisions.candidate
-        assert candidate is not None
-        look = KeptLook(look_closely(self.source, box, self._close_window), self.source.time, candidate.probability)
-        self._number(look)
-        self._closer_looks.append(look)
-        return look.original.candidates
+    def _look_closely(self, candidate: CandidatePlace) -> KeptLook | None:
+        """Spend a pass on a closer look at the candidate, unless an earlier look shows it as closely."""
+        detections = self.decisions.shown
+        if detections is None:
+            original = look_closely(self.source, candidate.box, self._close_window)
+            look = KeptLook(original, self.source.time, candidate.probability)
+            self._number(look)
+            self._closer_looks.append(look)
+            detections = original.candidates
+        self.decisions.examine(detections)
+        return self.newest
 
     def _number(self, look: KeptLook) -> None:
         """Give the newest look the number of its pass and the time at its end."""

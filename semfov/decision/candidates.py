@@ -93,7 +93,8 @@ class CandidatePlaces(ABC, Generic[LookType]):
     grid: Grid | None = None
 
     _fixation: int | None = None  # the fixation after which the last closer look was made
-    _index: int | None = None  # the index of the look that the last closer look was, once there is one
+    _next: int = 0  # index of the next look of the search, closer looks included
+    _index: int | None = None  # the index of the look that showed the last place that was examined
 
     def __init__(self, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
         self.forgetting = Forgetting() if forgetting is None else forgetting
@@ -127,13 +128,9 @@ class CandidatePlaces(ABC, Generic[LookType]):
             The place; None if no place is due.
         """
 
-    def is_shown(self, candidate: CandidatePlace) -> bool:
-        """Tell whether an earlier look shows a candidate as closely, so that it is examined without a pass."""
-        return False
-
-    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
-        """Look closely at a candidate; returns the detections, a batch of one, by which it is examined."""
-        return close_up(candidate.box)
+    def shown_at(self, candidate: CandidatePlace) -> Detections | None:
+        """Find what an earlier look shows of a candidate as closely as a closer look would; None where none does."""
+        return None
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place; box `(4,)` of the target in the closer look."""
@@ -158,12 +155,12 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._places.append(_CloserPlace(self._now, box, place))
         return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._index)
 
-    def examine(self, candidate: CandidatePlace, close_up: LookAt) -> tuple[Tensor, Tensor]:
-        """Look closely at a candidate, unless a look showed it so, and dismiss it.
+    def examine(self, candidate: CandidatePlace, detections: Detections) -> tuple[Tensor, Tensor]:
+        """Take in what a look shows closely at a candidate, and dismiss it.
 
         Args:
             candidate: the place.
-            close_up: looks closely at a box.
+            detections: what a closer look shows, a batch of one, or what an earlier look has shown (`shown_at`).
 
         Returns:
             The features `(7,)` of the look (`closer_features`), and the box `(4,)` of the target in it.
@@ -174,12 +171,18 @@ class CandidatePlaces(ABC, Generic[LookType]):
             fitted(self.presence),
             fitted.at_place(candidate.probability, self.presence),
             candidate.evidence,
-            self.look_at(candidate, close_up),
+            self._telling(candidate, detections),
             candidate.box,
             self.target,
         )
         self.dismiss(candidate, box)
         return features, box
+
+    def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
+        """Count the closer look, and choose which of its detections tell of the candidate."""
+        self._index = self._next
+        self._next += 1
+        return detections
 
     def wait(self, passed: float = FRAME) -> None:
         """Let seconds pass, and forget looks and examined places of which less than half the evidence is left."""
@@ -263,7 +266,6 @@ class CandidateCells(CandidatePlaces[Step]):
 
     grid: Grid
     _step: Step
-    _next = 0  # index of the next look, closer looks included
 
     def see(self, look: Step) -> None:
         self._step = look
@@ -322,12 +324,6 @@ class CandidateCells(CandidatePlaces[Step]):
             scores = scores * ~self._are_examined(boxes)
         footprints = torch.cat([look.footprint()[0] for _, look in self._looks])
         return scores[:, None] * footprints
-
-    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
-        """Look closely at a candidate, in the next look of the search."""
-        self._index = self._next
-        self._next += 1
-        return super().look_at(candidate, close_up)
 
     def probability(self, look: CloseUp) -> float:
         """Present probability that the target is in the cell of a closer look."""

@@ -43,11 +43,11 @@ class StoppingCriterion(DecisionState):
     def see(self, step: Step) -> None:
         """Take in a fixation."""
 
-    def end_search(self, room: float = math.inf) -> None:
-        """End the search; closer looks that are due are made while passes remain."""
+    def end_search(self) -> None:
+        """Let no fixation follow; closer looks may come due that are worth a pass at the end."""
 
-    def look(self) -> CloseUp:
-        """Look closely at the candidate, and choose the next one."""
+    def examine(self, detections: Detections) -> CloseUp:
+        """Judge the candidate by what a closer look shows, a batch of one, and choose the next one."""
         raise NotImplementedError
 
     def found_class(self, belief: Belief, target: int) -> int:
@@ -170,21 +170,21 @@ class ByCloserLooks(StoppingCriterion):
         self.verifier = verifier
         self.criterion = verifier.criterion
         self._has_looked = False
-        self._final_decision: Decision | None = None
+        self._has_ended = False
 
     def see(self, step: Step) -> None:
         self._has_looked = True
         self.verifier.see(step)
         self._judge()
 
-    def look(self) -> CloseUp:
-        look = self.verifier.look()
+    def examine(self, detections: Detections) -> CloseUp:
+        look = self.verifier.examine(detections)
         self._judge()
         return look
 
     def _judge(self) -> None:
-        """Decide, unless a closer look is due first."""
-        if self.candidate is None:
+        """Decide whether the search goes on, unless a closer look is due first, or it has ended."""
+        if self.candidate is None and not self._has_ended:
             self.outcome = self.verifier.outcome()
 
     @property
@@ -199,12 +199,12 @@ class ByCloserLooks(StoppingCriterion):
     def decision(self) -> Decision | None:
         if not self._has_looked:
             return None
-        # Once the search has ended, its decision stands, though verdicts may fade.
-        return self.verifier.decision() if self._final_decision is None else self._final_decision
+        return self.verifier.final_decision() if self._has_ended else self.verifier.decision()
 
-    def end_search(self, room: float = math.inf) -> None:
+    def end_search(self) -> None:
         self.outcome = self.verifier.outcome()
-        self._final_decision = self.verifier.finish(room)
+        self._has_ended = True
+        self.verifier.end()
 
     def found_class(self, belief: Belief, target: int) -> int:
         decision = self.decision

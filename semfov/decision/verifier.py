@@ -7,13 +7,12 @@ from functools import partial
 from typing import Generic, NamedTuple
 
 import torch
-from torch import Tensor
 
 from semfov.belief.verification import Verification, follow_target
 from semfov.data.inputs import FRAME
 from semfov.decision.candidates import CandidatePlace, CandidatePlaces, LookAt, LookType
 from semfov.decision.rule import FOUND, GO_ON, OUTCOMES, CloseUp, Decision, final_outcome, found_at_once
-from semfov.episode import Step
+from semfov.detection.detections import Detections
 from semfov.errors import check, check_whole
 from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
@@ -42,15 +41,15 @@ class _JudgedPlace(NamedTuple):
 
 
 class Verifier(Generic[LookType]):
-    r"""Decides one search, with closer looks at the places that seem to hold the target; close_up `(4,)`.
+    r"""Decides one search by looks, and by closer looks at the places that seem to hold the target.
 
-    After each look the verifier names the place that is to be looked at closely (`candidate`), the most evident one, if
-    it is probable enough. The search ends at once with a place that is sure, after `MOST_CLOSER` closer looks with one
-    from `confirm` on, and with the best one when it is over: when no look is worth a pass, or `most` closer looks were
-    made (the table in `semfov.decision`). Where all places are examined (`CandidatePlaces.exhaustive`) none ends it at
-    once, as the next may be surer.
+    It makes no look itself. After each one (`see`) it names the place that is to be looked at closely (`candidate`),
+    the most evident one, if it is probable enough, and is told what a closer look shows (`examine`). The search ends at
+    once with a place that is sure, after `MOST_CLOSER` closer looks with one from `confirm` on, and with the best one
+    when it is over: when no look is worth a pass, or `most` closer looks were made (the table in `semfov.decision`).
+    Where all places are examined (`CandidatePlaces.exhaustive`) none ends it at once, as the next may be surer.
 
-    Closer looks may follow a look at once (`look_closely`), or take frames of their own in a stream (`look`). Their
+    Closer looks may follow a look at once (`look_closely`), or take frames of their own in a stream. Their
     probabilities then fade towards the belief. With the rate r of the candidates' `Forgetting`, after a seconds
 
     .. math:: \operatorname{logit} P_a = e^{-ra} \operatorname{logit} P_0 + (1 - e^{-ra}) \operatorname{logit} B
@@ -73,7 +72,6 @@ class Verifier(Generic[LookType]):
         self,
         model: Verification,
         places: CandidatePlaces[LookType],
-        close_up: LookAt,
         thresholds: Thresholds | None = None,
         most: int = MOST_CLOSER,
     ) -> None:
@@ -83,7 +81,6 @@ class Verifier(Generic[LookType]):
         check_whole(most, "most", 1, 100)
         self.model = model
         self.places = places
-        self.close_up = close_up
         self.thresholds = thresholds
         self.most = most
         self.criterion = f"a closer look gives p {thresholds.confirm:g} there"
@@ -152,10 +149,22 @@ class Verifier(Generic[LookType]):
         look = replace(verdict.look, box=box, cell=self.places.cell(box))
         return verdict._replace(look=look, in_view=True)
 
-    def look(self) -> CloseUp:
-        """Look closely at the candidate, and choose the next one."""
+    @property
+    def shown(self) -> Detections | None:
+        """What an earlier look shows of the candidate as closely; None where that takes a pass, and without one."""
+        return None if self.candidate is None else self.places.shown_at(self.candidate)
+
+    def examine(self, detections: Detections) -> CloseUp:
+        """Judge the candidate by what a look shows closely, and choose the next one.
+
+        Args:
+            detections: detections of the closer look, a batch of one, or those that are `shown`.
+
+        Returns:
+            The closer look, with its probabilities.
+        """
         assert self.candidate is not None
-        features, box = self.places.examine(self.candidate, self.close_up)
+        features, box = self.places.examine(self.candidate, detections)
         with torch.no_grad():
             fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
         prior = self.places.prior
@@ -167,10 +176,11 @@ class Verifier(Generic[LookType]):
         self._choose()
         return look
 
-    def look_closely(self, room: float = math.inf) -> list[CandidatePlace]:
+    def look_closely(self, close_up: LookAt, room: float = math.inf) -> list[CandidatePlace]:
         """Make all closer looks that are due.
 
         Args:
+            close_up: looks closely at a box.
             room: number of passes that remain.
 
         Returns:
@@ -178,16 +188,18 @@ class Verifier(Generic[LookType]):
         """
         examined: list[CandidatePlace] = []
         while self.candidate is not None and len(examined) < room:
-            if not self.places.is_shown(self.candidate):
+            detections = self.shown
+            if detections is None:
                 examined.append(self.candidate)
-            self.look()
+                detections = close_up(self.candidate.box)
+            self.examine(detections)
         return examined
 
-    def __call__(self: "Verifier[Step]", step: Step) -> Tensor:
-        """Decide whether a search ends with a step `(1,)`, after the closer looks, once for every step in order."""
-        self.see(step)
-        self.look_closely()
-        return torch.full_like(step.cell, self.outcome())
+    def end(self) -> None:
+        """Let no look of the search follow: closer looks come due that are worth a pass at the end."""
+        if self.outcome() == GO_ON:
+            self._is_last = True
+            self._choose()
 
     @property
     def is_over(self) -> bool:
@@ -208,16 +220,8 @@ class Verifier(Generic[LookType]):
         """Make the decision of a search that ends as it is, also if a closer look is due."""
         return self._decision(is_over=self.is_over)
 
-    def finish(self, room: float = math.inf) -> Decision:
-        """Finish the search: make the closer looks that are still due, and decide as if no look were worth a pass.
-
-        Args:
-            room: number of passes that remain.
-        """
-        if self.outcome() == GO_ON:
-            self._is_last = True
-            self._choose()
-            self.look_closely(room)
+    def final_decision(self) -> Decision:
+        """Make the decision as if no look were worth a pass."""
         return self._decision(is_over=True)
 
     @property

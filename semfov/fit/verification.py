@@ -242,7 +242,10 @@ def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, T
             candidate = candidates.due(least, last=True)
             if candidate is None:
                 break
-            yield candidates.examine(candidate, search.close_up)
+            detections = candidates.shown_at(candidate)
+            if detections is None:
+                detections = search.close_up(candidate.box)
+            yield candidates.examine(candidate, detections)
 
 
 @torch.inference_mode()
@@ -269,7 +272,7 @@ def verify(
 def _verify_search(search: TargetSearch[LookType], model: Verification, limits: Thresholds) -> VerifiedSearch:
     """Make all closer looks of a search, and decide it without them."""
     places = search.candidates()
-    verifier = Verifier(model, places, search.close_up, limits, search.most)
+    verifier = Verifier(model, places, limits, search.most)
     looks = 0
     ends: list[int] = []
     for index in range(len(search)):
@@ -278,18 +281,19 @@ def _verify_search(search: TargetSearch[LookType], model: Verification, limits: 
         # Where passes are limited, a search ends with them, after the last closer look.
         is_last = index + 1 == len(search) if room == math.inf else room <= 1
         verifier.see(search.look(index, looks), last=is_last)
-        for _ in verifier.look_closely(room):
+        for _ in verifier.look_closely(search.close_up, room):
             looks += 1
             ends.append(looks)
         if verifier.outcome() or looks >= search.passes:
             break
+    verifier.end()
     return VerifiedSearch(
         picture=search.picture,
         present=search.present,
         spare=search.spare,
         places=tuple((look.place, search.right(look.box)) for look in verifier.looks),
         ends=() if places.exhaustive else tuple(ends),
-        presence=verifier.finish(room=0).probability,
+        presence=verifier.final_decision().probability,
         looks=looks,
         unverified=search.unverified(),
     )

@@ -11,7 +11,6 @@ from torch import Tensor
 from semfov.belief.prior import Prior
 from semfov.data.inputs import FRAME
 from semfov.decision import CandidatePlace, CandidatePlaces, CloseUp
-from semfov.decision.candidates import LookAt
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.motion import CameraStep, LostScene, Motion
@@ -122,7 +121,6 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
 
     Private attributes: `_look` is the last look of the search. `_scored` has the boxes of the target that looks have
     shown, where they lie in the present frame, and `_looks` the time of each of these looks, with its number of boxes.
-    `_next` is the index of the next look.
 
     Invariant: `_scored` has the boxes of `_looks`, in their order. `_most_evident`, once it was computed, is that of
     `_scored`, the examined places and the present time. What changes one of these calls `_change`.
@@ -137,7 +135,6 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         super().__init__(forgetting, prior)
         self.target = target
         self.likely = likely
-        self._next = 0
         self._scored = _Scored(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).bool())
         self._lost_boxes: LostScene[_Scored] = LostScene()
 
@@ -188,12 +185,6 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         """Drop what was computed of the looks and the examined places, as these change."""
         self.__dict__.pop("_most_evident", None)
         self.__dict__.pop("_scored_boxes", None)
-
-    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
-        """Look closely at a candidate, in the next look of the path."""
-        self._index = self._next
-        self._next += 1
-        return super().look_at(candidate, close_up)
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place."""
@@ -254,6 +245,13 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         return self.prior.at_place(chance, presence)
 
 
+class _ShownWindow(NamedTuple):
+    """A window of a photograph that was looked at: the number of the look in the path, and what it shows."""
+
+    number: int
+    detections: Detections
+
+
 class PhotographPlaces(CandidateBoxes):
     r"""Places of a photograph, hints among them; all are examined at which the chance of a hit is large enough.
 
@@ -274,12 +272,12 @@ class PhotographPlaces(CandidateBoxes):
         super().__init__(target, 0.0, forgetting, prior)
         self._lattice = lattice
         self._window = window
-        self._shown: dict[Window, tuple[int, Detections]] = {}  # by window, the index of the look and what it shows
+        self._shown: dict[Window, _ShownWindow] = {}
 
     def see(self, look: TargetFacts) -> None:
         """Take in a look at the whole photograph."""
         super().see(look)
-        self._shown[Window.overview(self._lattice)] = look.next_index - 1, look.detections
+        self._shown[Window.overview(self._lattice)] = _ShownWindow(look.next_index - 1, look.detections)
 
     @property
     def hit_chance(self) -> float:
@@ -292,16 +290,18 @@ class PhotographPlaces(CandidateBoxes):
         place = self._most_evident
         return None if place is None or self._hit_chance_at(place) < thresholds.stop_below else place
 
-    def is_shown(self, candidate: CandidatePlace) -> bool:
-        """Whether the window that shows a place was looked at."""
-        return self._showing(candidate) in self._shown
+    def shown_at(self, candidate: CandidatePlace) -> Detections | None:
+        """Find what the look at the window of a place showed; None where there was none."""
+        look = self._shown.get(self._showing(candidate))
+        return None if look is None else look.detections
 
-    def look_at(self, candidate: CandidatePlace, close_up: LookAt) -> Detections:
-        """Look closely at a place, unless its window was looked at; objects that were examined are left out."""
+    def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
+        """Count the look, unless its window was looked at before; objects that were examined are left out."""
         window = self._showing(candidate)
         if window not in self._shown:
-            self._shown[window] = self._next, super().look_at(candidate, close_up)
-        self._index, detections = self._shown[window]
+            super()._telling(candidate, detections)
+            self._shown[window] = _ShownWindow(self._next - 1, detections)
+        self._index = self._shown[window].number
         others = detections.mask & ~self._are_examined(detections.boxes[0])
         # Not a copy with another mask, whose highest scores would be those of what was examined, too.
         return Detections(detections.boxes, detections.scores, others, detections.confidence * others)

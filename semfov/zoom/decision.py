@@ -9,8 +9,8 @@ from torch import Tensor
 
 from semfov.belief.prior import Prior, PriorLike
 from semfov.decision import FOUND, GO_ON, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
-from semfov.decision.candidates import LookAt
 from semfov.decision.state import DecisionState
+from semfov.detection.detections import Detections
 from semfov.episode import Forgetting
 from semfov.motion import CameraStep
 from semfov.observation.matching import inside_frame
@@ -175,8 +175,13 @@ class WindowDecisions(DecisionState):
         """Make the decision of a search that ends as it is, also if a closer look is due."""
         return self.decision
 
-    def look(self) -> None:
-        """Look closely at the candidate, and choose the next one."""
+    @property
+    def shown(self) -> Detections | None:
+        """What an earlier look shows of the candidate as closely; None where that takes a pass, and without one."""
+        return None
+
+    def examine(self, detections: Detections) -> None:
+        """Judge the candidate by what a look shows closely, a batch of one, and choose the next one."""
 
     def wait(self, passed: float) -> None:
         """Let seconds pass. In a stream, call it before every frame."""
@@ -313,14 +318,18 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def looks(self) -> list[CloseUp]:
         return self.verifier.looks
 
-    def look(self) -> None:
-        self.verifier.look()
+    @property
+    def shown(self) -> Detections | None:
+        return self.verifier.shown
+
+    def examine(self, detections: Detections) -> None:
+        self.verifier.examine(detections)
         self._examine_shown()
 
     def _examine_shown(self) -> None:
         """Examine the places that need no pass, and decide."""
-        while self.candidate is not None and self.verifier.places.is_shown(self.candidate):
-            self.verifier.look()
+        while self.shown is not None:
+            self.verifier.examine(self.shown)
         self.outcome = self.verifier.outcome()
 
     @property
@@ -346,13 +355,12 @@ class DecisionsByCloserLooks(DecisionsByPresence):
 
 
 def decisions_of(
-    belief: ZoomBelief, close_up: LookAt, settings: DecisionSettings, forgetting: Forgetting | None = None
+    belief: ZoomBelief, settings: DecisionSettings, forgetting: Forgetting | None = None
 ) -> WindowDecisions:
     """Make the decisions of a search with evidence, by the kind of picture and the settings.
 
     Args:
         belief: the belief of the search, before the first look.
-        close_up: looks closely at a box.
         settings: thresholds, number of closer looks, and prior; None takes what was fitted.
         forgetting: how evidence fades in a stream.
 
@@ -380,7 +388,7 @@ def decisions_of(
     else:
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
     thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.stop_below)
-    verifier = Verifier(verification, places, close_up, thresholds_of_places, most)
+    verifier = Verifier(verification, places, thresholds_of_places, most)
     return DecisionsByCloserLooks(belief, prior, verifier)
 
 

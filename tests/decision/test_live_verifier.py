@@ -152,8 +152,7 @@ def test_evidence_fades_in_the_frame_of_a_closer_look_too():
 
 
 def verifier(scores, rate, **options):
-    closer = Closer(scores)
-    return Verifier(Told(), CandidateCells(GRID, 1, Forgetting(rate)), closer, AT, **options), closer
+    return Verifier(Told(), CandidateCells(GRID, 1, Forgetting(rate)), AT, **options), Closer(scores)
 
 
 def faded(told, here, weight):
@@ -164,10 +163,10 @@ def faded(told, here, weight):
 
 def test_the_verdict_fades_towards_the_belief():
     rate = 2.5
-    judge, _ = verifier({5: SURE}, rate)
+    judge, closer = verifier({5: SURE}, rate)
     judge.see(step(0, {5: 0.6}, [5], 0.5, look(5)))
     judge.wait()
-    told = judge.look()
+    told = judge.examine(closer(judge.candidate.box))
     assert (told.place, told.presence) == (pytest.approx(0.9), pytest.approx(0.45, abs=0.5))
     assert judge.decision().place == told.place
     for number in range(1, 12):
@@ -186,10 +185,10 @@ def test_the_verdict_fades_towards_the_belief():
 def test_a_found_target_is_followed_in_a_scene_that_changes():
     """Box and cell follow the detections; without forgetting, and without a detection, they stay."""
     for rate in (1.25, 0.0):
-        judge, _ = verifier({5: SURE}, rate)
+        judge, closer = verifier({5: SURE}, rate)
         judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
         judge.wait()
-        judge.look()
+        judge.examine(closer(judge.candidate.box))
         box = torch.tensor(box_of(5))
         for shift in (8.0, 16.0, 24.0, 32.0):
             judge.wait()
@@ -215,10 +214,10 @@ def test_a_found_target_is_followed_in_a_scene_that_changes():
 
 
 def test_a_belief_that_rises_does_not_find_a_place_that_was_dismissed():
-    judge, _ = verifier({5: 0.4}, 2.5)
+    judge, closer = verifier({5: 0.4}, 2.5)
     judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
     judge.wait()
-    judge.look()
+    judge.examine(closer(judge.candidate.box))
     for number in range(1, 20):
         judge.wait()
         now = step(number, {5: 0.99}, [0], 0.99)
@@ -230,7 +229,7 @@ def test_a_belief_that_rises_does_not_find_a_place_that_was_dismissed():
 @pytest.mark.parametrize(("rate", "free"), [(2.5, 7), (7.5, 3), (0.0, None)])
 def test_a_place_may_be_examined_again_when_half_of_the_verdict_is_left(rate, free):
     """ln 2 / 2.5 s are 6.9 frames of 25 a second, and ln 2 / 7.5 s 2.3; without forgetting never."""
-    judge, _ = verifier({5: 0.4}, rate)
+    judge, closer = verifier({5: 0.4}, rate)
     examined = []
     for number in range(20):
         judge.wait()
@@ -238,7 +237,7 @@ def test_a_place_may_be_examined_again_when_half_of_the_verdict_is_left(rate, fr
         if judge.candidate is None:
             judge.see(now)
         else:
-            judge.look()
+            judge.examine(closer(judge.candidate.box))
             examined.append(number)
     assert examined[0] == 1
     # The place is free in this frame, which is a look; the frame after it is a closer look.
@@ -251,7 +250,7 @@ def test_a_new_verdict_replaces_the_old_one_of_the_same_place():
     judge, closer = verifier({5: SURE}, 7.5)
     judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
     judge.wait()
-    judge.look()
+    judge.examine(closer(judge.candidate.box))
     closer.scores[5] = 0.4
     for number in range(1, 4):
         judge.wait()
@@ -259,14 +258,14 @@ def test_a_new_verdict_replaces_the_old_one_of_the_same_place():
         judge.see(now)
         assert judge.decision().outcome == "found"
     judge.wait()
-    judge.look()
+    judge.examine(closer(judge.candidate.box))
     assert judge.decision().outcome != "found"
     assert [each.look.place for each in judge.verdicts] == [pytest.approx(0.4)]
 
 
 def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgotten():
     for most in (1, 2):
-        judge, _ = verifier(dict.fromkeys(range(12), 0.3), 2.5, most=most)
+        judge, closer = verifier(dict.fromkeys(range(12), 0.3), 2.5, most=most)
         closely = []
         for number in range(60):
             judge.wait()
@@ -275,7 +274,7 @@ def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgo
             if judge.candidate is None:
                 judge.see(now)
             else:
-                judge.look()
+                judge.examine(closer(judge.candidate.box))
         # A closer look counts for 6 frames after its own.
         assert max(sum(closely[begin : begin + 7]) for begin in range(54)) == most
         assert sum(closely) >= 6 * most

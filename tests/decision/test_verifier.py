@@ -79,17 +79,32 @@ class Closer:
 
 
 def verifier(scores, **options):
-    closer = Closer(scores)
-    return Verifier(Told(), CandidateCells(GRID, 1), closer, options.pop("thresholds", AT), **options), closer
+    return Verifier(Told(), CandidateCells(GRID, 1), options.pop("thresholds", AT), **options), Closer(scores)
+
+
+def outcome_after(judge, look, closer):
+    """The outcome after a look and the closer looks that are due then."""
+    judge.see(look)
+    judge.look_closely(closer)
+    return judge.outcome()
+
+
+def decision_at_the_end(judge, closer):
+    """The decision after the closer looks that are due when no other look follows."""
+    judge.end()
+    judge.look_closely(closer)
+    return judge.final_decision()
 
 
 def test_a_sure_closer_look_ends_the_search_with_its_place():
     judge, closer = verifier({5: 0.9})
-    assert int(judge(step(0, {5: 0.6}, [0], 0.9, look(5)))) == 0  # the most probable cell was not fixated
+    assert (
+        outcome_after(judge, step(0, {5: 0.6}, [0], 0.9, look(5)), closer) == 0
+    )  # the most probable cell was not fixated
     assert closer.cells == []
     last = step(1, {5: 0.6}, [0, 5], 0.9, look(5))
-    assert int(judge(last)) == 1
-    decision = judge.finish()
+    assert outcome_after(judge, last, closer) == 1
+    decision = decision_at_the_end(judge, closer)
     assert (decision.outcome, decision.cell, closer.cells) == ("found", 5, [5])
     assert decision.place == pytest.approx(0.9)
     assert decision.box.tolist() == box_of(5)
@@ -98,12 +113,12 @@ def test_a_sure_closer_look_ends_the_search_with_its_place():
 
 def test_between_confirm_and_sure_the_search_goes_on_and_takes_the_best_place():
     judge, closer = verifier({5: 0.75, 7: 0.8, 2: 0.4}, most=3)
-    assert int(judge(step(0, {5: 0.6, 7: 0.4, 2: 0.35}, [5], 0.9, look(5, 7, 2)))) == 0
+    assert outcome_after(judge, step(0, {5: 0.6, 7: 0.4, 2: 0.35}, [5], 0.9, look(5, 7, 2)), closer) == 0
     assert closer.cells == [5]  # the next best cell was not fixated
     last = step(1, {5: 0.6, 7: 0.5, 2: 0.45}, [5, 7, 2], 0.9)
-    assert int(judge(last)) == 1  # after two closer looks no third one is needed
+    assert outcome_after(judge, last, closer) == 1  # after two closer looks no third one is needed
     assert closer.cells == [5, 7]
-    decision = judge.finish()
+    decision = decision_at_the_end(judge, closer)
     assert (decision.cell, decision.outcome) == (7, "found")
     assert [each.place for each in judge.looks] == pytest.approx([0.75, 0.8])
     assert [each.fixation for each in judge.looks] == [0, 1]
@@ -114,9 +129,9 @@ def test_without_a_confirmed_place_the_presence_decides(presence, outcome):
     judge, closer = verifier({5: 0.01 if presence < 0.5 else 0.6})
     last = step(0, {5: 0.6}, [5], presence, look(5))
     # No other cell is worth a look.
-    assert int(judge(last)) > 1
+    assert outcome_after(judge, last, closer) > 1
     assert closer.cells == [5]
-    decision = judge.finish()
+    decision = decision_at_the_end(judge, closer)
     assert decision.outcome == outcome
     assert (decision.cell, decision.box, decision.place) == (None, None, None)
     assert decision.probability == pytest.approx(judge.looks[0].presence)
@@ -125,26 +140,26 @@ def test_without_a_confirmed_place_the_presence_decides(presence, outcome):
 def test_what_is_probable_enough_is_examined_even_if_not_fixated():
     judge, closer = verifier({9: 0.95}, thresholds=Thresholds(0.7, 0.5, 0.3))
     last = step(0, {9: 0.4, 3: 0.2}, [0], 0.6, look(9, 3))
-    assert int(judge(last)) == 1
+    assert outcome_after(judge, last, closer) == 1
     assert closer.cells == [9]
-    assert judge.finish().cell == 9
+    assert decision_at_the_end(judge, closer).cell == 9
     judge, closer = verifier({9: 0.95}, thresholds=Thresholds(0.7, 0.5, 0.41))
     last = step(0, {9: 0.4}, [9], 0.6, look(9))
-    assert int(judge(last)) > 1
+    assert outcome_after(judge, last, closer) > 1
     assert closer.cells == []
-    assert judge.finish().probability == pytest.approx(0.6)
+    assert decision_at_the_end(judge, closer).probability == pytest.approx(0.6)
 
 
 def test_as_many_closer_looks_as_are_allowed_are_made_also_when_the_shifts_are_spent():
     judge, closer = verifier({5: 0.6, 7: 0.75})
     last = step(0, {5: 0.5, 7: 0.4}, [5], 0.8, look(5, 7))
-    assert int(judge(last)) == 0
+    assert outcome_after(judge, last, closer) == 0
     assert closer.cells == [5]
-    assert judge.finish().cell == 7
+    assert decision_at_the_end(judge, closer).cell == 7
     assert closer.cells == [5, 7]
     for most in (1, 2):
         judge, closer = verifier({5: 0.1, 7: 0.1, 2: 0.1}, most=most)
-        assert int(judge(step(0, {5: 0.6, 7: 0.55, 2: 0.5}, [5, 7, 2], 0.9, look(5, 7, 2)))) > 1
+        assert outcome_after(judge, step(0, {5: 0.6, 7: 0.55, 2: 0.5}, [5, 7, 2], 0.9, look(5, 7, 2)), closer) > 1
         assert len(closer.cells) == most
     for most in (0, 101, 1.5):
         refused("most: expected a whole number", verifier, {}, most=most)

@@ -102,7 +102,7 @@ def test_the_window_shows_the_box_with_its_surroundings_and_lies_in_the_picture(
 
 def test_the_strongest_detection_is_examined_first_and_each_place_once():
     source = Scripted([0.9, 0.1, 0.5], side=27.0)  # boxes of closer looks overlap the others by less than half
-    candidates, closely = CandidateBoxes(1, 0.0), []
+    candidates = CandidateBoxes(1, 0.0)
     looks = [
         seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540], [104.0, 100, 144, 140]], [0.6, 0.8, 0.55]),
         seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]),
@@ -110,16 +110,13 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
     for number, look in enumerate(looks, 1):
         candidates.see(TargetFacts(look.detections, number, 0.9, 0.95, 0.5))
 
-    def close_up(box):
-        closely.append(look_closely(source, box).detections)
-        return closely[-1]
-
     examined = []
     while (candidate := candidates.due(Thresholds(1.0, 0.0), last=True)) is not None:
         odds = [math.log(p / (1 - p)) for p in (0.9, candidate.evidence, 0.95)]
         assert candidate.probability == pytest.approx(1 / (1 + math.exp(odds[2] - odds[0] - odds[1])), abs=1e-5)
-        features, box = candidates.examine(candidate, close_up)
-        expected, at = closer_features(0.9, candidate.probability, candidate.evidence, closely[-1], candidate.box, 1)
+        closely = look_closely(source, candidate.box).detections
+        features, box = candidates.examine(candidate, closely)
+        expected, at = closer_features(0.9, candidate.probability, candidate.evidence, closely, candidate.box, 1)
         assert features.tolist() == expected.tolist()
         assert box.tolist() == at.tolist()
         examined.append((candidate.evidence, *candidate.box[:2].tolist()))
@@ -133,7 +130,7 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
 def verifier(model, scores, most=2):
     """A verifier of the target in class 1."""
     looks = Scripted(scores)
-    return Verifier(model, CandidateBoxes(1, 0.7), lambda box: look_closely(looks, box).detections, AT, most)
+    return Verifier(model, CandidateBoxes(1, 0.7), AT, most), lambda box: look_closely(looks, box).detections
 
 
 def look(number, presence, left, *boxes):
@@ -155,9 +152,9 @@ ONE, OTHER = [100.0, 100, 140, 140], [500.0, 500, 540, 540]
     ],
 )
 def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcome):
-    judge = verifier(FromScore(presence), scores)
+    judge, close_up = verifier(FromScore(presence), scores)
     judge.see(look(5, 0.9, 0.0 if over else 0.5, ONE, OTHER))
-    made = judge.look_closely(9)
+    made = judge.look_closely(close_up, 9)
     assert [each.index for each in judge.looks] == list(range(5, 5 + count))
     assert [round(each.place, 4) for each in judge.looks] == scores
     assert [round(each.probability, 4) for each in made] == [0.9] * count
@@ -170,23 +167,23 @@ def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcom
     ("scores", "outcome"), [([0.7, 0.5], 1), ([0.5, 0.1, 0.3, 0.65], 1), ([0.5, 0.1, 0.3, 0.4], 0)]
 )
 def test_closer_looks_go_on_until_a_place_is_probable_enough(scores, outcome):
-    judge = verifier(FromScore(0.3), list(scores), most=9)
+    judge, close_up = verifier(FromScore(0.3), list(scores), most=9)
     judge.see(look(5, 0.9, 0.5, ONE, OTHER, *([x, 300.0, x + 40, 340] for x in (200.0, 700.0))))
-    judge.look_closely()
+    judge.look_closely(close_up)
     assert [round(each.place, 4) for each in judge.looks] == scores
     assert judge.outcome() == outcome
 
 
 def test_improbable_places_are_examined_only_at_the_end():
     for chance, over, count in ((0.69, False, 0), (0.71, False, 2), (0.21, True, 2), (0.19, True, 0)):
-        judge = verifier(FromScore(), [0.1, 0.1])
+        judge, close_up = verifier(FromScore(), [0.1, 0.1])
         judge.see(look(1, chance, 0.5, ONE, OTHER), last=over)
-        assert len(judge.look_closely(9)) == count
+        assert len(judge.look_closely(close_up, 9)) == count
         assert judge.outcome() == (2 if count else 0)
         assert judge.decision_if_ended_now().outcome == ("absent" if count else "undecided")
-    none_left = verifier(FromScore(), [0.1, 0.1])
+    none_left, close_up = verifier(FromScore(), [0.1, 0.1])
     none_left.see(look(24, 0.9, 0.0, ONE))
-    assert none_left.look_closely(0) == []
+    assert none_left.look_closely(close_up, 0) == []
 
 
 @pytest.mark.parametrize("looks", [0, 1])
@@ -195,10 +192,10 @@ def test_what_the_camera_turns_away_from_is_forgotten_and_found_anew(looks):
     lens = np.array([[600.0, 0, 120], [0, 600, 120], [0, 0, 1]])
     third = cv2.Rodrigues(np.array([0, np.radians(120), 0]))[0]
     motion = Motion(lens @ third @ np.linalg.inv(lens))
-    judge = verifier(FromScore(0.7), [0.8, 0.7])
+    judge, close_up = verifier(FromScore(0.7), [0.8, 0.7])
     judge.see(look(1, 0.9, 0.5, ONE))
     for _ in range(looks):
-        judge.look()
+        judge.examine(close_up(judge.candidate.box))
     for _ in range(3):
         judge.follow(CameraStep(motion), (240, 240))
         assert judge.candidate is None
@@ -407,24 +404,19 @@ def test_a_closer_look_is_due_when_it_is_worth_a_pass():
 def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     boxes = torch.tensor([[[10.0, 10, 180, 140], [60.0, 60, 80, 80]]])
     scores = torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]])
-    places, looked = PhotographPlaces(1, OVER), []
+    places = PhotographPlaces(1, OVER)
     whole = Detections(boxes, scores, torch.ones(1, 2).bool())
     places.see(TargetFacts(whole, 1, 0.8, 0.5, 0.0))
-
-    def close_up(box):
-        looked.append(box)
-        return whole
-
     large = places.due(Thresholds(1.0, 0.1), last=True)
-    assert places.is_shown(large)
-    features, box = places.examine(large, close_up)
+    assert places.shown_at(large) is whole
+    features, box = places.examine(large, whole)
     expected = closer_features(0.8, large.probability, 0.5, whole, large.box, 1)
     assert torch.equal(features, expected[0])
-    assert (looked, places.record(box, 0.4, 0.5).index) == ([], 0)
+    assert places.record(box, 0.4, 0.5).index == 0
     small = places.due(Thresholds(1.0, 0.1), last=True)
-    assert not places.is_shown(small)
-    _, box = places.examine(small, close_up)
-    assert (len(looked), places.record(box, 0.4, 0.5).index) == (1, 1)
+    assert places.shown_at(small) is None
+    _, box = places.examine(small, whole)
+    assert places.record(box, 0.4, 0.5).index == 1
 
 
 @pytest.mark.parametrize(("rate", "passes"), [(0.0, 1), (2.5, 2)])
@@ -437,15 +429,15 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
         looked.append(box.tolist())
         return closely
 
-    judge = Verifier(Alike(), PhotographPlaces(1, OVER, Forgetting(rate)), close_up, AT, most=9)
+    judge = Verifier(Alike(), PhotographPlaces(1, OVER, Forgetting(rate)), AT, most=9)
     judge.see(TargetFacts(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
-    judge.look()
+    judge.examine(close_up(judge.candidate.box))
     # The second place is due in the same frame, and needs no pass; in a later one of a scene that changes it does.
-    assert judge.places.is_shown(judge.candidate)
+    assert judge.shown is closely
     judge.wait()
-    assert judge.places.is_shown(judge.candidate) == (rate == 0)
+    assert (judge.shown is None) == (rate > 0)
     due = judge.candidate
-    assert len(judge.look_closely(1)) == 1
+    assert len(judge.look_closely(close_up, 1)) == 1
     assert looked[0] == boxes[0, 0].tolist()
     assert looked[1] == boxes[0, 3 - passes].tolist()
     second = judge.looks[1]
@@ -460,11 +452,11 @@ def test_a_closer_look_is_not_at_an_object_that_was_examined():
     whole = Detections(boxes, torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
     places.see(TargetFacts(whole, 1, 0.8, 0.5, 0.0))
     one = Detections(boxes[:, :1] + 1, torch.tensor([[[0, 0.9, 0]]]), torch.ones(1, 1).bool())
-    _, box = places.examine(places.due(Thresholds(1.0, 0.1), last=True), lambda box: one)
+    _, box = places.examine(places.due(Thresholds(1.0, 0.1), last=True), one)
     assert torch.equal(box, one.boxes[0, 0])
     second = places.due(Thresholds(1.0, 0.1), last=True)
     assert torch.equal(second.box, boxes[0, 1])
-    features, box = places.examine(second, lambda box: one)
+    features, box = places.examine(second, one)
     nothing = closer_features(0.8, second.probability, 0.3, Detections.empty(1, 2), second.box, 1)
     assert torch.equal(features, nothing[0])
     assert torch.equal(box, second.box)
@@ -476,10 +468,10 @@ def test_the_score_of_an_object_that_was_examined_does_not_count_for_another_pla
     whole = Detections(boxes, torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
     places.see(TargetFacts(whole, 1, 0.8, 0.5, 0.0))
     closely = Detections(boxes + 1, torch.tensor([[[0, 0.9, 0], [0, 0.2, 0]]]), torch.ones(1, 2).bool())
-    places.examine(places.due(Thresholds(1.0, 0.1), last=True), lambda box: closely)
+    places.examine(places.due(Thresholds(1.0, 0.1), last=True), closely)
     second = places.due(Thresholds(1.0, 0.1), last=True)
     assert torch.equal(second.box, boxes[0, 1])
-    features, _ = places.examine(second, lambda box: closely)
+    features, _ = places.examine(second, closely)
     only = Detections(closely.boxes[:, 1:], closely.scores[:, 1:], closely.mask[:, 1:])
     expected, _ = closer_features(0.8, second.probability, 0.3, only, second.box, 1)
     assert torch.equal(features, expected)
@@ -649,9 +641,9 @@ def test_all_objects_of_a_photograph_are_those_of_the_whole_and_of_slices(detect
 
 
 def test_a_place_that_leaves_the_frame_counts_again_when_it_comes_back():
-    judge = verifier(FromScore(0.7), [0.8])
+    judge, close_up = verifier(FromScore(0.7), [0.8])
     judge.see(look(1, 0.9, 0.5, ONE))
-    judge.look()
+    judge.examine(close_up(judge.candidate.box))
     assert judge.decision().outcome == "found"
     out = Motion.similarity(shift=(-125, 0))  # the box reaches from 100 to 140, and its middle to the left of the frame
     judge.follow(CameraStep(out), LATTICE.size)
