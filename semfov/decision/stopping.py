@@ -59,7 +59,10 @@ class StoppingCriterion(DecisionState):
 
 
 class AtGoal(StoppingCriterion):
-    """Ends with the gaze on one of given cells, as the protocol of the paper has it; goal `(X·Y,)` boolean."""
+    """Ends with the gaze on one of given cells, `goal` `(X·Y,)` boolean: the paper's oracle, for one search.
+
+    The studies have it for many searches at once (`semfov.runs.protocols.run_episodes`).
+    """
 
     ending = "box"
 

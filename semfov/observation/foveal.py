@@ -44,7 +44,7 @@ class FovealObservationModel(Pretrained):
     are near zero together. A class prior and τ < 1 help, and each level may have an exponent that multiplies τ. The
     recommended models use `fit_discriminative`, which trains α and π for the posterior itself; `fit_through_belief`
     learns the odds of a miss from searches. The paper gives neither the number of levels nor their borders, nor its
-    treatment of scores of 0: `edges` and `epsilon` are our choice.
+    treatment of scores of 0: `edges` (`semfov.runs.config.SensorConfig.level_edges`) and `epsilon` are our choice.
 
     The logit of a class is linear in the log scores, with weights `τ (α - 1)`. The model with `α_k = 1 + e_k`, τ = 1
     and a uniform prior therefore returns the scores unchanged (`identity`).

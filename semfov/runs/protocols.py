@@ -226,6 +226,8 @@ def run_episodes(
 ) -> list[_Outcome]:
     """Run searches of one scene, each until its target is found or its shifts are spent.
 
+    The target is found when the gaze is on a cell of `Trial.goal`, whatever the belief says: the paper's oracle.
+
     Args:
         episodes: B searches.
         strategy: the observer, and the policy that chooses fixations.
