@@ -1,4 +1,25 @@
-"""Selection of a detector's boxes: threshold, non-maximum suppression, and a limit on their number."""
+"""Selection of a detector's boxes: threshold, non-maximum suppression, and a limit on their number.
+
+What a box counts for by its score, from the faintest on. Each threshold has its value in the room that is named:
+
+    a box from this score on                              threshold
+    ----------------------------------------------------  --------------------------------------------------------------
+    is a hint of where to zoom in, and counts for         `FAINT`, `Detector.faint`
+    `Detections.highest`
+    is a detection: beliefs of a fovea read all of them   `Selection.threshold`, option `threshold` of `load_detector`
+    is a candidate for an object, or is tracked           `FAINTEST` in `semfov.detection.objects`
+    marks a place for a closer look of a head             `_FAINTEST` in `semfov.head.closer`
+    counts as a find of a look at a window                `DETECTION_SCORE` in `semfov.zoom.hints`
+    is counted and drawn with its look                    `CONFIDENT` in `semfov.paths.look`
+    is listed as an object                                `score_threshold` of a task; None: `score_threshold` of the
+                                                          detector for a fovea and a head, and of windows `LIKELY` in
+                                                          `semfov.agents.window_episode` for probabilities, and
+                                                          `SCORE_THRESHOLD` in `semfov.detection.objects` for scores
+    ends a search without fitted models                   `confirm` of a task; None: as in
+                                                          `semfov.agents.fovea` and in `semfov.zoom.decision`
+
+With fitted models probabilities decide a search (`semfov.decision`).
+"""
 
 import math
 from dataclasses import dataclass, replace
