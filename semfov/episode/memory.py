@@ -20,6 +20,19 @@ class Forgetting:
     a fixated cell for :math:`\ln 2 / r` seconds, until half of its evidence is left. If all cells are inhibited, the
     one that was fixated longest ago is free.
 
+    What forgets by it, and where; another law of forgetting changes these:
+
+    - the belief of a fovea or a head: `attend` (`semfov.episode.loop`) calls `Observer.fade` of each observer with
+      `keep` to the power of the seconds that have passed;
+    - detections by which a search decides: after `span` (`semfov.decision.stopping`);
+    - places for closer looks and what these said: scores and probabilities by `keep`, both until `span` or a multiple
+      of it (`semfov.decision.candidates`, `semfov.decision.verifier`, `semfov.zoom.closer`);
+    - looks at windows: after `span`, or when a look replaces them (`semfov.zoom.episode`,
+      `semfov.agents.window_episode`).
+
+    Objects that are tracked have a rate of their own (`TrackingModel.loss`). The default rates are `RATE` in
+    `semfov.agents.fovea` and in `semfov.agents.windows`; a scene for a head has its own `rate`.
+
     Attributes:
         rate: r per second, 0 or more; 0 forgets nothing.
         keep: share of the evidence that is left after a second, :math:`e^{-r}`.
