@@ -1,4 +1,21 @@
-"""How often the target is there: probabilities for another share of searches than that of the fit."""
+"""How often the target is there: probabilities for another share of searches than that of the fit.
+
+Where the `prior` of a search changes its probabilities, and where the share of the fit is kept:
+
+    looks by             changed by                                            share of the fit
+    -------------------  ----------------------------------------------------  -------------------------------------
+    a fovea              `Strategy.with_prior`, by the observer's              `Presence.shares`, by class
+                         `SemanticSearch.with_prior`
+    a head               `HeadAgent.search`, by the same observer              the same
+    windows              `semfov.zoom.decision.decisions_of`                   of a photograph
+                                                                               `PhotographEvidence.shares`, by class;
+                                                                               of a large picture one half
+    closer looks         `semfov.decision.Verifier`, by `CandidatePlaces`,     that of the kind of look
+                         which have the prior of their search
+
+The record keeps what was given (`prior`) and what is assumed (`assumed`), and changes its own decision
+(`Record.probability_at`).
+"""
 
 import math
 import sys
