@@ -1,4 +1,10 @@
-"""The kinds of look of an agent: what each opens of a picture, and the episodes of its tasks."""
+"""The kinds of look of an agent: what each opens of a picture, and the episodes of its tasks.
+
+A new kind has its name, words and drawings in `semfov.kinds`, a class here, and the part of the agent that makes its
+episodes (`AgentParts`, `semfov.agent`). Its record is a subclass of `semfov.paths.Record`, which names the kind and has
+words, a format of its file and data for pages; one that is like a record of another kind is a subclass of that.
+`OpenedPicture.kind` chooses it for `auto`, and `semfov.settings` says which settings mean something to it.
+"""
 
 from abc import ABC, abstractmethod
 from dataclasses import replace

@@ -1,4 +1,9 @@
-"""Fusion rules: update a Dirichlet belief with the likelihoods of detections."""
+"""Fusion rules: update a Dirichlet belief with the likelihoods of detections.
+
+A rule is a function here, which `_rule` registers under its name. `semfov.belief.observers.Semantic` takes it by that
+name, and studies by `BeliefConfig.fusion` (`semfov.runs.config`), whose type lists the names. `SemanticSearch` and
+`SemanticMap` always fuse by Kaplan's rule.
+"""
 
 import math
 from collections.abc import Callable

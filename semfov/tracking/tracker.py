@@ -3,6 +3,10 @@
 tracks ── time passes, the camera moves ──► predicted ── a look at a window ──► seen: place, velocity, more probable
                                                                                 not seen there: less probable
                                                                                 not looked at: as they were
+
+`semfov.agents.window_episode.WindowSession` makes the tracker of a stream, and asks another one for the same: `follow`
+before a frame, `see` after each look, `tracks` for the list, and `model` for the value of looks
+(`semfov.tracking.gain`). The studies compare it with others (`eval.stream`).
 """
 
 from dataclasses import dataclass, replace

@@ -83,6 +83,10 @@ class Observer(nn.Module, ABC):
     A subclass implements `start`, `weigh` and `update`. Only the observer's own `update` reads the result of `weigh`,
     and `weigh` does not depend on the episode, so a look can be weighed once and used by many episodes.
 
+    A look that detects nothing in a cell tells something, too, and each observer says what: `Semantic` nothing, as
+    published, or with `misses` the miss rates of the classes; `SemanticSearch` and `SemanticMap` their odds of a miss.
+    Looks at windows have a belief of their own (`semfov.zoom.belief.ZoomBelief`).
+
     Attributes:
         by_target: whether the evidence of a look depends on the target that is searched for.
 

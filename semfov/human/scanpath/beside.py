@@ -194,7 +194,10 @@ def _entries(people: Fixations | Record | Sequence[Fixations | Record]) -> list[
 
 
 class _Measures:
-    """Measures of the points of a scanpath against those of several others, in a picture of `(width, height)`."""
+    """Measures of the points of a scanpath against those of several others, in a picture of `(width, height)`.
+
+    A new measure is a function of a file beside this one, and a line of `by_name`.
+    """
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
