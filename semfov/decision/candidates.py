@@ -317,7 +317,7 @@ class CandidateCells(CandidatePlaces[Step]):
         faded_scores = []
         for time, look in self._looks:
             scores_of_look = look.detections.scores[0, :, self.target]
-            share = self.forgetting.keep ** (self._now - time)  # of the evidence that is left
+            share = self.forgetting.share_left(self._now - time)
             faded_scores.append(look.detections.mask[0] * (scores_of_look * share))
         scores = torch.cat(faded_scores)
         if self._examined:

@@ -300,7 +300,7 @@ class Verifier(Generic[LookType]):
     def _place(self, verdict: _Verdict) -> float:
         """Probability that the target is still at the place of a closer look."""
         look = verdict.look
-        if self.places.forgetting.keep**verdict.age == 1:
+        if self.places.forgetting.share_left(verdict.age) == 1:
             return look.place
         faded = self._faded(look.place, self.places.probability(look), verdict.age)
         return min(look.place, faded)
@@ -316,7 +316,7 @@ class Verifier(Generic[LookType]):
         Returns:
             The probability whose log odds are the mean of both, weighted by the evidence that is left.
         """
-        weight = self.places.forgetting.keep**age
+        weight = self.places.forgetting.share_left(age)
         if weight == 1:
             return fresh
         logit = weight * _log_odds(fresh) + (1 - weight) * _log_odds(without)

@@ -87,7 +87,7 @@ def attend(
     if forgetting is not None:
         # What was seen before fades first: the new look counts in full.
         age = age + look.passed
-        share_left = forgetting.keep**look.passed
+        share_left = forgetting.share_left(look.passed)
         belief = observer.fade(belief, look.evidence, share_left, forgetting.visited(age))
     belief = observer.update(belief, look.evidence)
     watch.lap("update belief")

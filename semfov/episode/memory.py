@@ -20,13 +20,12 @@ class Forgetting:
     a fixated cell for :math:`\ln 2 / r` seconds, until half of its evidence is left. If all cells are inhibited, the
     one that was fixated longest ago is free.
 
-    What forgets by it, and where; another law of forgetting changes these:
+    What forgets by it:
 
-    - the belief of a fovea or a head: `attend` (`semfov.episode.loop`) calls `Observer.fade` of each observer with
-      `keep` to the power of the seconds that have passed;
-    - detections by which a search decides: after `span` (`semfov.decision.stopping`);
-    - places for closer looks and what these said: scores and probabilities by `keep`, both until `span` or a multiple
+    - the belief of a fovea or a head, by `share_left`: `attend` (`semfov.episode.loop`) calls `Observer.fade`;
+    - scores of looks and probabilities of closer looks, by `share_left`, and both as a whole after `span` or a multiple
       of it (`semfov.decision.candidates`, `semfov.decision.verifier`, `semfov.zoom.closer`);
+    - detections by which a search decides: after `span` (`semfov.decision.stopping`);
     - looks at windows: after `span`, or when a look replaces them (`semfov.zoom.episode`,
       `semfov.agents.window_episode`).
 
@@ -35,24 +34,32 @@ class Forgetting:
 
     Attributes:
         rate: r per second, 0 or more; 0 forgets nothing.
-        keep: share of the evidence that is left after a second, :math:`e^{-r}`.
-        span: seconds for which a fixated cell is inhibited, :math:`\ln 2 / r`.
+        span: seconds after which half of the evidence is left, :math:`\ln 2 / r`.
 
     Raises:
         InputError: `rate` is negative or above 100.
 
-    >>> round(Forgetting(2.5).keep, 3), round(Forgetting(2.5).span, 3)
+    >>> round(Forgetting(2.5).share_left(1.0), 3), round(Forgetting(2.5).span, 3)
     (0.082, 0.277)
     """
 
     rate: float = 0.0
-    keep: float = field(init=False, repr=False, compare=False)
     span: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_number(self.rate, "rate", 0, 100)
-        object.__setattr__(self, "keep", math.exp(-self.rate))
         object.__setattr__(self, "span", math.log(2) / self.rate if self.rate else math.inf)
+
+    def share_left(self, seconds: float) -> float:
+        r"""Compute the share of evidence that is left after some seconds, :math:`e^{-rt}`.
+
+        Args:
+            seconds: t, 0 or more.
+
+        Returns:
+            The share, from 0 to 1.
+        """
+        return math.exp(-self.rate) ** seconds
 
     def visited(self, age: Tensor) -> Tensor:
         """Cells that inhibition of return keeps the gaze from.

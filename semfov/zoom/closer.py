@@ -229,8 +229,7 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     def _scored_boxes(self) -> tuple[Tensor, Tensor]:
         """Boxes `(M, 4)` of the target in view that count, and their scores `(M,)`, faded."""
         boxes, scores, in_view = self._scored
-        keep = self.forgetting.keep
-        shares_left = [keep ** (self._now - time) for time, _ in self._looks]
+        shares_left = [self.forgetting.share_left(self._now - time) for time, _ in self._looks]
         counts = np.array([count for _, count in self._looks], dtype=int)
         share_of_box = np.repeat(shares_left, counts)
         faded_scores = scores * torch.from_numpy(share_of_box).to(scores)
