@@ -68,6 +68,8 @@ class WindowTask:
         batch: number of windows that are chosen jointly and pass the detector together; in a photograph one.
         score_threshold: probability, without evidence score, from which on objects count; None for the usual one.
         detector: name of the detector; None if it is not known.
+        usual_score: score from which on objects count where neither evidence nor `score_threshold` says it
+            (`Detector.score_threshold`).
     """
 
     goal: Goal
@@ -77,6 +79,7 @@ class WindowTask:
     batch: int = 1
     score_threshold: float | None = None
     detector: str | None = None
+    usual_score: float = SCORE_THRESHOLD
 
     def __post_init__(self) -> None:
         if self.evidence is None and self.goal.searches:
@@ -283,9 +286,7 @@ class WindowSession:
         """Probability, or score, from which on objects count."""
         if self.task.score_threshold is not None:
             return self.task.score_threshold
-        if self._certainty is None:
-            return SCORE_THRESHOLD
-        return LIKELY
+        return self.task.usual_score if self._certainty is None else LIKELY
 
     def _merged(self, looks: Sequence[LookAtWindow]) -> MergedLooks:
         """Make what merges the objects of looks when they are asked for; what changes is computed now."""

@@ -150,7 +150,8 @@ class ZoomAgent(nn.Module):
 
         With fitted evidence the scores of objects are the probabilities that box and class are right
         (`semfov.zoom.certainty`), and those from 0.5 on count. Without evidence they are the detector's, and count from
-        0.3 on. In a photograph, and without evidence, slices are looked at, and `min_gain` and `batch` mean nothing.
+        its `score_threshold` on, mostly 0.3. In a photograph, and without evidence, slices are looked at, and
+        `min_gain` and `batch` mean nothing.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
@@ -209,7 +210,8 @@ class ZoomAgent(nn.Module):
         # The evidence computes on the CPU, where the looks are that it reads.
         evidence = None if self.evidence is None else on_cpu(self.evidence)
         goal = Goal.of(self.classes, target, targets)
-        return WindowTask(goal, evidence, detector=self.eye.detector.name, **settings)
+        detector = self.eye.detector
+        return WindowTask(goal, evidence, detector=detector.name, usual_score=detector.score_threshold, **settings)
 
     def episode(self, picture: _Picture, task: WindowTask, limits: EpisodeLimits | None = None) -> WindowEpisode:
         """Make the episode of a picture.

@@ -11,10 +11,9 @@ What a box counts for by its score, from the faintest on. Each threshold has its
     marks a place for a closer look of a head             `_FAINTEST` in `semfov.head.closer`
     counts as a find of a look at a window                `DETECTION_SCORE` in `semfov.zoom.hints`
     is counted and drawn with its look                    `CONFIDENT` in `semfov.paths.look`
-    is listed as an object                                `score_threshold` of a task; None: `score_threshold` of the
-                                                          detector for a fovea and a head, and of windows `LIKELY` in
-                                                          `semfov.agents.window_episode` for probabilities, and
-                                                          `SCORE_THRESHOLD` in `semfov.detection.objects` for scores
+    is listed as an object                                `score_threshold` of a task; None: that of the detector, and
+                                                          for probabilities of windows `LIKELY` in
+                                                          `semfov.agents.window_episode`
     ends a search without fitted models                   `confirm` of a task; None: as in
                                                           `semfov.agents.fovea` and in `semfov.zoom.decision`
 

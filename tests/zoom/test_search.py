@@ -37,6 +37,18 @@ def test_search_finds_a_target_in_the_picture_and_ends_without_one(agent, pictur
     assert path.decision.box is None
 
 
+def test_scores_count_from_where_the_detector_says(agent, picture):
+    """Also where evidence makes no probabilities of them; as the scores of a fovea do."""
+    detector = agent.eye.detector
+    usual = detector.score_threshold
+    detector.score_threshold = 0.2
+    for known in (None, agent.evidence):
+        raw = ZoomAgent(WindowEye(detector), known)
+        assert raw.find_all(picture, "blue", FindSettings(passes=1)).score_threshold == 0.2
+        assert raw.find_all(picture, "blue", FindSettings(passes=1, score_threshold=0.4)).score_threshold == 0.4
+    detector.score_threshold = usual
+
+
 def test_a_record_keeps_its_reduced_picture_and_the_file(agent, picture, tmp_path):
     """However the file is given, also opened."""
     file = tmp_path / "squares.png"
