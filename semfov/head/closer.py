@@ -10,8 +10,8 @@ from semfov.head.belief import SceneBelief
 from semfov.head.gain import OUT, LookGain
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
+from semfov.sensor.glimpse import CONTEXT
 
-_CONTEXT = 3.0  # side of a closer view, in longer sides of the box that it shows
 _MOST = 4  # places that are offered for a look
 _FAINTEST = 0.05  # score from which on a box marks a place
 
@@ -86,7 +86,7 @@ class CloserLookOffers:
 
     def _field_around(self, extent: float) -> float:
         """Choose the narrowest field of view that shows an object of an extent in degrees with its surroundings."""
-        wide_enough = [field for field in self.views.fields if field >= _CONTEXT * extent]
+        wide_enough = [field for field in self.views.fields if field >= CONTEXT * extent]
         return min(wide_enough, default=self.views.fields[-1])
 
     def values(self, belief: SceneBelief, here: int) -> Tensor:

@@ -266,11 +266,11 @@ class Conversion(Outcome, OtherWords):
     def _table(self, table: str) -> tuple[list[Values], list[str]]:
         """Make the rows and the names of the columns of a table."""
         check(table in get_args(_Table), "table", "looks or objects", table)
-        if table == "objects":
-            return self.object_rows(), list(self._columns)
-        rows = self.rows()
+        rows = self.object_rows() if table == "objects" else self.rows()
+        # A table without objects has a head, too.
+        head = self._columns if table == "objects" else ()
         # Looks of one record may have other columns, which stand in the order in which rows first have them.
-        columns = dict.fromkeys(chain.from_iterable(rows))
+        columns = dict.fromkeys([*head, *chain.from_iterable(rows)])
         return rows, list(columns)
 
     def to_supervision(self) -> supervision.Detections:

@@ -10,6 +10,9 @@ from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
 from semfov.sensor.base import stacked_views
 
+CONTEXT = 3.0
+"""Side of the window of a closer look, in longer sides of the box that it shows."""
+
 _Padding = Literal["zeros", "border", "fill"]
 # Pixels of a canvas that are resampled together: with fewer the products are slow, with more they multiply more zeros.
 _TOGETHER = 32
@@ -115,7 +118,7 @@ def edges_at(point: _Length, magnification: _Length, length: _Length) -> tuple[_
     return centre - half, centre + half
 
 
-def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0, least: float = 1 / 3) -> Tensor:
+def window_around(box: Tensor, picture: tuple[int, int], *, context: float = CONTEXT, least: float = 1 / 3) -> Tensor:
     """Compute the window that shows a box closely, with some of its surroundings.
 
     It is moved to lie inside the picture. Where the picture is narrower, it is cut.

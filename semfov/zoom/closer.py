@@ -16,12 +16,10 @@ from semfov.episode import Forgetting
 from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
-from semfov.sensor.glimpse import window_around
+from semfov.sensor.glimpse import CONTEXT, window_around
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
-
-_CONTEXT = 3.0  # side of the window of a closer look, in longer sides of the examined box
 
 USUAL_WINDOW = 0.6, 2.0
 """Least side of that window in a photograph, in longer sides of the photograph, and its side in those of the box."""
@@ -48,7 +46,7 @@ def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = U
     """
     least, context = window
     if lattice.levels > 1:
-        context = _CONTEXT
+        context = CONTEXT
         least = min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
     x1, y1, x2, y2 = window_around(box.double(), lattice.size, context=context, least=least).tolist()
     return Window.around(lattice, (x1, y1, x2, y2))

@@ -339,6 +339,18 @@ def test_every_record_is_written_as_tables_and_as_json(make, tmp_path):
     refused("table: expected looks or objects, got people", record.to_csv, table="people")
 
 
+def test_a_table_of_objects_has_every_column_of_its_rows(monkeypatch):
+    """A new one needs no list of columns; without objects the table has a head all the same."""
+    record = zoom_path()
+    usual = record.object_rows()
+    monkeypatch.setattr(type(record), "object_rows", lambda self: [{**row, "colour": "red"} for row in usual])
+    head, *lines = record.to_csv(table="objects").splitlines()
+    assert head.split(",") == [*usual[0], "colour"]
+    assert [line.split(",")[-1] for line in lines] == ["red"] * len(usual)
+    monkeypatch.setattr(type(record), "object_rows", lambda self: [])
+    assert record.to_csv(table="objects").strip().split(",") == [*usual[0]]
+
+
 @pytest.mark.parametrize("make", RECORDS)
 def test_looks_are_taken_by_number_and_shown_and_drawn_on_a_given_picture(make):
     record = make()
