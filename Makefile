@@ -77,7 +77,7 @@ lab: $(STAMP)
 # Gradio needs an older Pillow than the other tests, so it lies in an environment of its own, on top of theirs. Its own
 # warnings are not errors.
 app: $(GRADIO)/.installed
-	$(GRADIO)/bin/python -m pytest -W default -k telephone tests/cli/test_app.py
+	$(GRADIO)/bin/python -m pytest -W default -k "telephone or http" tests/cli/test_app.py tests/cli/test_app_requests.py
 
 $(GRADIO)/.installed: $(STAMP) .ci/app.txt
 	$(BIN)/python -m venv $(GRADIO)

@@ -21,10 +21,11 @@ from semfov.cli.agent import detector_classes, make_agent
 from semfov.cli.doorkeeper import Doorkeeper, token_for
 from semfov.cli.options import AppOptions
 from semfov.cli.own_looks import SCRIPT, STYLE, TEMPLATE, look_at_cells, scene_json
+from semfov.cli.request_limits import RequestLimits
 from semfov.data import Scene, read_image
 from semfov.data.examples import EXAMPLES, example_scene
 from semfov.data.images import PhotographPicture
-from semfov.errors import DataError, InputError, SemfovError, check_data
+from semfov.errors import DataError, InputError, SemfovError, check, check_data
 from semfov.paths import Record
 from semfov.report.episode import pillow
 from semfov.report.gaze import gaze_page_html, gaze_part
@@ -60,6 +61,7 @@ _SECONDS_SWEPT = 600  # after which those that are older are removed, again and 
 _PICTURE = "one, or an example"  # what is expected
 _READY = "Press *Look*, or give it a picture of your own."
 _NO_PICTURE = "Give it a picture, or take an example."
+_WHAT = "Choose what to do."
 _WHICH = "Choose a class: a search looks for one."
 _CLICK = "Point at the picture to see as the fovea does. Click to look: find “{}” in fewer looks than the agent."
 _WHICH_OWN = "Choose a class in the field *Class*, and look for it here."
@@ -116,7 +118,7 @@ def serve(options: AppOptions) -> int:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["GRADIO_TEMP_DIR"] = folder  # where pictures are while they are looked at
         page = _make_page(agent)
-        address = _launched(page, options.host, options.port, token_for(options.host))
+        address = _launched(page, Path(folder), options.host, options.port, token_for(options.host))
         others = "; elsewhere with this machine's address in place of localhost" if "//localhost" in address else ""
         name = agent.eye.detector.settings()["name"]
         print(f"{name}: open {address} in a browser{others}; Ctrl-C ends it", flush=True)
@@ -127,17 +129,22 @@ def serve(options: AppOptions) -> int:
     return 0
 
 
-def _launched(page: "gradio.Blocks", host: str, port: int | None, token: str | None = None) -> str:
-    """Serve a page, with one look at a time; returns its address, with the token that it asks for."""
+def _launched(page: "gradio.Blocks", folder: Path, host: str, port: int | None, token: str | None = None) -> str:
+    """Serve a page whose pictures are kept in a folder; returns its address, with the token that it asks for."""
     import gradio
     from starlette.middleware import Middleware
 
     look = gradio.themes.Base(font=["system-ui", "sans-serif"], font_mono=["monospace"])  # fonts of this machine
-    page.queue(default_concurrency_limit=1, max_size=_MOST_WAITING)
+    page.queue(default_concurrency_limit=1, max_size=_MOST_WAITING, api_open=False)
     _, address, _ = page.launch(
         server_name=host, server_port=port, prevent_thread_lock=True, share=False, quiet=True,
         show_error=True, head=f"<style>{_STYLE}</style>", theme=look, max_file_size=_MOST_BYTES,
-        app_kwargs={"middleware": [Middleware(Doorkeeper, host=host, token=token)]},
+        app_kwargs={
+            "middleware": [
+                Middleware(Doorkeeper, host=host, token=token),
+                Middleware(RequestLimits, folder=folder, most_bytes=_MOST_BYTES, seconds_kept=_SECONDS_KEPT),
+            ]
+        },
     )  # fmt: skip
     return str(address) if token is None else f"{address}?token={token}"
 
@@ -188,6 +195,8 @@ class _Calls:
         """
         if path is None:
             return _NO_PICTURE, ""
+        if task not in _TASKS:
+            return _WHAT, ""
         if task == "search" and target not in self.classes:
             return _WHICH, ""
         with _errors_on_page():
@@ -251,6 +260,8 @@ class _Calls:
         if not target:
             return cells, "", _WHICH_OWN
         with _errors_on_page():
+            are_numbers = isinstance(point, list | tuple) and all(isinstance(side, int | float) for side in point)
+            check(are_numbers and len(point) == 2, "point", "(x, y) in pixels of the picture", point)
             image = _read(path)
             grid = Grid(self.agent.columns, self.agent.rows, (image.shape[-1], image.shape[-2]))
             cell = int(grid.cell_of(torch.tensor([point]))[0])
@@ -456,6 +467,8 @@ def _connect_person(calls: _Calls, panel: _Panel, views: _Views, usual: "gradio.
     cells = gradio.State([])
     sought = [panel.picture, panel.target, usual]
     shown = [cells, views.own, views.about]
+    # One picture at a time is read for these, and another one for a search.
+    one_at_a_time: dict[str, Any] = {"concurrency_id": "own looks", **_PRIVATE}
     for changed in (panel.picture.change, views.again.click, panel.target.change):
-        changed(fresh, sought, shown, **_PRIVATE)
-    views.own.select(click, [*sought, cells], shown, **_PRIVATE)
+        changed(fresh, sought, shown, **one_at_a_time)
+    views.own.select(click, [*sought, cells], shown, **one_at_a_time)

@@ -7,10 +7,11 @@ from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-_Message = MutableMapping[str, Any]
-_Receive = Callable[[], Awaitable[_Message]]
-_Send = Callable[[_Message], Awaitable[None]]
-_Application = Callable[[_Message, _Receive, _Send], Awaitable[None]]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+Application = Callable[[Message, Receive, Send], Awaitable[None]]
+"""A server, or a layer of one, as ASGI has it."""
 
 _STRANGER = "semfov app: expected the address that the command prints, and its own page\n"
 _NO_TOKEN = "semfov app: expected the whole address that the command prints, with its token\n"
@@ -50,24 +51,23 @@ class Doorkeeper:
 
     # Another page in the same browser can send requests here, also under a name of its own for this address.
 
-    def __init__(self, app: _Application, host: str, token: str | None = None) -> None:
+    def __init__(self, app: Application, host: str, token: str | None = None) -> None:
         self._app = app
         self._host = host
         self._token = token
 
-    async def __call__(self, scope: _Message, receive: _Receive, send: _Send) -> None:
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        headers = {key.decode("latin-1"): value.decode("latin-1") for key, value in scope.get("headers", ())}
-        if not self.admits(headers.get("host", ""), headers.get("origin")):
-            await _refuse(scope, send, 403, _STRANGER)
-        elif self._has_token(headers.get("cookie", "")) or scope.get("path") == _BEGIN:
+        if not self.admits(header(scope, "host"), header(scope, "origin") or None):
+            await refuse(scope, send, 403, _STRANGER)
+        elif self._has_token(header(scope, "cookie")) or scope.get("path") == _BEGIN:
             await self._app(scope, receive, send)
         elif scope["type"] == "http" and self._is_token(_token_of(scope)):
             await self._welcome(send)
         else:
-            await _refuse(scope, send, 401, _NO_TOKEN)
+            await refuse(scope, send, 401, _NO_TOKEN)
 
     def admits(self, address: str, origin: str | None) -> bool:
         """Tell whether a request may enter, by the address that it was sent to and the page that it comes from."""
@@ -109,7 +109,7 @@ class Doorkeeper:
         """Compare a text with the token, in a time that does not tell how much of it is right."""
         return self._token is not None and secrets.compare_digest(text.encode(), self._token.encode())
 
-    async def _welcome(self, send: _Send) -> None:
+    async def _welcome(self, send: Send) -> None:
         """Let the browser keep the token, and open the page under an address without it."""
         cookie = f"{_COOKIE}={self._token}; Path=/; HttpOnly; SameSite=Lax"
         headers = [(b"location", b"/"), (b"set-cookie", cookie.encode()), (b"referrer-policy", b"no-referrer")]
@@ -117,14 +117,35 @@ class Doorkeeper:
         await send({"type": "http.response.body", "body": b""})
 
 
-def _token_of(scope: _Message) -> str:
+def _token_of(scope: Message) -> str:
     """Read the token in the address of a request; empty for none."""
     values = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])
     return values[0]
 
 
-async def _refuse(scope: _Message, send: _Send, status: int, words: str) -> None:
-    """Answer a request that may not enter."""
+def header(scope: Message, name: str) -> str:
+    """Read a header of a request.
+
+    Args:
+        scope: the request.
+        name: in small letters.
+
+    Returns:
+        The last one of the name; empty for none.
+    """
+    values = [value for key, value in scope.get("headers", ()) if key == name.encode()]
+    return str(values[-1].decode("latin-1")) if values else ""
+
+
+async def refuse(scope: Message, send: Send, status: int, words: str) -> None:
+    """Answer a request that may not enter.
+
+    Args:
+        scope: the request.
+        send: sends the answer.
+        status: the status of HTTP.
+        words: the reason.
+    """
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008})
         return

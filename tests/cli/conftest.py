@@ -1,11 +1,14 @@
 """The command `semfov` with the agent of a test."""
 
 import pytest
+import torch
 from PIL import Image
 
-from semfov.cli import jobs, live, main, search
+from semfov.cli import app, jobs, live, main, search
+from semfov.data import Scene
 from semfov.zoom import GlimpseEvidence
 from tests import small
+from tests.small import rand
 
 
 @pytest.fixture
@@ -63,8 +66,24 @@ def large(tmp_path):
 @pytest.fixture
 def evidence():
     """Untrained evidence for large pictures for the detector of squares."""
-    import torch
-
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return GlimpseEvidence(2)
+
+
+def red_scene(name, classes):
+    """An example: a red square on grey noise, which is blurred or sharp."""
+    image = rand(1, 120, 160).expand(3, -1, -1).clone()
+    image[:, 8:28, 8:28] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    return Scene(name, name, image, torch.tensor([[8.0, 8, 28, 28]]), torch.tensor([1]))
+
+
+@pytest.fixture
+def opened(agent, tmp_path, monkeypatch):
+    """Serves the page of the agent of squares, with a token or None; returns its address."""
+    pytest.importorskip("gradio", reason='needs Gradio (pip install "semfov[app]")')
+    monkeypatch.setenv("GRADIO_TEMP_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(app, "example_scene", red_scene)
+    page = app._make_page(agent)
+    yield lambda token: app._launched(page, tmp_path / "kept", "127.0.0.1", None, token)
+    page.close()

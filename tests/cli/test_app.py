@@ -13,14 +13,12 @@ from html import unescape
 from types import ModuleType
 
 import pytest
-import torch
 
 from semfov.cli import app
 from semfov.cli.app import _Calls
 from semfov.cli.main import main
-from semfov.data import Scene, read_image
+from semfov.data import read_image
 from tests import small
-from tests.small import rand
 
 NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((path for name in NAMES if name and (path := shutil.which(name))), None)
@@ -179,24 +177,6 @@ def test_a_visitor_stops_its_own_search(calls, agent, photo, monkeypatch):
     for visitor in ("patient", "impatient"):
         calls.look(str(photo), "red", "explore", 4.0, visitor=visitor)
     assert counts["impatient"] < counts["patient"] == 4
-
-
-def red_scene(name, classes):
-    """An example: a red square on grey noise, which is blurred or sharp."""
-    image = rand(1, 120, 160).expand(3, -1, -1).clone()
-    image[:, 8:28, 8:28] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
-    return Scene(name, name, image, torch.tensor([[8.0, 8, 28, 28]]), torch.tensor([1]))
-
-
-@pytest.fixture
-def opened(agent, tmp_path, monkeypatch):
-    """Serves the page of the agent of squares, with a token or None; returns its address."""
-    pytest.importorskip("gradio", reason='needs Gradio (pip install "semfov[app]")')
-    monkeypatch.setenv("GRADIO_TEMP_DIR", str(tmp_path / "kept"))
-    monkeypatch.setattr(app, "example_scene", red_scene)
-    page = app._make_page(agent)
-    yield lambda token: app._launched(page, "127.0.0.1", None, token)
-    page.close()
 
 
 @pytest.fixture

@@ -1,0 +1,162 @@
+"""What the page of `semfov app` may be asked for: its own addresses, small requests, and files that it was given."""
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from time import time
+from typing import Any
+
+from semfov.cli.doorkeeper import Application, Message, Receive, Send, header, refuse
+
+# Gradio has dozens of other addresses, which fetch pages for a visitor, run functions past the queue or tell the state
+# of the server. The page asks for none of them.
+_READ = {
+    *("/", "/config", "/theme.css", "/favicon.ico", "/manifest.json", "/robots.txt"),
+    *("/gradio_api/info", "/gradio_api/startup-events", "/gradio_api/queue/data", "/gradio_api/upload_progress"),
+}
+_READ_BELOW = ("/static/", "/assets/", "/svelte/", "/gradio_api/heartbeat/")
+_FILE = "/gradio_api/file="
+_CALLS = ("/gradio_api/queue/join", "/gradio_api/run/predict")
+_UPLOAD = "/gradio_api/upload"
+_WRITTEN = {*_CALLS, _UPLOAD, "/gradio_api/cancel", "/gradio_api/reset"}
+
+_MOST_REQUEST = 2**18  # bytes of a request that is no upload
+_FRAME = 2**16  # bytes around the file of an upload
+_MOST_KEPT = 2**31  # bytes of all files of visitors
+
+
+class RequestLimits:
+    """A layer of the server that passes on what its own page asks for, and nothing else.
+
+    A request names only files in the folder of uploads, as the server would open, or fetch, any other.
+
+    Args:
+        app: the server behind it.
+        folder: where the files of visitors are.
+        most_bytes: the largest file.
+        seconds_kept: how long a file is kept, at least.
+    """
+
+    def __init__(self, app: Application, folder: Path, most_bytes: int, seconds_kept: float) -> None:
+        self._app = app
+        self._folder = folder.resolve()
+        self._most_bytes = most_bytes
+        self._seconds_kept = seconds_kept
+
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        refusal = self._refusal(scope)
+        if refusal is None and scope["path"] in _CALLS:
+            body = await _body(receive)
+            receive = _replayed(body, receive)
+            refusal = self._refusal_of_call(body)
+        if refusal is None:
+            await self._app(scope, receive, send)
+        else:
+            await refuse(scope, send, *refusal)
+
+    def _refusal(self, scope: Message) -> tuple[int, str] | None:
+        """Say why a request may not pass, by its head, as a status and words; None for one that may."""
+        path = scope["path"]
+        method = scope.get("method", "")
+        if method in ("GET", "HEAD") and path.startswith(_FILE):
+            return None if self._is_kept(path.removeprefix(_FILE)) else (403, "expected a file of this page\n")
+        if method in ("GET", "HEAD") and (path in _READ or path.startswith(_READ_BELOW)):
+            return None
+        if method == "POST" and path in _WRITTEN:
+            return self._refusal_by_size(scope)
+        return 404, "expected an address of this page\n"
+
+    def _refusal_by_size(self, scope: Message) -> tuple[int, str] | None:
+        """Say why a request is too large, or of unknown size, which browsers never send."""
+        length = header(scope, "content-length")
+        if not (length.isascii() and length.isdigit()) or header(scope, "transfer-encoding"):
+            return 411, "expected the size of the request\n"
+        is_upload = scope["path"] == _UPLOAD
+        most = self._most_bytes + _FRAME if is_upload else _MOST_REQUEST
+        if int(length) > most:
+            return 413, f"expected a maximum of {most:,} bytes\n"
+        if is_upload and self._kept_bytes() + int(length) > _MOST_KEPT:
+            return 503, "too many pictures are kept; give yours in an hour\n"
+        return None
+
+    def _kept_bytes(self) -> int:
+        """Remove old files of visitors, and add up the sizes of the others.
+
+        Uploads that break off leave files behind, of which Gradio does not know.
+        """
+        total = 0
+        for path in self._folder.rglob("*"):
+            try:
+                found = path.stat()
+                if not path.is_file():
+                    continue
+                if found.st_mtime < time() - self._seconds_kept:
+                    path.unlink()
+                else:
+                    total += found.st_size
+            except FileNotFoundError:
+                continue  # Gradio has removed or moved it since
+        return total
+
+    def _refusal_of_call(self, body: bytes) -> tuple[int, str] | None:
+        """Say why a call of a function may not pass, by its arguments."""
+        try:
+            call = json.loads(body, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError):
+            return 400, "expected JSON\n"
+        if not isinstance(call, dict) or len(str(call.get("session_hash"))) > 64:
+            return 400, "expected a call of a function\n"
+        if not all(self._is_kept(path) for path in _paths(call)):
+            return 403, "expected files that this page was given\n"
+        return None
+
+    def _is_kept(self, path: object) -> bool:
+        """Tell whether a path is in the folder of uploads; None names no file."""
+        if path is None:
+            return True
+        try:
+            return isinstance(path, str) and Path(os.path.realpath(path)).is_relative_to(self._folder)
+        except (OSError, ValueError):
+            return False  # a name that no file can have
+
+
+def _refuse_constant(name: str) -> float:
+    """Refuse NaN and infinities, which are no JSON."""
+    raise ValueError(name)
+
+
+def _paths(value: Any) -> Iterator[object]:
+    """List what stands for paths of files in the arguments of a call, at any depth."""
+    waiting = [value]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            if "path" in value:
+                yield value["path"]
+            waiting.extend(value.values())
+        elif isinstance(value, list):
+            waiting.extend(value)
+
+
+async def _body(receive: Receive) -> bytes:
+    """Read the body of a request, whose size has been checked."""
+    parts = []
+    while True:
+        message = await receive()
+        parts.append(message.get("body", b""))
+        if not message.get("more_body"):
+            return b"".join(parts)
+
+
+def _replayed(body: bytes, receive: Receive) -> Receive:
+    """Hand over a body that has been read, and then what comes after it."""
+    waiting = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replay() -> Message:
+        return waiting.pop() if waiting else await receive()
+
+    return replay
