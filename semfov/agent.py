@@ -536,10 +536,9 @@ class ActivePerception(MovableModule):
             DataError: the file of the picture or of the model cannot be read.
         """
         opened = OpenedPicture.of(picture, color, white, bands)
-        image = opened.whole(self.eye.sensor.like)[0]
-        return GazePrediction.of(
-            self.eye, image, model=model, source=opened.path, seen=seen, quality=quality, panorama=opened.is_panorama
-        )
+        image, size = opened.viewed(self.eye.sensor.like)
+        facts: dict[str, Any] = {"source": opened.path, "size": size, "panorama": opened.is_panorama}
+        return GazePrediction.of(self.eye, image, model=model, seen=seen, quality=quality, **facts)
 
     @checked_keywords
     @documented_by(StreamSettings)

@@ -1,5 +1,6 @@
 """The picture that a user gave, opened once: its size, the kinds of look that it allows, and its form for each."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -17,12 +18,16 @@ from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
 from semfov.errors import InputError, SemfovError, check, lookup
+from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import Panorama, World
 from semfov.kinds import KindName
 from semfov.paths import Record
 from semfov.settings import How
 from semfov.zoom.lattice import Lattice
+
+_MOST_WHOLE = 1 << 24  # pixels of a picture of which a prediction of gaze reads all
+_VIEWED = 1024  # pixels along the longer side that a prediction of gaze needs at least, for six views of a detector
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
@@ -127,8 +132,7 @@ class OpenedPicture:
             source = cast(ImageLike, self.source)
             return as_image(source, like=like, argument="picture", color=self.color, white=self.white)[None]
         width, height = self.large.size
-        expected = f"at most {MAX_PIXELS:,} pixels for a fovea"
-        check(width * height <= MAX_PIXELS, "picture", expected, f"{width} × {height}; {SMALLER}")
+        self._check_area(width, height)
         return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
 
     @property
@@ -151,6 +155,38 @@ class OpenedPicture:
         """
         around = self.source.image() if isinstance(self.source, Panorama) else None
         return around.to(like)[None] if isinstance(around, Tensor) else self.image(like)
+
+    def viewed(self, like: Tensor) -> tuple[Tensor, tuple[int, int]]:
+        """Read the pixels that a prediction of gaze needs of a flat picture, or of a panorama.
+
+        A large picture is reduced as it is read: at its full size it would take gigabytes as floats.
+
+        Args:
+            like: as for `image`.
+
+        Returns:
+            `(3, h, w)`, RGB in [0, 1], and `(width, height)` of the picture itself.
+
+        Raises:
+            InputError: it is another scene, or too large to be read as a whole.
+            DataError: the file cannot be read.
+        """
+        if not self.scene and math.prod(self._size()) > _MOST_WHOLE:
+            width, height = self.large.size
+            self._check_area(width, height)
+            reduction = self.large.reduction(max(width, height) / _VIEWED)
+            shape = (max(1, height // reduction), max(1, width // reduction))
+            # Predictions count cells by the size of the picture.
+            if reduction > 1 and cells_of(shape) == cells_of((height, width)):
+                pixels = self.large.read((0, 0, width, height), reduction)
+                return as_image(pixels, like=like, argument="picture"), (width, height)
+        image = self.whole(like)[0]
+        return image, (int(image.shape[-1]), int(image.shape[-2]))
+
+    def _check_area(self, width: int, height: int) -> None:
+        """Raise `InputError` for a picture that is too large for a fovea."""
+        expected = f"at most {MAX_PIXELS:,} pixels for a fovea"
+        check(width * height <= MAX_PIXELS, "picture", expected, f"{width} × {height}; {SMALLER}")
 
     def _is_read_by_windows(self) -> bool:
         """Tell whether the pixels are read by windows, as those of a TIFF are."""

@@ -159,12 +159,13 @@ class _GazeJob:
         """Predict where people look in a picture, and write the density."""
         options = self.options
         source = self.sources[number]
-        image = OpenedPicture.of(source.picture()).image(torch.zeros(1))[0]
+        image, size = OpenedPicture.of(source.picture()).viewed(torch.zeros(1))
         file = None if source.file is None else str(source.file)
         stated_model = None if options.model is None else self.model
         prediction = GazePrediction.of(
-            self.detector, image, model=stated_model, source=file, quality=options.quality, panorama=options.panorama
-        )
+            self.detector, image, model=stated_model, source=file, size=size, quality=options.quality,
+            panorama=options.panorama,
+        )  # fmt: skip
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
         shares = {} if self.areas is None else prediction.share(self.areas)
         outcome: _Outcome = {

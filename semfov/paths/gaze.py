@@ -92,6 +92,7 @@ class GazePrediction(OtherWords):
         *,
         model: FixationDensity | str | PathLike[str] | None = None,
         source: str | None = None,
+        size: tuple[int, int] | None = None,
         seen: ScanpathLike | None = None,
         quality: Quality = "quick",
         panorama: bool = False,
@@ -103,6 +104,7 @@ class GazePrediction(OtherWords):
             image: `(3, H, W)`, RGB in [0, 1].
             model: a model that was fitted to the detector, or its file or folder; None for the one that is shipped.
             source: file of the picture.
+            size: `(width, height)` of the picture, of which `image` may be a reduced copy; None for that of `image`.
             seen: fixations at which the eye has looked, or a record, in any size of the picture, or points in its
                 pixels; the prediction then knows only what the fovea has shown. None for the sharp picture.
             quality: `quick`, one pass; or `best`, six passes, over windows and a mirror image, too.
@@ -120,7 +122,8 @@ class GazePrediction(OtherWords):
         """
         detector = looking.detector if isinstance(looking, Eye) else looking
         fitted = density_for(detector, model)
-        size = int(image.shape[-1]), int(image.shape[-2])
+        size_of_image = int(image.shape[-1]), int(image.shape[-2])
+        size = size or size_of_image
         lookup(quality, get_args(Quality), "quality")
         is_wide = size[0] >= _ROUND * size[1]
         check(is_wide or not panorama, "panorama", "a picture that is at least 1.5 times as wide as high", size)
@@ -135,7 +138,8 @@ class GazePrediction(OtherWords):
             eye = _fovea_of(looking, quality, panorama)
             fixations = fixations_of(seen, "seen", size, source)
             with torch.no_grad():
-                terms = converted.terms(_foveal_features(eye, image, fixations, fitted), size[::-1])
+                on_image = fixations if size == size_of_image else fixations.resized(size_of_image)
+                terms = converted.terms(_foveal_features(eye, image, on_image, fitted), size[::-1])
             # What a fovea has shown is unlike a sharp picture, whatever the picture is.
             unlikeness = None
 

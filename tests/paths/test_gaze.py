@@ -10,7 +10,9 @@ import torch
 from PIL import Image
 from torch.nn import functional as F
 
-from semfov import Eye, Foveation, InputError, foveate
+from semfov import ActivePerception, Eye, Foveation, InputError, foveate
+from semfov.agents.picture import OpenedPicture
+from semfov.data.examples import example_scene
 from semfov.data.fixations import Fixations, read_table, write_table
 from semfov.gaze.saliency import FixationDensity, PictureLikeness
 from semfov.gaze.saliency.likeness import pooled
@@ -386,3 +388,24 @@ def test_the_film_has_a_frame_after_each_fixation(gaze, tmp_path):
     assert not np.array_equal(film.frames[0], film.frames[1])
     assert gaze.animate(tmp_path / "gaze.gif", people=2, duration=0.4).stat().st_size > 1000
     refused("seconds", gaze.animate, seconds=0)
+
+
+def test_a_large_picture_is_predicted_from_a_reduced_copy(tmp_path, monkeypatch):
+    """Its floats would take gigabytes; the prediction is that of the whole picture, in its pixels."""
+    agent = ActivePerception.recommended()
+    photograph = example_scene("market", ["person"]).image
+    height, width = (4 * side for side in photograph.shape[-2:])
+    path = tmp_path / "large.png"
+    pixels = F.interpolate(photograph[None], (height, width), mode="bicubic")[0].clamp(0, 1)
+    Image.fromarray((255 * pixels.permute(1, 2, 0)).byte().numpy()).save(path)
+    seen = [(0.1 * width, 0.7 * height), (0.8 * width, 0.4 * height)]
+    expected = [agent.gaze(path), agent.gaze(path, seen=seen)]
+    monkeypatch.setattr("semfov.agents.picture._MOST_WHOLE", 1000)
+    monkeypatch.setattr("semfov.agents.picture._VIEWED", width / 8)
+    monkeypatch.setattr("semfov.data.windowed._LARGE", 1000)
+    image, size = OpenedPicture.of(path).viewed(torch.zeros(1))
+    assert size == (width, height)
+    assert image.shape[-1] == width // 4
+    for whole, prediction in zip(expected, [agent.gaze(path), agent.gaze(path, seen=seen)], strict=True):
+        assert prediction.size == (width, height)
+        assert 0.5 * (prediction.cells - whole.cells).abs().sum() < 0.15
