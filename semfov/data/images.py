@@ -41,6 +41,7 @@ _FORMATS = ("JPEG", "JPEG2000", "PNG", "WEBP", "AVIF", "HEIF", "TIFF", "GIF", "B
 Pillow knows others, of which some start programs (EPS) or are made of other files.
 """
 
+_TILED = "reduce it, or convert it to a tiled TIFF"  # of which windows are decoded one by one
 SMALLER = "reduce it, or look at it by windows (search, find_all, explore; the largest as a tiled TIFF)"
 """What to do with a picture that is too large to be read as a whole, in words that hold for every command."""
 
@@ -86,7 +87,7 @@ def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: 
         held = Path(path).stat().st_size
         check_proportion(image.size, held, path)
         check_area(image.size, name)
-        check_decoding(image.size, _FLOATS + _halves(image), held, name)
+        check_decoding(image.size, _FLOATS + _halves(image), held, name, SMALLER)
         # Pillow spreads these over 8 or 16 bits, so that what is white is no longer known.
         are_spread = white is not None and image.format == "JPEG2000" and jpeg2000_bits(path) > 8
         check_data(not are_spread, name, f"white=None beside more than 8 bits of JPEG 2000, {_JPEG2000_REMEDY}", white)
@@ -344,7 +345,7 @@ def check_tile(size: int, stored: int, name: str) -> None:
     check_data(not (is_larger or is_smaller), name, f"tiles of {size:,} bytes", got)
 
 
-def check_decoding(size: tuple[int, int], a_pixel: int, held: int, name: str) -> None:
+def check_decoding(size: tuple[int, int], a_pixel: int, held: int, name: str, remedy: str = _TILED) -> None:
     """Raise `DataError` for a picture that takes far more memory than a file of its size should, when it is decoded.
 
     Args:
@@ -352,10 +353,11 @@ def check_decoding(size: tuple[int, int], a_pixel: int, held: int, name: str) ->
         a_pixel: bytes that a pixel takes.
         held: bytes of its file.
         name: of the picture, for the message.
+        remedy: what helps, for the message.
     """
     most = _SMALL_BYTES + _BYTES_A_BYTE * held
     taken = math.prod(size) * a_pixel
-    got = f"{size[0]} × {size[1]}, which take {taken:,}; reduce it, or convert it to a tiled TIFF"
+    got = f"{size[0]} × {size[1]}, which take {taken:,}; {remedy}"
     check_data(taken <= most, name, f"pixels of at most {most:,} bytes, in proportion to the file", got)
 
 

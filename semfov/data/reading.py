@@ -8,6 +8,7 @@ from torch import Tensor
 
 from semfov.data.images import (
     SIXTEEN_BITS,
+    SMALLER,
     check_area,
     check_decoding,
     has_pages,
@@ -56,7 +57,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     if _is_read_by_windows(path, white, oriented):
         picture = open_by_windows(path, white=white)
         check_area(picture.size, f"image {Path(path)}")
-        check_decoding(picture.size, _BYTES_A_PIXEL, Path(path).stat().st_size, f"image {Path(path)}")
+        check_decoding(picture.size, _BYTES_A_PIXEL, Path(path).stat().st_size, f"image {Path(path)}", SMALLER)
         return picture.read((0, 0, *picture.size)).float().div_(255)
     return read_photograph(path, oriented=oriented, white=white)
 

@@ -5,6 +5,7 @@ import struct
 import sys
 import tracemalloc
 import zlib
+from itertools import repeat
 
 import numpy as np
 import pytest
@@ -416,3 +417,15 @@ def png16(array):
 
     head = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 3: 2, 4: 6}[channels], 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows, 1)) + chunk(b"IEND", b"")
+
+
+def test_a_blank_tiled_tiff_is_looked_at_by_windows_as_the_message_says(tmp_path):
+    """It takes next to nothing in the file; read as a whole it would take a gigabyte."""
+    path = tmp_path / "blank.tif"
+    tile = np.full((256, 256, 3), 200, np.uint8)
+    side = 36 * 256
+    layout = {"shape": (side, side, 3), "dtype": "uint8", "tile": (256, 256), "photometric": "rgb"}
+    tifffile.imwrite(path, repeat(tile, 36**2), compression="zlib", **layout)
+    with pytest.raises(DataError, match=r"in proportion to the file, got 9216 × 9216, .*; reduce it, or .* by windows"):
+        read_image(path)
+    assert (open_large(path).read((9000, 9000, 9216, 9216)) == 200).all()
