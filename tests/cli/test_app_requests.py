@@ -18,7 +18,9 @@ SECONDS = 60  # that an answer may take on a busy machine
 def client(opened):
     import httpx
 
-    with httpx.Client(base_url=opened(None), timeout=SECONDS) as client:
+    # The server closes a connection that is not used for five seconds, which is short on a busy machine.
+    anew = httpx.Limits(max_keepalive_connections=0)
+    with httpx.Client(base_url=opened(None), timeout=SECONDS, limits=anew) as client:
         yield client
 
 
