@@ -45,8 +45,8 @@ def suspicions_by_content(
     with task_bar(len(names), "where people look", "picture", hidden=quiet) as bar:
         for name in names:
             with suppress(KeyError, SemfovError):  # a picture that is missing or damaged is named by its size
-                image = OpenedPicture.of(path_of(name)).image(torch.zeros(1))[0]
-                densities[name] = GazePrediction.of(detector, image).cells
+                image, size = OpenedPicture.of(path_of(name)).viewed(torch.zeros(1))
+                densities[name] = GazePrediction.of(detector, image, size=size).cells
                 picture_sizes[name] = sizes[name]
             bar.update()
     return content_suspicions(records, densities, picture_sizes)
