@@ -7,17 +7,19 @@ import argparse
 import json
 import tempfile
 import warnings
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from examples.look_graph import IR_VERSION, OPSET, LookGraph
+from examples.look_graph import IR_VERSION, OPSET, LookGraph, Proposals, Value, constant
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.detection.onnx import OnnxDetector
+from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import Candidates, score_vectors
 from semfov.errors import InputError, SemfovError, check
 from semfov.io.files import replacing
@@ -72,54 +74,75 @@ def export_look(
     """
     try:
         import onnxscript  # noqa: F401 (torch exports with it)
-        from onnx import TensorProto, checker, helper
+        from onnx import checker
     except ImportError as error:
         raise ModuleNotFoundError("exporting a look needs two packages: pip install onnx onnxscript") from error
     detector = eye.detector
-    kinds = len(detector.classes)
     check(cells >= 8 and cells % 8 == 0, "cells", "a multiple of 8", cells)
     if evidence is not None:
-        check(evidence.classes == kinds, "evidence", f"one for {kinds} classes", evidence.classes)
+        count = len(detector.classes)
+        check(evidence.classes == count, "evidence", f"one for {count} classes", evidence.classes)
         evidence.check_compatible(eye.settings())
     graph = LookGraph(detector)
-    canvas, frame, start = graph.window("picture", "fixation")
-    boxes, confidence, vectors = _propose(graph, detector, canvas)
-    on_canvas, scores = graph.selection(boxes, confidence, vectors, detector.selection)
-    placed, cut = graph.placed(on_canvas, frame, "picture")
-    window = graph.add("Slice", frame, graph.constant([0]), graph.constant([4]))
-    outputs: dict[str, tuple[str, list[Any]]] = {
-        "boxes": (placed, ["found", 4]),
-        "scores": (scores, ["found", kinds + 1]),
-        "cut": (cut, ["found"]),
-        "window": (graph.add("Cast", window, to=TensorProto.FLOAT), [4]),
-    }
-    if evidence is not None:
-        faint, values = graph.hints(boxes, confidence, vectors)
-        hints = graph.placed(faint, frame, "picture")[0], values
-        gist = graph.gist(hints, (placed, scores), start, cells, kinds)
-        (rates,) = graph.append(_exported(_Predicting(evidence), *_examples(cells, kinds)), "evidence/", _named(gist))
-        outputs["rates"] = rates, [kinds + 1, STEPS, cells, cells]
-    for name, (value, _) in outputs.items():
-        graph.add("Identity", value, output=name)
-    described = [
-        helper.make_tensor_value_info(name, TensorProto.BOOL if name == "cut" else TensorProto.FLOAT, shape)
-        for name, (_, shape) in outputs.items()
-    ]
-    inputs = [
-        helper.make_tensor_value_info("picture", TensorProto.UINT8, ["height", "width", 3]),
-        helper.make_tensor_value_info("fixation", TensorProto.FLOAT, [3]),
-    ]
-    model = helper.make_model(
-        helper.make_graph(graph.nodes, "look", inputs, described, list(graph.constants.values())),
-        producer_name="semfov",
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-    )
+    model = _model_of(graph, _look(graph, detector, evidence, cells))
     metadata = {"classes": list(detector.classes), "input_size": list(detector.input_size), "cells": cells}
     model.metadata_props.add(key=_LOOK_METADATA_KEY, value=json.dumps(metadata))
     checker.check_model(model)
     with replacing(Path(path)) as temporary:
         temporary.write_bytes(model.SerializeToString())
+
+
+class _Output(NamedTuple):
+    """An output of the exported model: its name, its value, and its shape, with words for sizes that are open."""
+
+    name: str
+    value: Value
+    shape: list[int | str]
+
+
+def _look(graph: LookGraph, detector: Detector, evidence: GlimpseEvidence | None, cells: int) -> list[_Output]:
+    """Add a look to a graph, from its inputs `picture` and `fixation` on; returns the outputs of `export_look`."""
+    classes = len(detector.classes)
+    picture = Value(graph, "picture", torch.uint8)
+    window = graph.window(picture, Value(graph, "fixation", torch.float32))
+    proposals = _propose(graph, detector, window.canvas)
+    on_canvas = graph.select(proposals, detector.selection)
+    detections = on_canvas._replace(boxes=graph.to_picture(on_canvas.boxes, window))
+    outputs = [
+        _Output("boxes", detections.boxes, ["found", 4]),
+        _Output("scores", detections.vectors, ["found", classes + 1]),
+        _Output("cut", graph.cut(on_canvas.boxes, window, picture), ["found"]),
+        _Output("window", window.shown.to(torch.float32), [4]),
+    ]
+    if evidence is not None:
+        hints_on_canvas = graph.hints(proposals)
+        hints = hints_on_canvas._replace(boxes=graph.to_picture(hints_on_canvas.boxes, window))
+        gist = graph.gist(hints, detections, window, cells, classes)
+        nothing = torch.zeros(cells, cells, classes), torch.zeros(cells, cells), torch.zeros(cells, cells, classes)
+        (rates,) = graph.append(_exported(_Predicting(evidence), *nothing), "evidence/", _numbered(gist))
+        outputs.append(_Output("rates", rates, [classes + 1, STEPS, cells, cells]))
+    return outputs
+
+
+def _model_of(graph: LookGraph, outputs: Sequence[_Output]) -> Any:
+    """Make the ONNX model of a graph."""
+    from onnx import TensorProto, helper
+
+    described = []
+    for output in outputs:
+        graph.add("Identity", output.value.name, output=output.name)
+        element = TensorProto.BOOL if output.value.dtype == torch.bool else TensorProto.FLOAT
+        described.append(helper.make_tensor_value_info(output.name, element, output.shape))
+    inputs = [
+        helper.make_tensor_value_info("picture", TensorProto.UINT8, ["height", "width", 3]),
+        helper.make_tensor_value_info("fixation", TensorProto.FLOAT, [3]),
+    ]
+    return helper.make_model(
+        helper.make_graph(graph.nodes, "look", inputs, described, list(graph.constants.values())),
+        producer_name="semfov",
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+    )
 
 
 class _Proposing(nn.Module):
@@ -138,7 +161,8 @@ class _Decoding(nn.Module):
 
     def __init__(self, detector: OnnxDetector, names: list[str]) -> None:
         super().__init__()
-        self.detector, self.names = detector, names
+        self.detector = detector
+        self.names = names
 
     def forward(self, *outputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         by_name = dict(zip(self.names, outputs, strict=True))
@@ -162,37 +186,27 @@ def _columns(candidates: Candidates, detector: Detector) -> tuple[Tensor, Tensor
     return candidates.boxes, candidates.confidence, score_vectors(candidates, detector.background)
 
 
-def _propose(graph: LookGraph, detector: Detector, canvas: str) -> tuple[str, str, str]:
-    """Boxes `(1, N, 4)`, confidence `(1, N)` and score vectors `(1, N, K+1)` of a canvas."""
-    wide, high = detector.input_size
+def _propose(graph: LookGraph, detector: Detector, canvas: Value) -> Proposals:
+    """Add the detector to a graph, for a canvas `(1, 3, h, w)`."""
     if isinstance(detector, OnnxDetector):
         outputs = _network(graph, detector, canvas)
-        raw = detector.session.probe(detector.input_size)
-        decoding = _exported(_Decoding(detector, list(raw)), *raw.values())
-        proposals = graph.append(decoding, "head/", _named(outputs))
+        examples = detector.session.probe(detector.input_size)
+        decoding = _exported(_Decoding(detector, list(examples)), *examples.values())
+        columns = graph.append(decoding, "head/", _numbered(outputs))
     else:
-        proposals = graph.append(
-            _exported(_Proposing(detector), torch.zeros(1, 3, high, wide)), "detector/", {"x_0": canvas}
-        )
-    boxes, confidence, vectors = proposals
-    return boxes, confidence, vectors
+        width, height = detector.input_size
+        proposing = _exported(_Proposing(detector), torch.zeros(1, 3, height, width))
+        columns = graph.append(proposing, "detector/", _numbered([canvas]))
+    return Proposals(*columns)
 
 
-def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]:
-    """Add the network in a detector's file to the graph, for a canvas; returns its outputs."""
+def _network(graph: LookGraph, detector: OnnxDetector, canvas: Value) -> list[Value]:
+    """Add the network in a detector's file to a graph, for a canvas; returns its outputs."""
     import onnx
     from onnx import version_converter
 
-    preprocessing = detector.preprocessing
-    if preprocessing.channels == "bgr":
-        canvas = graph.add("Gather", canvas, graph.constant([2, 1, 0]), axis=1)
-    factor, shift = (
-        torch.tensor([value / std for value, std in zip(values, preprocessing.std, strict=True)]).view(1, 3, 1, 1)
-        for values in ([preprocessing.scale] * 3, preprocessing.mean)
-    )
-    image = graph.add("Sub", graph.add("Mul", canvas, graph.constant(factor)), graph.constant(shift))
     model = onnx.load(detector.session.path)
-    constants = {constant.name for constant in model.graph.initializer}
+    constants = {tensor.name for tensor in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in constants]
     if len(inputs) != 1 or detector.session.shape[0] not in (None, 1):
         names = ", ".join(f"{value.name!r}" for value in inputs)
@@ -202,9 +216,21 @@ def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]
     except Exception as error:  # the converter raises errors of many kinds
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"detector: expected a model that converts to opset {OPSET}, got {reason}") from error
-    image = graph.add("Cast", image, to=inputs[0].type.tensor_type.elem_type)
+    image = _preprocessed(graph, detector.preprocessing, canvas)
+    image = image.node("Cast", to=inputs[0].type.tensor_type.elem_type)
     outputs = graph.append(model, "network/", {inputs[0].name: image})
-    return [graph.add("Cast", output, to=onnx.TensorProto.FLOAT) for output in outputs]
+    return [output.to(torch.float32) for output in outputs]
+
+
+def _preprocessed(graph: LookGraph, preprocessing: Preprocessing, canvas: Value) -> Value:
+    """Add `(canvas · scale - mean) / std` to a graph, with the channels in the network's order."""
+    if preprocessing.channels == "bgr":
+        canvas = canvas.take(constant(graph, torch.tensor([2, 1, 0])), axis=1)
+    factor = [preprocessing.scale / std for std in preprocessing.std]
+    shift = [mean / std for mean, std in zip(preprocessing.mean, preprocessing.std, strict=True)]
+    by_channel = (1, 3, 1, 1)
+    scaled = canvas * constant(graph, torch.tensor(factor).view(by_channel))
+    return scaled - constant(graph, torch.tensor(shift).view(by_channel))
 
 
 def _exported(module: nn.Module, *inputs: Tensor) -> Any:
@@ -228,12 +254,9 @@ def _exported(module: nn.Module, *inputs: Tensor) -> Any:
         return onnx.load(path)
 
 
-def _named(values: Any) -> dict[str, str]:
+def _numbered(values: Iterable[Value]) -> dict[str, Value]:
+    """Name the values that a module of `_exported` reads."""
     return {f"x_{number}": value for number, value in enumerate(values)}
-
-
-def _examples(cells: int, classes: int) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.zeros(cells, cells, classes), torch.zeros(cells, cells), torch.zeros(cells, cells, classes)
 
 
 def main() -> None:
@@ -248,9 +271,11 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=32, help="cells along a side of the window, for the evidence")
     options = parser.parse_args()
     try:
-        detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
+        weights = {} if options.weights is None else {"weights": options.weights}
+        detector = load_detector(options.detector, **weights)
         evidence = None if options.evidence is None else GlimpseEvidence.from_pretrained(options.evidence)
-        export_look(WindowEye(detector, stretch=False).eval(), options.output, evidence, cells=options.cells)
+        eye = WindowEye(detector, stretch=False).eval()
+        export_look(eye, options.output, evidence, cells=options.cells)
     except SemfovError as error:
         parser.exit(1, f"error: {error}\n")
     print(f"written: {options.output}")
