@@ -45,6 +45,43 @@ class _Layout(NamedTuple):
         return _Layout(self.axis.to(device), *(values.to(device, dtype) for values in numbers))
 
 
+class _Sides(NamedTuple):
+    """Sides of boxes beside lines of cells, along the axis of each line: first the X columns, then the Y rows.
+
+    A box and a cell relate along both axes, so both are computed at once, `(..., L, X+Y)`.
+
+    Attributes:
+        lower: lower side of each box.
+        upper: its upper side.
+        start: where each line begins.
+        end: where it ends.
+        middle: its middle.
+        half: half its width.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    start: Tensor
+    end: Tensor
+    middle: Tensor
+    half: Tensor
+
+    def overlap(self) -> Tensor:
+        """Tell which lines share a positive length with which boxes."""
+        return (self.start < self.upper) & (self.end > self.lower) & (self.upper > self.lower)
+
+    def holds_middle(self) -> Tensor:
+        """Tell which boxes hold the middle of which lines."""
+        return (self.middle >= self.lower) & (self.middle < self.upper)
+
+    def log_weight(self) -> Tensor:
+        """Compute the part of one axis in ln w, `-x² / (2 (a² + u²) / 3)`, of the rule `soft`."""
+        centre = (self.lower + self.upper) / 2
+        half_box = (self.upper - self.lower) / 2
+        offset = (self.middle - centre) / torch.hypot(half_box, self.half)
+        return -1.5 * offset.square()
+
+
 @dataclass(frozen=True)
 class Grid:
     """`columns` × `rows` equal cells over an image, numbered row by row: `cell = row * columns + column`.
@@ -175,28 +212,29 @@ class Grid:
         check_finite(boxes, "boxes")
         lookup(rule, get_args(Footprint), "footprint rule")
         boxes = as_positions(boxes)
-        layout = self._layout(boxes)
-        # Both axes at once: for each line of cells the sides of the boxes along its axis.
-        lower = boxes.index_select(-1, layout.axis)
-        upper = boxes.index_select(-1, layout.axis + 2)
-        lines = (layout.start, layout.end, layout.middle, layout.half)
-        start, end, middle, half = (line if line.ndim == 1 else line[:, None] for line in lines)
-        if rule in ("overlap", "soft"):
-            shares_length = (start < upper) & (end > lower) & (upper > lower)
-            shared = self._in_cells(shares_length, torch.logical_and)
-            if rule == "overlap":
-                return shared
-            # x / √(a² + u²) of the formula, with a factor of 3/2 in the exponent.
-            centre = (lower + upper) / 2
-            offset = (middle - centre) / torch.hypot((upper - lower) / 2, half)
-            return self._in_cells(-1.5 * offset.square(), torch.add).exp() * shared
+        sides = self._sides(boxes)
+        if rule == "overlap":
+            return self._in_cells(sides.overlap(), torch.logical_and)
+        if rule == "soft":
+            shared = self._in_cells(sides.overlap(), torch.logical_and)
+            return self._in_cells(sides.log_weight(), torch.add).exp() * shared
         box_centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
         central_cell = self.cell_of(box_centre)
         covered = central_cell[..., None] == torch.arange(len(self), device=boxes.device)
         if rule == "centre":
-            inside = self._in_cells((middle >= lower) & (middle < upper), torch.logical_and)
+            inside = self._in_cells(sides.holds_middle(), torch.logical_and)
             covered = inside | (covered & ~inside.any(-1, keepdim=True))
-        return covered & self._in_cells(upper > lower, torch.logical_and)
+        has_area = self._in_cells(sides.upper > sides.lower, torch.logical_and)
+        return covered & has_area
+
+    def _sides(self, boxes: Tensor) -> "_Sides":
+        """Put the sides of boxes `(..., L, 4)` beside the lines of cells."""
+        layout = self._layout(boxes)
+        lines = (layout.start, layout.end, layout.middle, layout.half)
+        start, end, middle, half = (line if line.ndim == 1 else line[:, None] for line in lines)
+        lower = boxes.index_select(-1, layout.axis)
+        upper = boxes.index_select(-1, layout.axis + 2)
+        return _Sides(lower, upper, start, end, middle, half)
 
     def _in_cells(self, lines: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Join the values of the columns and rows `(..., X+Y)` in every cell, `(..., X·Y)`."""
