@@ -80,29 +80,11 @@ class OculomotorBias(nn.Module):
         saccade = places - last[:, None]  # (B, N, 2)
         length = _norm(saccade)
         direction = saccade / length[..., None].clamp(min=1e-9)
-        cos, sin = direction.unbind(-1)
-        # Of twice and four times the angle, by the formulas of the double angle.
-        cos2 = cos.square() - sin.square()
-        sin2 = 2 * cos * sin
-        cos4 = cos2.square() - sin2.square()
-        sin4 = 2 * cos2 * sin2
-        directions = (torch.ones_like(cos), cos, sin, cos2, sin2, cos4, sin4)
-
-        # The turn τ from the saccade before, of which a path of one fixation has none.
-        step = torch.where(before.isnan(), 0.0, last - before)
-        unit = step / _norm(step)[:, None].clamp(min=1e-9)
-        cos_before, sin_before = unit[:, None].unbind(-1)  # (B, 1)
-        cos_turn = cos * cos_before + sin * sin_before
-        cos_2_turn = 2 * cos_turn.square() - 1
-        cos_3_turn = 4 * cos_turn**3 - 3 * cos_turn
-        has_turn = (~before[:, :1].isnan()).to(cos_turn)
-        turns = (has_turn * cos_turn, has_turn * cos_2_turn, has_turn * cos_3_turn)
-
         tables = torch.cat([self.saccade, self.turn])
         # A table that is interpolated linearly is its first value and the shares of its steps that were passed.
         by_length = tables[:, :1] + tables.diff(dim=1) @ _passed(_LENGTHS, length)  # (B, tables, N)
-        angles = torch.stack([*directions, *turns], -2)
-        return by_length.mul(angles).sum(-2)
+        by_angle = torch.stack([*_of_direction(direction), *_of_turn(direction, last - before)], -2)
+        return by_length.mul(by_angle).sum(-2)
 
     def _refixation_bias(self, path: Tensor, places: Tensor, bias: Tensor) -> Tensor:
         """Add to a bias that of the distance of every place to the fixations before the last one.
@@ -142,6 +124,32 @@ class OculomotorBias(nn.Module):
             `(B, 2)`.
         """
         return self.gain.t()[(number - 1).clamp(0, _NUMBERS - 1)]
+
+
+def _of_direction(direction: Tensor) -> list[Tensor]:
+    """Compute φ of unit vectors `(B, N, 2)`: 1, cos θ, sin θ, cos 2θ, sin 2θ, cos 4θ and sin 4θ."""
+    cos, sin = direction.unbind(-1)
+    cos2 = cos.square() - sin.square()
+    sin2 = 2 * cos * sin
+    cos4 = cos2.square() - sin2.square()
+    sin4 = 2 * cos2 * sin2
+    return [torch.ones_like(cos), cos, sin, cos2, sin2, cos4, sin4]
+
+
+def _of_turn(direction: Tensor, before: Tensor) -> list[Tensor]:
+    """Compute cos τ, cos 2τ and cos 3τ of the turns to unit vectors `(B, N, 2)` from the saccades before, `(B, 2)`.
+
+    They are 0 where there is no saccade before, which is NaN.
+    """
+    step = torch.where(before.isnan(), 0.0, before)
+    unit = step / _norm(step)[:, None].clamp(min=1e-9)
+    cos, sin = direction.unbind(-1)
+    cos_before, sin_before = unit[:, None].unbind(-1)  # (B, 1)
+    cos_turn = cos * cos_before + sin * sin_before
+    cos_2_turn = 2 * cos_turn.square() - 1
+    cos_3_turn = 4 * cos_turn**3 - 3 * cos_turn
+    has_turn = (~before[:, :1].isnan()).to(cos_turn)
+    return [has_turn * cos_turn, has_turn * cos_2_turn, has_turn * cos_3_turn]
 
 
 def _norm(vectors: Tensor) -> Tensor:
