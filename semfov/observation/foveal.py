@@ -155,8 +155,8 @@ class FovealObservationModel(Pretrained):
         if rates is not None:
             are_probabilities = bool(((rates >= 0) & (rates <= 1)).all())
             check(are_probabilities, "miss_rate", "probabilities", "numbers outside [0, 1]")
-        odds = _table(miss_odds, "miss_odds", by_class_and_level, alpha)
-        powers = _table(exponents, "exponents", (levels,), alpha)
+        odds = _positive_table(miss_odds, "miss_odds", by_class_and_level, alpha)
+        powers = _positive_table(exponents, "exponents", (levels,), alpha)
         if powers is None:
             powers = alpha.new_ones(levels)
         rho = torch.as_tensor(refutation).detach().to(alpha).clone()
@@ -522,12 +522,17 @@ def _checked_log_cell(cell: Sequence[float] | Tensor, like: Tensor) -> Tensor:
 
 
 def _table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor) -> Tensor | None:
-    """Check a table that may be left out, and copy it; odds and exponents must be positive."""
+    """Check a table that may be left out, and copy it."""
     if table is None:
         return None
     check(tuple(table.shape) == shape, name, f"shape {shape}", tuple(table.shape))
     check_finite(table, name)
-    copied = table.detach().to(like).clone()
-    if name in ("exponents", "miss_odds"):
+    return table.detach().to(like).clone()
+
+
+def _positive_table(table: Tensor | None, name: str, shape: tuple[int, ...], like: Tensor) -> Tensor | None:
+    """Check a table of positive numbers that may be left out, and copy it."""
+    copied = _table(table, name, shape, like)
+    if copied is not None:
         check(bool((copied > 0).all()), name, "positive numbers", float(copied.min()))
     return copied

@@ -67,6 +67,14 @@ def presence_facts(probability: Tensor, evidence: Tensor) -> Tensor:
     return torch.stack([log_odds_of_cells(probability.amax(-1)), evidence], -1)
 
 
+def _check_numbers(values: Tensor, name: str, shape: tuple[int, ...]) -> None:
+    """Raise `InputError` unless this is a tensor of finite floating-point numbers of a shape."""
+    check_tensor(values, name)
+    check(values.is_floating_point(), name, "a floating-point tensor", values.dtype)
+    check(tuple(values.shape) == shape, name, f"shape {shape}", tuple(values.shape))
+    check_finite(values, name)
+
+
 class Presence(DecidingModule):
     r"""Probability that a picture holds a class, from the most probable cell, and from the highest score of any look.
 
@@ -117,22 +125,22 @@ class Presence(DecidingModule):
     ) -> None:
         super().__init__()
         check_tensor(shares, "shares")
-        place = torch.tensor([0.0, 1.0]).to(shares) if place is None else place
-        numbers = [("offset", offset, ()), ("slopes", slopes, (2,)), ("place", place, (2,))]
+        if place is None:
+            place = torch.tensor([0.0, 1.0]).to(shares)  # P' = P
+        _check_numbers(offset, "offset", ())
+        _check_numbers(slopes, "slopes", (2,))
+        _check_numbers(place, "place", (2,))
         if centre is not None:
-            numbers.append(("centre", centre, (2,)))
-        for name, values, shape in [*numbers, ("shares", shares, (shares.numel(),))]:
-            check_tensor(values, name)
-            check(values.is_floating_point(), name, "a floating-point tensor", values.dtype)
-            check(tuple(values.shape) == shape, name, f"shape {shape}", tuple(values.shape))
-            check_finite(values, name)
+            _check_numbers(centre, "centre", (2,))
+        _check_numbers(shares, "shares", (shares.numel(),))
         are_shares = bool(((shares > 0) & (shares < 1)).all())
         check(are_shares, "shares", "numbers above 0 and below 1", shares.tolist())
         check(thresholds is None or isinstance(thresholds, Thresholds), "thresholds", "Thresholds or None", thresholds)
-        for name, values, _ in numbers:
-            self.register_parameter(name, nn.Parameter(values.detach().clone()))
-        if centre is None:
-            self.register_parameter("centre", None)
+        self.offset = nn.Parameter(offset.detach().clone())
+        self.slopes = nn.Parameter(slopes.detach().clone())
+        self.place = nn.Parameter(place.detach().clone())
+        # Registered also where there is none.
+        self.register_parameter("centre", None if centre is None else nn.Parameter(centre.detach().clone()))
         self.register_buffer("shares", shares.detach().clone())
         self.thresholds = thresholds
 
