@@ -468,10 +468,7 @@ class Darknet(nn.Module):
 
         The header of the file holds major version, minor version and revision as int32, then the number of images seen
         in training (uint64 since version 0.2, uint32 before). For each convolution of the cfg follow the bias, with
-        batch norm also its scale, mean and variance, and the kernel `(O, I / groups, k, k)`. Batch norm is folded in
-        float64:
-
-            weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
+        batch norm also its scale, mean and variance, and the kernel `(O, I / groups, k, k)`.
         """
         layers = [layer for layer in self.layers if isinstance(layer, Convolution)]
         name = f"weights {str(path)!r}"
@@ -481,19 +478,33 @@ class Darknet(nn.Module):
         got = "NaN or infinite ones; the file is damaged or not a weights file"
         check_data(bool(numbers.isfinite().all()), name, "finite numbers", got)
         for layer, part in zip(layers, numbers.split(lengths), strict=True):
-            vectors, kernel = part.split([layer.out_channels * layer.stored_vectors, layer.weight.numel()])
-            weight = kernel.view(layer.weight.shape).double()
-            bias, *batch_norm = vectors.view(-1, layer.out_channels).double()
-            if batch_norm:
-                scale, mean, variance = batch_norm
-                got = "negative ones; the file does not fit the cfg"
-                check_data(not bool((variance < 0).any()), name, "variances of at least 0", got)
-                factor = scale / (variance + _EPSILON).sqrt()
-                weight = weight * factor[:, None, None, None]
-                bias = bias - mean * factor
+            weight, bias = _folded(part, layer, name)
             layer.weight.copy_(weight)
             cast(Tensor, layer.bias).copy_(bias)
         return hashlib.sha256(data).hexdigest()
+
+
+def _folded(numbers: Tensor, layer: Convolution, name: str) -> tuple[Tensor, Tensor]:
+    """Fold batch norm into a convolution: `weight · γ / √(σ² + ε)` and `β - μ γ / √(σ² + ε)`.
+
+    Args:
+        numbers: what a weights file stores of the layer: β, with batch norm γ, μ and σ², and the weight.
+        layer: the layer.
+        name: name of the file, for messages.
+
+    Returns:
+        The weight `(O, I / groups, k, k)` and the bias `(O,)`, in float64.
+    """
+    vectors, kernel = numbers.split([layer.out_channels * layer.stored_vectors, layer.weight.numel()])
+    weight = kernel.view(layer.weight.shape).double()
+    bias, *batch_norm = vectors.view(-1, layer.out_channels).double()
+    if not batch_norm:
+        return weight, bias
+    scale, mean, variance = batch_norm
+    got = "negative ones; the file does not fit the cfg"
+    check_data(not bool((variance < 0).any()), name, "variances of at least 0", got)
+    factor = scale / (variance + _EPSILON).sqrt()
+    return weight * factor[:, None, None, None], bias - mean * factor
 
 
 def _hands_on(layer: nn.Module) -> bool:

@@ -324,10 +324,7 @@ def unlike(
     Returns:
         Indices of the boxes, most confident first.
     """
-    # The best box first: whole before cut, then sharper, then more confident. Sorts are stable, so the last one leads.
-    order = scores.argsort(descending=True, stable=True)
-    order = order[sharpness[order].argsort(descending=True, stable=True)]
-    order = order[cut[order].int().argsort(stable=True)]
+    order = _best_first(scores, cut, sharpness)
     corners = boxes[order].numpy()
     classes = labels.double()[order].numpy()
     look = looks[order].numpy()
@@ -349,6 +346,14 @@ def unlike(
 
     index = order[torch.from_numpy(survivors(len(corners), better[is_same], worse[is_same]))]
     return index[scores[index].argsort(descending=True, stable=True)]
+
+
+def _best_first(scores: Tensor, cut: Tensor, sharpness: Tensor) -> Tensor:
+    """Order boxes: whole before cut, of these sharper before blurred, and of these the more confident first."""
+    # Sorts are stable, so the last one leads.
+    order = scores.argsort(descending=True, stable=True)
+    order = order[sharpness[order].argsort(descending=True, stable=True)]
+    return order[cut[order].int().argsort(stable=True)]
 
 
 def _overlapping_pairs(
