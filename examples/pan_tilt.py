@@ -6,6 +6,7 @@ Run it from a checkout: python -m examples.pan_tilt PANORAMA.jpg cup --out found
 import argparse
 import math
 import random
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,27 @@ from numpy.typing import NDArray
 import semfov
 from semfov.head import CameraFrame, Panoramas, PanTiltCamera, Speeds
 from semfov.viz import save_figure
+
+Direction = tuple[float, float]
+"""Pan and tilt in degrees."""
+
+
+@dataclass(frozen=True)
+class Movement:
+    """A movement from one direction to another, between two times in seconds."""
+
+    begin: float
+    end: float
+    start: Direction
+    stop: Direction
+
+    def at(self, time: float) -> Direction:
+        """Tell the direction at a time; before and after the movement it rests."""
+        duration = max(self.end - self.begin, 1e-9)
+        share = min(max((time - self.begin) / duration, 0.0), 1.0)
+        way = share * (share * (3 - 2 * share))  # gently away, and gently to a stop
+        pan, tilt = self.start
+        return pan + way * (self.stop[0] - pan), tilt + way * (self.stop[1] - tilt)
 
 
 class SimulatedCamera(PanTiltCamera):
@@ -44,41 +66,53 @@ class SimulatedCamera(PanTiltCamera):
     def __init__(
         self, panorama: semfov.Panorama, *, delay: float = 0.3, noise: float = 0.5, reports: bool = True, seed: int = 0
     ) -> None:
-        self.panorama, self.delay, self.noise, self.reports = panorama, delay, noise, reports
+        self.panorama = panorama
+        self.delay = delay
+        self.noise = noise
+        self.reports = reports
         self.speeds = Speeds(look=self.interval, eye_start=0.0, eye=0.0, head=90.0, acceleration=200.0, settle=delay)
-        self.clock, self.turns = 0.0, 0
+        self.clock = 0.0
+        self.turns = 0
         self._random = random.Random(seed)
-        self._sent = (0.0, 0.0)
-        # The last movement: its start, its end, and where it leads from and to.
-        self._move = (0.0, 0.0, self._sent, self._sent)
+        self._sent: Direction = (0.0, 0.0)
+        self._movement = Movement(0.0, 0.0, self._sent, self._sent)
 
-    def look_at(self, direction: tuple[float, float], field: float) -> CameraFrame | NDArray[np.uint8]:
+    def look_at(self, direction: Direction, field: float) -> CameraFrame | NDArray[np.uint8]:
         """Turn to a direction, wait until the motors have stopped, and take the next frame that arrives."""
         if direction != self._sent:
-            self._send(direction)
+            self._turn(direction)
         self.clock += self.interval
         pan_tilt = self.where(self.clock - self.delay)
         # What `cv2.VideoCapture.read` returns: bytes (H, W, 3), blue first.
-        pixels = self.panorama.look_at(pan_tilt, field).mul(255).byte().permute(1, 2, 0).flip(-1).numpy()
+        view = self.panorama.look_at(pan_tilt, field)
+        pixels = view.mul(255).byte().permute(1, 2, 0).flip(-1).numpy()
         return CameraFrame(pixels, pan_tilt) if self.reports else pixels
 
-    def _send(self, direction: tuple[float, float]) -> None:
+    def _turn(self, direction: Direction) -> None:
+        """Turn to a direction, or beside it by the noise, and wait until the motors have stopped."""
         here = self.where(self.clock)
-        stop = tuple(angle + self._random.gauss(0, self.noise) for angle in direction)
-        angle = max(abs(a - b) for a, b in zip(here, stop, strict=True))
-        speed, acceleration = self.speeds.head, self.speeds.acceleration
-        fast = speed**2 / acceleration
-        takes = 2 * math.sqrt(angle / acceleration) if angle <= fast else angle / speed + speed / acceleration
-        self._sent, self._move = direction, (self.clock, self.clock + takes, here, (stop[0], stop[1]))
+        pan, tilt = direction
+        stop = (pan + self._random.gauss(0, self.noise), tilt + self._random.gauss(0, self.noise))
+        # The motors turn together, so the longer way decides.
+        seconds = self._seconds(max(abs(here[0] - stop[0]), abs(here[1] - stop[1])))
+        self._sent = direction
+        self._movement = Movement(self.clock, self.clock + seconds, here, stop)
         self.turns += 1
-        self.clock += takes + (0.0 if self.reports else self.delay)
+        unseen = 0.0 if self.reports else self.delay  # until a frame must be new
+        self.clock += seconds + unseen
 
-    def where(self, time: float) -> tuple[float, float]:
-        """Pan and tilt at a time, as far back as the last movement."""
-        begins, ends, one, other = self._move
-        share = min(max((time - begins) / max(ends - begins, 1e-9), 0.0), 1.0)
-        share *= share * (3 - 2 * share)  # gently away, and gently to a stop
-        return one[0] + share * (other[0] - one[0]), one[1] + share * (other[1] - one[1])
+    def _seconds(self, angle: float) -> float:
+        """Compute how long a motor takes for an angle: it accelerates, turns at its speed, and brakes."""
+        speed = self.speeds.head
+        acceleration = self.speeds.acceleration
+        # In a short movement it brakes before it has reached its speed.
+        if angle <= speed**2 / acceleration:
+            return 2 * math.sqrt(angle / acceleration)
+        return angle / speed + speed / acceleration
+
+    def where(self, time: float) -> Direction:
+        """Tell pan and tilt at a time, as far back as the last movement."""
+        return self._movement.at(time)
 
 
 def main() -> None:
