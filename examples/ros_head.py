@@ -49,7 +49,11 @@ class JointHead(PanTiltCamera):
         speeds: Speeds | None = None,
         patience: float = 10.0,
     ) -> None:
-        self.node, self.size, self.joints, self.pan, self.tilt = node, size, joints, pan, tilt
+        self.node = node
+        self.size = size
+        self.joints = joints
+        self.pan = pan
+        self.tilt = tilt
         self.fields = (field,)
         self.speeds = Speeds(eye_start=0.0, eye=0.0, settle=0.2) if speeds is None else speeds
         self.patience = patience
@@ -74,27 +78,38 @@ class JointHead(PanTiltCamera):
             raise DataError(f"head: its controller refuses to turn to {direction}")
         self.result(handle.get_result_async())
         time.sleep(self.speeds.settle)
-        self.image, before = None, self.image
+        image = self.next_image()
+        pan, tilt = (-math.degrees(self.angles[joint]) for joint in self.joints)
+        return CameraFrame(ros.picture(image), (pan, tilt))
+
+    def next_image(self) -> Image:
+        """Wait for an image that is newer than the last one, and for new angles of the joints."""
+        earliest = stamp(self.image)
+        self.image = None
         self.angles.clear()
-        until = time.monotonic() + self.patience
-        while self.image is None or stamp(self.image) <= stamp(before) or not self.angles.keys() >= {*self.joints}:
-            if time.monotonic() > until:
+        deadline = time.monotonic() + self.patience
+        while stamp(self.image) <= earliest or not self.angles.keys() >= {*self.joints}:
+            if time.monotonic() > deadline:
                 raise DataError("head: expected an image and the angles of its joints, got none; check the topics")
             rclpy.spin_once(self.node, timeout_sec=0.1)
-        pan, tilt = (-math.degrees(self.angles[joint]) for joint in self.joints)
-        return CameraFrame(ros.picture(self.image), (pan, tilt))
+        return self.image
 
     def goal(self, direction: tuple[float, float]) -> FollowJointTrajectory.Goal:
         """Make the goal of the action: one point, at the time that the speeds allow."""
-        goal, point = FollowJointTrajectory.Goal(), JointTrajectoryPoint()
+        turns = []
+        for joint, angle in zip(self.joints, direction, strict=True):
+            present = -math.degrees(self.angles.get(joint, 0.0))
+            turns.append(abs(present - angle))
+        # The joints turn together, so the longer way decides.
+        seconds = max(float(self.speeds.turn(torch.tensor(max(turns)))), 0.1)
+
+        point = JointTrajectoryPoint()
         point.positions = [-math.radians(angle) for angle in direction]
-        farthest = max(
-            (abs(math.degrees(self.angles.get(joint, 0.0)) + angle))
-            for joint, angle in zip(self.joints, direction, strict=True)
-        )
-        seconds = max(float(self.speeds.turn(torch.tensor(farthest))), 0.1)
-        point.time_from_start.sec, point.time_from_start.nanosec = int(seconds), int(seconds % 1 * 1e9)
-        goal.trajectory.joint_names, goal.trajectory.points = list(self.joints), [point]
+        point.time_from_start.sec = int(seconds)
+        point.time_from_start.nanosec = int(seconds % 1 * 1e9)
+        goal = FollowJointTrajectory.Goal()
+        goal.trajectory.joint_names = list(self.joints)
+        goal.trajectory.points = [point]
         return goal
 
     def result(self, future: Any) -> Any:
@@ -106,8 +121,10 @@ class JointHead(PanTiltCamera):
 
 
 def stamp(image: Image | None) -> float:
-    """Time of an image in seconds; before all others where there is none."""
-    return -math.inf if image is None else image.header.stamp.sec + image.header.stamp.nanosec / 1e9
+    """Read the time of an image in seconds; before all others where there is none."""
+    if image is None:
+        return -math.inf
+    return image.header.stamp.sec + image.header.stamp.nanosec / 1e9
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ and `geometry_msgs/PointStamped`. A complete node is in `ros_node.py`.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,21 @@ from semfov.errors import check, check_number, check_shape
 _Values = dict[str, Any]
 Message = TypeVar("Message")
 
-_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
-_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
+
+class _Encoding(NamedTuple):
+    """Layout of a pixel: where red, green and blue are, and its number of bytes."""
+
+    channels: tuple[int, int, int]
+    bytes: int
+
+
+_ENCODINGS = {
+    "rgb8": _Encoding((0, 1, 2), 3),
+    "bgr8": _Encoding((2, 1, 0), 3),
+    "rgba8": _Encoding((0, 1, 2), 4),
+    "bgra8": _Encoding((2, 1, 0), 4),
+    "mono8": _Encoding((0, 0, 0), 1),
+}
 
 
 def header(stamp: Any, frame: str) -> _Values:
@@ -39,21 +52,22 @@ def detection_array(
     detections: Detections, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
 ) -> _Values:
     """Make a `vision_msgs/Detection2DArray`: boxes in pixels, each with its most likely classes."""
-    boxes, scores, mask = detections.boxes, detections.scores, detections.mask
+    mask = detections.mask
     check(mask.ndim == 1 or len(mask) == 1, "detections", "detections of one image", f"a batch of {len(mask)}")
-    check_shape(scores, "detections.scores", None, len(classes) + 1)
-    if mask.ndim > 1:
-        boxes, scores, mask = boxes[0], scores[0], mask[0]
-    head, entries = header(stamp, frame), []
-    for box, each in zip(boxes[mask].tolist(), scores[mask, 1:], strict=True):
-        top = each.topk(min(most, len(classes)))
-        hypotheses = [
-            {"hypothesis": {"class_id": classes[index], "score": score}}
-            for score, index in zip(top.values.tolist(), top.indices.tolist(), strict=True)
-            if score >= least
-        ]
+    check_shape(detections.scores, "detections.scores", None, len(classes) + 1)
+    of_image = detections if mask.ndim == 1 else detections[0]
+    boxes = of_image.boxes[of_image.mask].tolist()
+    scores = of_image.scores[of_image.mask, 1:]  # without background
+    head = header(stamp, frame)
+    entries = []
+    for box, scores_of_box in zip(boxes, scores, strict=True):
+        hypotheses = []
+        top = scores_of_box.topk(min(most, len(classes)))
+        for score, index in zip(top.values.tolist(), top.indices.tolist(), strict=True):
+            if score >= least:
+                hypotheses.append(_hypothesis(classes[index], score))
         if hypotheses:
-            entries.append({"header": head, "results": hypotheses, "bbox": _bounds(box), "id": ""})
+            entries.append(_entry(head, hypotheses, box))
     return {"header": head, "detections": entries}
 
 
@@ -63,12 +77,22 @@ def found_array(decision: Decision | None, name: str, *, stamp: Any, frame: str)
     >>> found_array(None, "cup", stamp=0, frame="camera")["detections"]
     []
     """
-    head, entries = header(stamp, frame), []
+    head = header(stamp, frame)
+    entries = []
     if decision is not None and decision.box is not None:
         score = decision.probability if decision.place is None else decision.place
-        result = {"hypothesis": {"class_id": name, "score": score}}
-        entries.append({"header": head, "results": [result], "bbox": _bounds(decision.box.tolist()), "id": ""})
+        entries.append(_entry(head, [_hypothesis(name, score)], decision.box.tolist()))
     return {"header": head, "detections": entries}
+
+
+def _hypothesis(name: str, score: float) -> _Values:
+    """Make a `vision_msgs/ObjectHypothesisWithPose` of a class."""
+    return {"hypothesis": {"class_id": name, "score": score}}
+
+
+def _entry(head: _Values, hypotheses: list[_Values], box: Sequence[float]) -> _Values:
+    """Make a `vision_msgs/Detection2D`."""
+    return {"header": head, "results": hypotheses, "bbox": _bounds(box), "id": ""}
 
 
 def _bounds(box: Sequence[float]) -> _Values:
@@ -117,27 +141,36 @@ def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
         if isinstance(value, Mapping):
             fill(getattr(message, name), value, *kinds)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            kind_name = fields[name].removeprefix("sequence<").partition(">")[0].partition("/")[2].split(",")[0]
-            named = {kind.__name__: kind for kind in kinds}
-            check(kind_name in named, "kinds", f"{kind_name} among them", ", ".join(named) or "none")
-            setattr(message, name, [fill(named[kind_name](), each, *kinds) for each in value])
+            kind = _kind_of_elements(fields[name], kinds)
+            setattr(message, name, [fill(kind(), element, *kinds) for element in value])
         else:
             setattr(message, name, value)
     return message
 
 
+def _kind_of_elements(field: str, kinds: Sequence[type]) -> type:
+    """Find the class of the messages in a list by the type of its field, such as `sequence<std_msgs/Header, 3>`."""
+    element = field.removeprefix("sequence<").partition(">")[0].split(",")[0]
+    kind_name = element.partition("/")[2]
+    by_name = {kind.__name__: kind for kind in kinds}
+    check(kind_name in by_name, "kinds", f"{kind_name} among them", ", ".join(by_name) or "none")
+    return by_name[kind_name]
+
+
 def picture(message: Any) -> NDArray[np.uint8]:
-    """Read the pixels of a `sensor_msgs/Image`; → `(h, w, 3)`."""
-    encoding, step = str(message.encoding), int(message.step)
-    height, width = int(message.height), int(message.width)
-    check(
-        encoding in _CHANNELS,
-        "encoding",
-        f"one of {', '.join(_CHANNELS)}",
-        f"{encoding!r}; convert it with image_proc or cv_bridge",
-    )
-    size, data = _BYTES[encoding], np.frombuffer(bytes(message.data), np.uint8)
-    whole = height > 0 and width > 0 and step >= width * size and len(data) >= height * step
-    check(whole, "data", f"{width} × {height} pixels of {size} bytes", f"{len(data)} bytes, {step} in each row")
-    rows = data[: height * step].reshape(height, step)[:, : width * size].reshape(height, width, size)
-    return np.ascontiguousarray(rows[..., list(_CHANNELS[encoding])])
+    """Read the pixels of a `sensor_msgs/Image`, `(h, w, 3)`."""
+    name = str(message.encoding)
+    got = f"{name!r}; convert it with image_proc or cv_bridge"
+    check(name in _ENCODINGS, "encoding", f"one of {', '.join(_ENCODINGS)}", got)
+    encoding = _ENCODINGS[name]
+    height = int(message.height)
+    width = int(message.width)
+    step = int(message.step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    length = width * encoding.bytes
+    is_complete = height > 0 and width > 0 and step >= length and len(data) >= height * step
+    expected = f"{width} × {height} pixels of {encoding.bytes} bytes"
+    check(is_complete, "data", expected, f"{len(data)} bytes, {step} in each row")
+    rows = data[: height * step].reshape(height, step)
+    pixels = rows[:, :length].reshape(height, width, encoding.bytes)
+    return np.ascontiguousarray(pixels[..., list(encoding.channels)])

@@ -22,7 +22,8 @@ class GazeNode(Node):
         target = self.declare_parameter("target", "cup").value
         detector = self.declare_parameter("detector", "yolox-nano").value
         self.agent = semfov.ActivePerception.recommended(detector)
-        self.target, self.live = target, self.agent.live(target)
+        self.target = target
+        self.live = self.agent.live(target)
         self.time: float | None = None
         self.detections = self.create_publisher(Detection2DArray, "detections", 1)
         self.decision = self.create_publisher(Detection2DArray, "found", 1)
@@ -32,16 +33,18 @@ class GazeNode(Node):
     def look(self, message: Image) -> None:
         """Look at an image, and publish the detections, the box of a found target and the next gaze point."""
         moment = self.live.step(ros.picture(message), self.passed(message.header.stamp))
-        of = {"stamp": message.header.stamp, "frame": message.header.frame_id}
-        array = ros.detection_array(moment.seen, self.agent.classes[1:], **of)
-        self.detections.publish(ros.fill(Detection2DArray(), array, Detection2D, ObjectHypothesisWithPose))
-        array = ros.found_array(moment.decision, self.target, **of)
-        self.decision.publish(ros.fill(Detection2DArray(), array, Detection2D, ObjectHypothesisWithPose))
-        self.gaze.publish(ros.fill(PointStamped(), ros.gaze_point(moment.next_point, **of)))
+        origin = {"stamp": message.header.stamp, "frame": message.header.frame_id}
+        detections = ros.detection_array(moment.seen, self.agent.classes[1:], **origin)
+        self.detections.publish(ros.fill(Detection2DArray(), detections, Detection2D, ObjectHypothesisWithPose))
+        found = ros.found_array(moment.decision, self.target, **origin)
+        self.decision.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
+        point = ros.gaze_point(moment.next_point, **origin)
+        self.gaze.publish(ros.fill(PointStamped(), point))
 
     def passed(self, stamp: Time) -> float:
-        """Seconds since the image before; none where a recording begins anew."""
-        before, self.time = self.time, stamp.sec + stamp.nanosec / 1e9
+        """Compute the seconds since the image before; 0 for the first one, and where a recording begins anew."""
+        before = self.time
+        self.time = stamp.sec + stamp.nanosec / 1e9
         return 0.0 if before is None else max(self.time - before, 0.0)
 
 
