@@ -257,21 +257,41 @@ def _weights(start: Tensor, end: Tensor, count: int, length: int, *, border: boo
     # The pixels that some triangle reaches, also outside the picture: all weights of a canvas pixel sum to 1.
     first_reached = (start - reach).floor()
     last_reached = (end + reach).ceil()
-    first, last = torch.stack([first_reached, last_reached + 1]).detach().long().tolist()
-    pixel = torch.arange(first, last, device=start.device)
-    centre = pixel.to(start) + 0.5
+    first, end_of_reached = torch.stack([first_reached, last_reached + 1]).detach().long().tolist()
+    centre = torch.arange(first, end_of_reached, device=start.device).to(start) + 0.5
     distance = (middle[:, None] - centre).abs()  # (count, pixels)
     triangle = (1 - distance / reach).clamp(min=0)
     weight = triangle / triangle.sum(-1, keepdim=True)
     if border:
-        # What a triangle reaches outside the picture counts for the nearest pixel inside.
-        begin = min(max(first, 0), length - 1)
-        stop = max(min(last, length), 1)
-        nearest = pixel.clamp(0, length - 1) - begin
-        return weight.new_zeros(count, stop - begin).index_add(1, nearest, weight), (begin, stop)
+        return _moved_to_border(weight, first, length)
+    return _inside(weight, first, length)
+
+
+def _inside(weight: Tensor, first: int, length: int) -> tuple[Tensor, tuple[int, int]]:
+    """Leave out the weights of pixels outside the picture, whose values are 0.
+
+    Args:
+        weight: weights `(count, n)` of n pixels.
+        first: number of the first of these pixels.
+        length: number of picture pixels.
+
+    Returns:
+        The weights of pixels of the picture, and the range of these pixels; there may be none.
+    """
+    end = first + weight.shape[1]
     begin = min(max(first, 0), length)
-    stop = max(min(max(last, 0), length), begin)
+    stop = min(max(end, begin), length)
     return weight[:, begin - first : stop - first], (begin, stop)
+
+
+def _moved_to_border(weight: Tensor, first: int, length: int) -> tuple[Tensor, tuple[int, int]]:
+    """Add the weights of pixels outside the picture to those of the nearest pixel inside, as `_inside`."""
+    end = first + weight.shape[1]
+    begin = min(max(first, 0), length - 1)
+    stop = min(max(end, begin + 1), length)
+    pixel = torch.arange(first, end, device=weight.device)
+    nearest = pixel.clamp(0, length - 1) - begin
+    return weight.new_zeros(len(weight), stop - begin).index_add(1, nearest, weight), (begin, stop)
 
 
 def _weights_of_all(middle: Tensor, reach: Tensor, length: int, *, border: bool) -> Tensor:
