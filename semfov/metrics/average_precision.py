@@ -51,7 +51,7 @@ def average_precision(
 
     # In LVIS a box counts only where its class is annotated, or known to be absent.
     of_lvis = {number for image, number in image_ids.items() if annotations.images[image].get(ABSENT) is not None}
-    verified = _pairs(truth) | _named(annotations, ABSENT, image_ids, class_ids)
+    verified = {_pair(entry) for entry in truth} | _named(annotations, ABSENT, image_ids, class_ids)
     boxes = [box for box in boxes if box["image_id"] not in of_lvis or _pair(box) in verified]
 
     partial = _named(annotations, PARTIAL, image_ids, class_ids)
@@ -106,11 +106,6 @@ def _copies(entries: Iterable[Entry], image_ids: Mapping[Id, int], class_ids: Ma
 def _pair(entry: Entry) -> tuple[int, int]:
     """Name the image and the class of an entry."""
     return entry["image_id"], entry["category_id"]
-
-
-def _pairs(entries: Iterable[Entry]) -> set[tuple[int, int]]:
-    """List the images, each with a class of which it has entries."""
-    return {_pair(entry) for entry in entries}
 
 
 def _named(
