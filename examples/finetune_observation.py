@@ -10,6 +10,7 @@ Run it from a checkout: python -m examples.finetune_observation
 
 import argparse
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,16 +46,32 @@ def looks_at(scenes: semfov.EmbeddedScenes, eye: semfov.Eye, starts: int) -> lis
 
 def chance_of_hit(model: semfov.FovealObservationModel, looks: Looks, sharpness: float) -> Tensor:
     """Compute the probability that the next fixation, drawn from a softmax over the posterior, lands on the target."""
-    grid, cells, detections = looks.grid, looks.cells, looks.detections
+    grid = looks.grid
     observer = semfov.observers.Semantic(len(model.classes) + 1, model)
-    belief = observer(observer.start(len(cells), grid, detections.scores), detections, grid.centres[cells], grid)
-    here = torch.nn.functional.one_hot(cells, len(grid)).bool()
+    start = observer.start(len(looks.cells), grid, looks.detections.scores)
+    belief = observer(start, looks.detections, grid.centres[looks.cells], grid)
+    visited = torch.nn.functional.one_hot(looks.cells, len(grid)).bool()
     hits = []
     for target, goal in looks.goals.items():
         values = belief.probability(target).clamp(min=1e-9).log()
-        choice = (sharpness * values).masked_fill(here, -torch.inf).softmax(-1)
-        hits.append(choice[:, goal].sum(-1)[~goal[cells]])
+        choice = (sharpness * values).masked_fill(visited, -torch.inf).softmax(-1)  # (starts, X·Y)
+        hit = choice[:, goal].sum(-1)
+        hits.append(hit[~goal[looks.cells]])  # a search that begins at the target needs no shift
     return torch.cat(hits)
+
+
+def train(model: semfov.FovealObservationModel, looks: Sequence[Looks], steps: int) -> None:
+    """Raise the chance of a hit by gradient ascent on α."""
+    optimiser = torch.optim.Adam([model.log_alpha], lr=0.02)
+    for step in range(steps):
+        optimiser.zero_grad()
+        hits = torch.cat([chance_of_hit(model, look, 3.0) for look in looks])
+        loss = -hits.clamp(min=1e-6).log().mean()
+        loss.backward()
+        optimiser.step()
+        if step % 10 == 0:
+            percent = 100 * float(hits.mean().detach())
+            print(f"step {step:3d}: probability of a hit at the next fixation {percent:.1f} %")
 
 
 def main() -> None:
@@ -67,22 +84,12 @@ def main() -> None:
 
     detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(semfov.Foveation(100.0), detector).requires_grad_(False)
-    train, test = (
-        looks_at(semfov.EmbeddedScenes(detector.classes, count=arguments.scenes, seed=seed), eye, arguments.starts)
-        for seed in (1, 2)
-    )
+    count = arguments.scenes
+    training = looks_at(semfov.EmbeddedScenes(detector.classes, count=count, seed=1), eye, arguments.starts)
+    test = looks_at(semfov.EmbeddedScenes(detector.classes, count=count, seed=2), eye, arguments.starts)
     published = semfov.FovealObservationModel.from_pretrained("yolox-nano-published")
     model = copy.deepcopy(published).train()
-    optimiser = torch.optim.Adam([model.log_alpha], lr=0.02)
-    for step in range(arguments.steps):
-        optimiser.zero_grad()
-        hits = torch.cat([chance_of_hit(model, look, 3.0) for look in train])
-        loss = -hits.clamp(min=1e-6).log().mean()
-        loss.backward()
-        optimiser.step()
-        if step % 10 == 0:
-            percent = 100 * float(hits.mean().detach())
-            print(f"step {step:3d}: probability of a hit at the next fixation {percent:.1f} %")
+    train(model, training, arguments.steps)
     model.eval()
     with torch.no_grad():
         for name, tested in (("before", published), ("after", model)):

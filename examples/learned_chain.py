@@ -16,8 +16,11 @@ from torch.nn import functional as F
 import semfov
 from semfov.belief.observers import SemanticSearch
 
-COLUMNS, ROWS, LOOKS = 10, 8, 3
-Search = tuple[Tensor, int, Tensor]  # the image, the class to search for, and the cells that hold it
+COLUMNS, ROWS = 10, 8  # cells of the map
+LOOKS = 3  # looks of a search
+
+Search = tuple[Tensor, int, Tensor]
+"""The image, the class to search for, and the cells that hold it."""
 
 
 class Chain(nn.Module):
@@ -29,7 +32,8 @@ class Chain(nn.Module):
 
     def __init__(self, classes: tuple[str, ...]) -> None:
         super().__init__()
-        components, edges = len(classes) + 1, [0.1, 0.2, 0.4]
+        components = len(classes) + 1
+        edges = [0.1, 0.2, 0.4]
         odds = torch.full((components, len(edges) + 1), 0.1)
         self.fovea = semfov.Foveation(10.0, levels=4, learnable=True)
         self.network = nn.Sequential(
@@ -44,11 +48,14 @@ class Chain(nn.Module):
 
     def forward(self, image: Tensor, cells: Tensor, target: int, goal: Tensor) -> Tensor:
         """Search an image `(3, H, W)` from `cells` `(n,)`; returns −ln of the share of the goal `(X·Y,)`, a scalar."""
-        grid, observer = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2])), SemanticSearch(self.model)
+        grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
+        observer = SemanticSearch(self.model)
         belief = observer.start(1, grid, image)
         everywhere = torch.ones(1, len(grid), dtype=torch.bool)
         for fixation in grid.centres[cells].split(1):
-            scores = self.network(self.fovea(image[None], fixation)).flatten(2).mT.softmax(-1)
+            view = self.fovea(image[None], fixation)
+            logits = self.network(view)  # (1, K+1, Y, X)
+            scores = logits.flatten(2).mT.softmax(-1)  # (1, X·Y, K+1)
             seen = semfov.Detections(grid.edges[None], scores, everywhere)
             belief = observer(belief, seen, fixation, grid)
         share = belief.probability(target)[0].index_fill(0, cells, 0.0)
@@ -92,19 +99,28 @@ def train(chain: Chain, searches: list[Search], steps: int) -> None:
         optimiser.step()
 
 
+def described(chain: Chain, searches: list[Search]) -> str:
+    """Say the mean loss and the width of the fovea."""
+    sigma = float(chain.fovea.sigma.detach())
+    return f"loss {mean_loss(chain, searches):.2f}, fovea {sigma:.1f} px"
+
+
 def main() -> None:
+    """Train on embedded scenes, and compare the loss before and after."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=6, help="number of embedded scenes")
     parser.add_argument("--steps", type=int, default=100, help="number of training steps")
     arguments = parser.parse_args()
     torch.manual_seed(0)
     scenes = semfov.EmbeddedScenes(("person", "boat", "truck", "car", "horse"), count=arguments.scenes)
-    searches, chain = searches_in(scenes), Chain(scenes.classes)
-    print(f"before training: loss {mean_loss(chain, searches):.2f}, fovea {float(chain.fovea.sigma.detach()):.1f} px")
-    alpha = chain.model.alpha.detach()
+    searches = searches_in(scenes)
+    chain = Chain(scenes.classes)
+    alpha_before = chain.model.alpha.detach()
+    print(f"before training: {described(chain, searches)}")
     train(chain, searches, arguments.steps)
-    print(f"after training: loss {mean_loss(chain, searches):.2f}, fovea {float(chain.fovea.sigma.detach()):.1f} px")
-    print(f"α changed by up to {float((chain.model.alpha.detach() / alpha - 1).abs().max()):.0%}")
+    print(f"after training: {described(chain, searches)}")
+    change = chain.model.alpha.detach() / alpha_before - 1
+    print(f"α changed by up to {float(change.abs().max()):.0%}")
 
 
 if __name__ == "__main__":

@@ -9,20 +9,24 @@ Run it from a checkout: python -m examples.learned_gaze
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 import semfov
-from semfov.episode import StoredLooks
+from semfov.episode import Step, StoredLooks
 from semfov.gaze import Choice, Greedy, Softmax
 from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Uniform
 from semfov.sensor import named_sensor
 
-COLUMNS, ROWS, SHIFTS, DISCOUNT = 8, 6, 8, 0.9
+COLUMNS, ROWS = 8, 6  # cells of the map
+SHIFTS = 8  # gaze shifts at most
+DISCOUNT = 0.9  # factor by which each gaze shift lowers the value of a search
+
 Maker = Callable[[Tensor], AcquisitionFunction]
+"""Makes an acquisition function for the targets `(A,)` of the episodes that still run."""
 
 
 class LearnedValue(AcquisitionFunction):
@@ -54,8 +58,13 @@ def gaze_network(width: int = 8) -> nn.Module:
     """Make the network of `LearnedValue`; before training it values all cells alike."""
     last = nn.Conv2d(width, 1, 1)
     nn.init.zeros_(last.weight)
-    convolutions = nn.Conv2d(5, width, 3, padding=1), nn.GELU(), nn.Conv2d(width, width, 3, padding=1), nn.GELU()
-    return nn.Sequential(*convolutions, last)
+    return nn.Sequential(
+        nn.Conv2d(5, width, 3, padding=1),
+        nn.GELU(),
+        nn.Conv2d(width, width, 3, padding=1),
+        nn.GELU(),
+        last,
+    )
 
 
 @dataclass(frozen=True)
@@ -76,10 +85,13 @@ def searches_in(scenes: semfov.EmbeddedScenes, eye: semfov.Eye) -> list[Searches
         grid = semfov.Grid(COLUMNS, ROWS, scene.size)
         with torch.no_grad():
             detections = eye(scene.image[None], grid.centres)
-        classes, covered = torch.tensor(scenes.targets(index)), grid.footprint(scene.boxes)
+        classes = torch.tensor(scenes.targets(index))
+        covered = grid.footprint(scene.boxes)
         goals = torch.stack([covered[scene.labels == target].any(0) for target in classes])
         number, start = (~goals).nonzero(as_tuple=True)
-        searches.append(Searches(StoredLooks(detections, grid, classes[number]), classes[number], start, goals[number]))
+        targets = classes[number]
+        looks = StoredLooks(detections, grid, targets)
+        searches.append(Searches(looks, targets, start, goals[number]))
     return searches
 
 
@@ -96,7 +108,13 @@ def run(searches: Searches, observer: semfov.observers.Observer, make: Maker, ch
         The gaze shift that found each target, `(B,)`, with `SHIFTS + 1` for none; and the logarithm of the probability
         of all choices in a search if they are drawn from a softmax over the values, `(B,)`.
     """
-    shifts, logarithm = torch.full_like(searches.start, SHIFTS + 1), torch.zeros(len(searches.start))
+
+    def is_found(step: Step) -> Tensor:
+        """Tell which of the episodes of a step reach an object of their class by it."""
+        return searches.goal[step.episodes, step.next_cell]
+
+    shifts = torch.full_like(searches.start, SHIFTS + 1)
+    logarithm = torch.zeros(len(searches.start))
     steps = semfov.rollout(
         searches.looks,
         observer,
@@ -104,13 +122,37 @@ def run(searches: Searches, observer: semfov.observers.Observer, make: Maker, ch
         searches.start,
         choice,
         most=SHIFTS,
-        ends=lambda step: searches.goal[step.episodes, step.next_cell],
+        ends=is_found,
     )
     for step in steps:
-        shifts[step.episodes[searches.goal[step.episodes, step.next_cell]]] = step.shift + 1
+        shifts[step.episodes[is_found(step)]] = step.shift + 1
+        # ln of the softmax over the cells that were not visited, of the cell that was drawn.
         shares = step.values.masked_fill(step.visited, -torch.inf).log_softmax(-1)
-        logarithm = logarithm.index_add(0, step.episodes, shares.gather(-1, step.next_cell[:, None])[:, 0])
+        share_of_choice = shares.gather(-1, step.next_cell[:, None])[:, 0]
+        logarithm = logarithm.index_add(0, step.episodes, share_of_choice)
     return shifts, logarithm
+
+
+def train(
+    network: nn.Module,
+    scenes: Sequence[Searches],
+    observer: semfov.observers.Observer,
+    noise: Callable[[int, Tensor], Tensor],
+    steps: int,
+) -> None:
+    """Train a network by the policy gradient: choices of searches that were worth more than the mean get likelier."""
+    optimiser = torch.optim.Adam(network.parameters(), lr=0.01)
+    choice = Softmax(noise, 1.0)
+    for step in range(steps):
+        searches = scenes[step % len(scenes)]
+        shifts, logarithm = run(searches, observer, lambda target: LearnedValue(network, target), choice)
+        value = torch.where(shifts <= SHIFTS, DISCOUNT**shifts, 0.0)
+        advantage = value - value.mean()
+        optimiser.zero_grad()
+        (-advantage * logarithm).mean().backward()
+        optimiser.step()
+        if step % 25 == 0:
+            print(f"step {step:3d}: mean value of a search {float(value.mean()):.2f}")
 
 
 def main() -> None:
@@ -123,24 +165,16 @@ def main() -> None:
     detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(named_sensor("gradual"), detector).requires_grad_(False)
     observer = semfov.observers.Semantic(len(detector.classes) + 1, tempering=0.25, footprint="box_centre")
-    train, test = (
-        searches_in(semfov.EmbeddedScenes(detector.classes, count=arguments.scenes, seed=seed), eye) for seed in (1, 2)
-    )
-    network, generator = gaze_network(), torch.Generator().manual_seed(0)
+    count = arguments.scenes
+    training = searches_in(semfov.EmbeddedScenes(detector.classes, count=count, seed=1), eye)
+    test = searches_in(semfov.EmbeddedScenes(detector.classes, count=count, seed=2), eye)
+    network = gaze_network()
+    generator = torch.Generator().manual_seed(0)
 
     def noise(shift: int, episodes: Tensor) -> Tensor:
         return torch.rand(len(episodes), COLUMNS * ROWS, generator=generator)
 
-    optimiser = torch.optim.Adam(network.parameters(), lr=0.01)
-    for step in range(arguments.steps):
-        searches = train[step % len(train)]
-        shifts, logarithm = run(searches, observer, lambda target: LearnedValue(network, target), Softmax(noise, 1.0))
-        value = torch.where(shifts <= SHIFTS, DISCOUNT**shifts, 0.0)
-        optimiser.zero_grad()
-        (-(value - value.mean()) * logarithm).mean().backward()
-        optimiser.step()
-        if step % 25 == 0:
-            print(f"step {step:3d}: mean value of a search {float(value.mean()):.2f}")
+    train(network, training, observer, noise, arguments.steps)
     policies: dict[str, Maker] = {
         "random": lambda _: Uniform(),
         "learned": lambda target: LearnedValue(network, target),

@@ -32,7 +32,7 @@ class ScoreBelief(semfov.Belief):
     closest: Tensor  # (B, X·Y), distance to the closest fixation; every belief has it
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Largest score of the target in each cell, `(B, X·Y)`."""
+        """Return the largest score of the target in each cell, `(B, X·Y)`."""
         return self.scores[torch.arange(len(self.scores)), :, target]
 
 
@@ -70,7 +70,9 @@ def main() -> None:
     detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(named_sensor("published"), detector).eval().requires_grad_(False)
     scene = semfov.EmbeddedScenes(detector.classes)[0]
-    image, grid, dog = scene.image[None], semfov.Grid(10, 10, scene.size), detector.classes.index("dog") + 1
+    image = scene.image[None]
+    grid = semfov.Grid(10, 10, scene.size)
+    dog = detector.classes.index("dog") + 1
     goal = grid.footprint(scene.boxes[scene.labels == dog]).any(0)
 
     steps = semfov.rollout(
@@ -83,7 +85,8 @@ def main() -> None:
         ends=lambda step: goal[step.cell],
     )
     for step in steps:
-        (x, y), best = step.fixation[0].tolist(), float(step.belief.probability(dog).max())
+        x, y = step.fixation[0].tolist()
+        best = float(step.belief.probability(dog).max())
         print(f"fixation {step.shift + 1} at ({x:.0f}, {y:.0f}), best score of a dog so far {best:.2f}")
     print("found" if goal[step.cell] else "not found")
 

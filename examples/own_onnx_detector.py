@@ -6,8 +6,10 @@ photographs with `train.fit_fom`.
 """
 
 import argparse
+from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 import semfov
 from semfov.detection.weights import fetch
@@ -16,19 +18,45 @@ from semfov.observation.matching import match
 EDGES = [n * 50 / 640 for n in range(1, 8)]  # borders between levels of distance, in units of the image's longer side
 
 
-def look_around(eye: semfov.Eye, scenes: semfov.EmbeddedScenes, looks: int) -> list[torch.Tensor]:
-    """Return score vectors, distances to the fovea and true classes of the detections from random fixations."""
+class Samples(NamedTuple):
+    """Detections from several fixations: score vectors, distances to the fovea, and true classes."""
+
+    scores: Tensor  # (M, K+1)
+    distances: Tensor  # (M,), in units of the image's longer side
+    labels: Tensor  # (M,)
+
+
+@torch.inference_mode()
+def look_around(eye: semfov.Eye, scenes: semfov.EmbeddedScenes, looks: int) -> Samples:
+    """Detect from random fixations in scenes."""
     generator = torch.Generator().manual_seed(0)
-    scores, distances, labels = [], [], []
+    samples = []
     for index in range(len(scenes)):
         scene = scenes[index]
         grid = semfov.Grid(10, 10, scene.size)
-        for fixation in grid.centres[torch.randperm(len(grid), generator=generator)[:looks]]:
+        cells = torch.randperm(len(grid), generator=generator)[:looks]
+        for fixation in grid.centres[cells]:
             detections = eye(scene.image[None], fixation[None])[0]
-            scores.append(detections.scores)
-            distances.append(grid.box_distance(detections.boxes, fixation))
-            labels.append(match(detections.boxes, scene.boxes, scene.labels))
-    return [torch.cat(column) for column in (scores, distances, labels)]
+            distances = grid.box_distance(detections.boxes, fixation)
+            labels = match(detections.boxes, scene.boxes, scene.labels)
+            samples.append(Samples(detections.scores, distances, labels))
+    return Samples(*(torch.cat(column) for column in zip(*samples, strict=True)))
+
+
+def fitted(samples: Samples, eye: semfov.Eye) -> semfov.FovealObservationModel:
+    """Fit an observation model to detections of an eye."""
+    classes = eye.detector.classes
+    model = semfov.FovealObservationModel.identity(classes, EDGES)
+    statistics = semfov.DirichletStatistics(model.alpha.shape[:2], len(classes) + 1)
+    statistics.update(samples.scores, (samples.labels, model.level(samples.distances)))
+    model.fit(statistics, minimum=1, prior=True, tempering=0.1, **eye.settings())
+    return model.eval().requires_grad_(False)
+
+
+def nats(probabilities: Tensor, labels: Tensor) -> float:
+    """Compute the mean negative log likelihood of the true classes."""
+    of_true_class = probabilities.gather(-1, labels[:, None])
+    return float(-of_true_class.clamp(min=1e-6).log().mean())
 
 
 def main() -> None:
@@ -45,24 +73,21 @@ def main() -> None:
 
     eye = semfov.Eye(semfov.Foveation(sigma=100.0), detector).eval()
     scenes = semfov.EmbeddedScenes(detector.classes, count=arguments.scenes, seed=1)
-    with torch.inference_mode():
-        scores, distances, labels = look_around(eye, scenes, arguments.looks)
-    model = semfov.FovealObservationModel.identity(detector.classes, EDGES)
-    statistics = semfov.DirichletStatistics(model.alpha.shape[:2], len(detector.classes) + 1)
-    statistics.update(scores, (labels, model.level(distances)))
-    model.fit(statistics, minimum=1, prior=True, tempering=0.1, **eye.settings()).eval().requires_grad_(False)
+    samples = look_around(eye, scenes, arguments.looks)
+    model = fitted(samples, eye)
     model.save(arguments.out)
-    print(f"fitted to {len(labels)} detections, written to {arguments.out}")
+    print(f"fitted to {len(samples.labels)} detections, written to {arguments.out}")
 
     others = semfov.EmbeddedScenes(detector.classes, count=2, seed=2)
-    with torch.inference_mode():
-        scores, distances, labels = look_around(eye, others, arguments.looks)
-    for name, probabilities in (("raw scores", scores), ("fitted model", model.calibrate(scores, distances))):
-        loss = -probabilities.gather(-1, labels[:, None]).clamp(min=1e-6).log().mean()
+    test = look_around(eye, others, arguments.looks)
+    predictions = {"raw scores": test.scores, "fitted model": model.calibrate(test.scores, test.distances)}
+    for name, probabilities in predictions.items():
+        loss = nats(probabilities, test.labels)
         print(f"{name}: negative log likelihood of {loss:.2f} nats per detection on other scenes")
 
     observer = semfov.observers.Semantic(len(detector.classes) + 1, model)
-    search, explore = semfov.policies.Policy("predictive", model), semfov.policies.Policy("kl", model)
+    search = semfov.policies.Policy("predictive", model)
+    explore = semfov.policies.Policy("kl", model)
     agent = semfov.ActivePerception(eye, (observer, search), (observer, explore)).eval()
     scanpath = agent.search(others[0].image, "person", start=0)
     print(f"person {'found' if scanpath.found else 'not found'} after {len(scanpath)} looks")

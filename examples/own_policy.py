@@ -39,7 +39,7 @@ class InhibitedPosterior(semfov.acquisition.AcquisitionFunction):
 
 
 def main() -> None:
-    """Search embedded scenes for all their classes, without the wide inhibition and with it."""
+    """Search embedded scenes without the wide inhibition and with it."""
     detector = semfov.load_detector("yolox-nano")
     eye = semfov.Eye(named_sensor("published"), detector).eval().requires_grad_(False)
     observer = semfov.observers.Semantic(len(detector.classes) + 1)
@@ -47,13 +47,21 @@ def main() -> None:
     for name in ("non-predictive", "wide-inhibition"):
         policy = policies.Policy(name)  # or policies.Policy("wide-inhibition", width=0.15)
         agent = semfov.ActivePerception(eye, search=(observer, policy), explore=(observer, policies.Policy("random")))
-        shifts = []
-        for index in range(len(scenes)):
-            scene = scenes[index]
-            for target in scenes.targets(index):
-                boxes = scene.boxes[scene.labels == target]
-                shifts += [len(agent.search(scene.image, target, start=start, boxes=boxes)) - 1 for start in (0, 99)]
+        shifts = gaze_shifts(agent, scenes)
         print(f"{name}: {sum(shifts) / len(shifts):.1f} gaze shifts on average, {len(shifts)} searches")
+
+
+def gaze_shifts(agent: semfov.ActivePerception, scenes: semfov.EmbeddedScenes) -> list[int]:
+    """Search scenes for all their classes, each from the first and from the last cell; returns the gaze shifts."""
+    shifts = []
+    for index in range(len(scenes)):
+        scene = scenes[index]
+        for target in scenes.targets(index):
+            boxes = scene.boxes[scene.labels == target]
+            for start in (0, 99):
+                scanpath = agent.search(scene.image, target, start=start, boxes=boxes)
+                shifts.append(len(scanpath) - 1)
+    return shifts
 
 
 if __name__ == "__main__":

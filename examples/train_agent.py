@@ -11,6 +11,7 @@ Run it from a checkout: python -m examples.train_agent
 
 import argparse
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any
 
 import gymnasium
@@ -60,13 +61,15 @@ class CellPolicy(MaskableActorCriticPolicy):
     The value function has its own copy of `CellFeatures`, followed by a hidden layer.
 
     Args:
-        given: positional arguments of `MaskableActorCriticPolicy`.
+        arguments: positional arguments of `MaskableActorCriticPolicy`.
         options: keyword arguments of `MaskableActorCriticPolicy`.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        layers = {"net_arch": {"pi": [], "vf": [64]}, "share_features_extractor": False}
-        super().__init__(*arguments, **{**options, "features_extractor_class": CellFeatures, **layers})
+        options["features_extractor_class"] = CellFeatures
+        options["share_features_extractor"] = False
+        options["net_arch"] = {"pi": [], "vf": [64]}
+        super().__init__(*arguments, **options)
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
@@ -78,7 +81,9 @@ class CellPolicy(MaskableActorCriticPolicy):
 def belief_only(scenery: Scenery) -> gymnasium.Env[Any, Any]:
     """Make an environment whose observation is the belief alone."""
     env = GazeSearch(scenery, belief=True)
-    return gymnasium.wrappers.TransformObservation(env, lambda each: each["belief"], env.observation_space["belief"])
+    return gymnasium.wrappers.TransformObservation(
+        env, lambda planes: planes["belief"], env.observation_space["belief"]
+    )
 
 
 def gaze_shifts(env: gymnasium.Env[Any, Any], agent: Agent, episodes: Sequence[Any]) -> list[int]:
@@ -88,7 +93,8 @@ def gaze_shifts(env: gymnasium.Env[Any, Any], agent: Agent, episodes: Sequence[A
         belief, info = env.reset(options={"episode": episode})
         terminated = truncated = False
         while not (terminated or truncated):
-            belief, _, terminated, truncated, info = env.step(agent(belief, info["action_mask"].astype(bool)))
+            cell = agent(belief, info["action_mask"].astype(bool))
+            belief, _, terminated, truncated, info = env.step(cell)
         found.append(int(terminated) * (info["passes"] - 1))
     return found
 
@@ -109,9 +115,8 @@ def main() -> None:
         "shifts": arguments.shifts,
         "cache": arguments.cache,
     }
-    training, test = (
-        open_scenery("search", **common, seed=seed, starts=starts) for seed, starts in ((0, 100), (1000, 10))
-    )
+    training = open_scenery("search", **common, seed=0, starts=100)
+    test = open_scenery("search", **common, seed=1000, starts=10)
     envs = DummyVecEnv([lambda: belief_only(training)] * 32)
     envs.seed(0)
     model = MaskablePPO(
@@ -133,11 +138,15 @@ def main() -> None:
         "hand-made": lambda belief, free: belief[0].argmax(),
         "trained": lambda belief, free: int(model.predict(belief, action_masks=free, deterministic=True)[0]),
     }
-    env, episodes = belief_only(test), [episode for scene in test.scenes for episode in test.episodes(scene)]
+    env = belief_only(test)
+    episodes = list(chain.from_iterable(map(test.episodes, test.scenes)))
     for name, agent in agents.items():
         shifts = np.array(gaze_shifts(env, agent, episodes))
-        shares = ", ".join(f"{100 * ((shifts > 0) & (shifts <= n)).mean():.0f} % within {n}" for n in (1, 3, 10))
-        print(f"{name}: of {len(shifts)} targets in other scenes, gaze shifts find {shares}")
+        shares = []
+        for most in (1, 3, 10):
+            is_found = (shifts > 0) & (shifts <= most)
+            shares.append(f"{100 * is_found.mean():.0f} % within {most}")
+        print(f"{name}: of {len(shifts)} targets in other scenes, gaze shifts find {', '.join(shares)}")
 
 
 if __name__ == "__main__":
