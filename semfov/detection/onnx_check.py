@@ -49,28 +49,36 @@ def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
     with reading(path, name):
         path.stat()
     try:
-        model = onnx.load(path, load_external_data=False)
-        functions = len(model.functions)
-        check_data(functions <= _MOST_FUNCTIONS, name, f"at most {_MOST_FUNCTIONS:,} functions", f"{functions:,}")
-        stored = [*_tensors(model)]
-        check_data(len(stored) <= _MOST_TENSORS, name, f"at most {_MOST_TENSORS:,} stored tensors", f"{len(stored):,}")
-        ports = len(model.graph.input) + len(model.graph.output)
-        most = _MOST_PORTS + len(stored)
-        check_data(ports <= most, name, f"at most {most:,} inputs and outputs", f"{ports:,}")
-        files = {path, *_files_of_weights(path.parent, stored)}
-        for tensor in stored:
-            check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)
-        length = sum(len(entry.key) + len(entry.value) for entry in model.metadata_props)
-        check_data(length <= _MOST_METADATA, name, f"at most {_MOST_METADATA:,} characters of metadata", f"{length:,}")
-        budget = Budget.of(_without_functions(model, name), canvas, name)
-        on_disk = sum(map(getsize, files))
-        budget.check(on_disk)
-        return budget.is_open(on_disk)
+        return _check_model(onnx.load(path, load_external_data=False), path, canvas, name)
     except DataError:
         raise
     except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
         reason = " ".join(str(error).split())[-_MOST_REASON:]
         raise DataError(f"cannot load the {name}: {reason}") from None
+
+
+def _check_model(model: ModelProto, path: Path, canvas: tuple[int, int], name: str) -> bool:
+    """Check what `check_file` has read; what later steps go through is counted by earlier ones."""
+    _check_count(name, len(model.functions), _MOST_FUNCTIONS, "functions")
+    stored = [*_tensors(model)]
+    _check_count(name, len(stored), _MOST_TENSORS, "stored tensors")
+    ports = len(model.graph.input) + len(model.graph.output)
+    _check_count(name, ports, _MOST_PORTS + len(stored), "inputs and outputs")
+    files = {path, *_files_of_weights(path.parent, stored)}
+    for tensor in stored:
+        check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)
+    length = sum(len(entry.key) + len(entry.value) for entry in model.metadata_props)
+    _check_count(name, length, _MOST_METADATA, "characters of metadata")
+
+    budget = Budget.of(_without_functions(model, name), canvas, name)
+    on_disk = sum(map(getsize, files))
+    budget.check(on_disk)
+    return budget.is_open(on_disk)
+
+
+def _check_count(name: str, count: int, most: int, what: str) -> None:
+    """Raise `DataError` if a model has too many of something."""
+    check_data(count <= most, name, f"at most {most:,} {what}", f"{count:,}")
 
 
 def stored_bytes(path: Path) -> int:
@@ -159,5 +167,5 @@ def _without_functions(model: ModelProto, name: str) -> ModelProto:
         return total
 
     nodes = count(model.graph.node)
-    check_data(nodes <= _MOST_NODES, name, f"at most {_MOST_NODES:,} nodes", f"{nodes:,}")
+    _check_count(name, nodes, _MOST_NODES, "nodes")
     return onnx.inliner.inline_local_functions(model) if model.functions else model
