@@ -140,20 +140,19 @@ def picture_terms(
     views = views_of(cells, quality, panorama=panorama)
     maps: list[Tensor] = []
     distances: list[float] = []
-    for view in views:
+    # Windows of a photograph are closer than the pictures of the fit are: the first view, the whole, tells.
+    judged_views = len(views) if panorama else 1
+    for number, view in enumerate(views):
         pixels = _pixels_of(view, image, cells)
         features = _features(detector, pixels, model)
         size_of_view = (int(pixels.shape[-2]), int(pixels.shape[-1]))
         maps.append(model.map(features, size_of_view)[0])
-        # Windows of a photograph are closer than the pictures of the fit are: the first view, the whole, tells.
-        if model.likeness is not None and (panorama or not distances):
+        if model.likeness is not None and number < judged_views:
             values = pooled(features, model.layers).to(model.likeness.mean)
             distances.append(float(model.likeness(values)[0]))
     unlikeness = digits(sum(distances) / len(distances)) if distances else None
 
-    map = joined(maps, views, cells)
-    if _GAIN[quality] != 1:
-        map = _GAIN[quality] * map
+    map = _GAIN[quality] * joined(maps, views, cells)
     centre = model.centre_bias(size)
     if panorama:
         centre = _same_in_all_directions(centre)
