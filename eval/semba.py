@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,9 +43,36 @@ from semfov.sensor import MultiScaleFovea
 
 _RULES = ("kaplan", "semba")
 _SHIFTS = (1, 3, 6)
-_STEPS = ("here", "scores", "and native picture", "and 3 × 3 inhibition", "and escape", "and bilinear crops")
-"""What a row takes over from the code of SemBA, beside what the rows before it do."""
-_SCORES, _NATIVE, _INHIBITION, _ESCAPE, _BILINEAR = range(1, 6)
+_Picture = Literal["shrunk", "native", "bilinear"]
+"""What crops show: the picture in the size of this project, in that of SemBA, or that without averaging."""
+
+
+class _Step(NamedTuple):
+    """What a row of the table takes over from the code of SemBA.
+
+    Attributes:
+        name: what it takes over beside what the row before it does.
+        scores: whether scores are those of the code (`_CodeLooks`).
+        picture: what crops show.
+        inhibition: whether the cells around those that were chosen are inhibited.
+        escape: whether those around the present cell are, too, if a crop shows nothing.
+    """
+
+    name: str
+    scores: bool = True
+    picture: _Picture = "native"
+    inhibition: bool = True
+    escape: bool = True
+
+
+_STEPS = (
+    _Step("here", scores=False, picture="shrunk", inhibition=False, escape=False),
+    _Step("scores", picture="shrunk", inhibition=False, escape=False),
+    _Step("and native picture", inhibition=False, escape=False),
+    _Step("and 3 × 3 inhibition", escape=False),
+    _Step("and escape"),
+    _Step("and bilinear crops", picture="bilinear"),
+)
 _LEAST = 1e-12
 
 
@@ -102,26 +129,33 @@ class _CodeLooks(Looks):
         self._crops: RememberedLooks[int, Detections] = RememberedLooks(self._open)
 
     def _open(self) -> Callable[[int], Detections]:
-        view, (detector, sensor) = self.eye.open(self.like), (self.eye.detector, self.eye.sensor)
+        detector = self.eye.detector
+        sensor = self.eye.sensor
+        view = self.eye.open(self.like)
 
         def look(cell: int) -> Detections:
             gaze = view.placement.points_to_canvas(self.grid.centres.to(self.like)[[cell]])
-            found = detector.propose(sensor.look(view.state, gaze)).precise()
-            best = found.confidence.topk(min(detector.selection.limit, found.confidence.shape[1])).indices[..., None]
-            boxes, classes = (each.take_along_dim(best, 1) for each in (found.boxes, found.classes))
+            candidates = detector.propose(sensor.look(view.state, gaze)).precise()
+            count = min(detector.selection.limit, candidates.confidence.shape[1])
+            best = candidates.confidence.topk(count).indices[..., None]
+            classes = candidates.classes.take_along_dim(best, 1)
             scores = classes.double().logit(_LEAST).softmax(-1).to(classes)
-            boxes = view.placement.boxes_to_image(sensor.boxes_to_canvas(view.state, gaze, boxes))
+            boxes_in_crops = candidates.boxes.take_along_dim(best, 1)
+            boxes = view.placement.boxes_to_image(sensor.boxes_to_canvas(view.state, gaze, boxes_in_crops))
             return Detections(boxes, scores, scores.amax(-1) > detector.selection.threshold)
 
         return look
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> EpisodeLook:
         """Look, and weigh."""
-        crops = Detections.stack([self._crops(number) for number in cell.tolist()])
-        rows = crops.mask.unflatten(0, (len(cell), -1))
-        self.cell, self.empty = cell, ~rows.any(-1).all(-1)
-        boxes, scores = (each.unflatten(0, rows.shape[:2]).flatten(1, 2) for each in (crops.boxes, crops.scores))
-        detections = Detections(boxes, scores, rows.flatten(1))
+        crops = Detections.stack([self._crops(number) for number in cell.tolist()])  # a row for each crop
+        shown = crops.mask.unflatten(0, (len(cell), -1))  # (A, crops, N)
+        self.cell = cell
+        self.empty = ~shown.any(-1).all(-1)
+        # The boxes of all crops of a look are in one row.
+        boxes = crops.boxes.unflatten(0, shown.shape[:2]).flatten(1, 2)
+        scores = crops.scores.unflatten(0, shown.shape[:2]).flatten(1, 2)
+        detections = Detections(boxes, scores, shown.flatten(1))
         return EpisodeLook(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
 
 
@@ -148,10 +182,12 @@ class _Inhibited(Greedy):
         return fixation, cell
 
     def _around(self, cell: Tensor) -> Tensor:
-        columns, place = self.looks.grid.columns, torch.arange(len(self.looks.grid))
-        across = (place % columns - cell[:, None] % columns).abs()
-        down = (place // columns - cell[:, None] // columns).abs()
-        return (across <= 1) & (down <= 1)
+        """Mark the 3 × 3 cells around cells `(B,)`, `(B, X·Y)`."""
+        columns = self.looks.grid.columns
+        cells = torch.arange(len(self.looks.grid))
+        columns_apart = (cells % columns - cell[:, None] % columns).abs()
+        rows_apart = (cells // columns - cell[:, None] // columns).abs()
+        return (columns_apart <= 1) & (rows_apart <= 1)
 
 
 def _search_as_semba(config: _SembaConfig) -> None:
@@ -170,18 +206,22 @@ def _search_as_semba(config: _SembaConfig) -> None:
 
     def measure(cases: Tensor) -> Tensor:
         chosen = figures[cases]
-        stopped, right = chosen[..., -2].mean(0), chosen[..., -1].sum(0) / chosen[..., -2].sum(0)
-        return torch.cat([chosen[..., :-2].mean(0), torch.stack([stopped, right], -1)], -1)
+        fixated = chosen[..., :-2]
+        stopped = chosen[..., -2]
+        right = chosen[..., -1]
+        of_stops = torch.stack([stopped.mean(0), right.sum(0) / stopped.sum(0)], -1)
+        return torch.cat([fixated.mean(0), of_stops], -1)
 
     bootstrap = Bootstrap.of(measure, scenes)
     head = [*(f"CP@{n}" for n in _SHIFTS if n <= config.protocol.shifts), "stopped", "right of those"]
-    ways = [f"{step}, {rule}" for step in _STEPS for rule in _RULES]
+    ways = [f"{step.name}, {rule}" for step, rule in product(_STEPS, _RULES)]
     rows = [["as in the code of SemBA, rule", *head]]
     rows += [[way, *_cells(bootstrap, n)] for n, way in enumerate(ways)]
-    apart = [["less the row of this rule before", *head]]
-    for n, way in enumerate(ways[2:]):
-        apart.append([way, *_cells(bootstrap.less(n), n + 2, "+")])
-    lines = [*table(rows), "", *table(apart)]
+    differences = [["less the row of this rule before", *head]]
+    for n in range(len(_RULES), len(ways)):
+        before = bootstrap.less(n - len(_RULES))
+        differences.append([ways[n], *_cells(before, n, "+")])
+    lines = [*table(rows), "", *table(differences)]
     text = "\n".join([f"{len(results)} searches in {len(set(scenes))} photographs", "", *lines, ""])
     write_text(config.out / "summary.md", text)
     print(text)
@@ -195,38 +235,49 @@ def _cells(figures: Bootstrap, row: int, sign: str = "") -> list[str]:
 
 @torch.inference_mode()
 def _search_scene(config: _SembaConfig, run: Looking, index: int) -> list[Tensor]:
-    """Search one photograph for each of its targets that is not in the middle."""
-    grid, annotation = run.grid(index), run.scenes.annotation(index)
+    """Search one photograph for each of its targets that is not in the middle; figures `(steps · rules, 5)` of each."""
+    grid = run.grid(index)
+    annotation = run.scenes.annotation(index)
     middle = grid.cell_of(grid.extent[None] / 2)
     covered = grid.footprint(annotation.boxes)
     goals = {target: covered[annotation.labels == target].any(0) for target in run.scenes.targets(index)}
-    targets = torch.tensor([target for target, goal in goals.items() if not bool(goal[middle])], dtype=torch.int64)
-    if not len(targets):
+    goals = {target: goal for target, goal in goals.items() if not bool(goal[middle])}
+    if not goals:
         return []
-    goal = torch.stack([goals[target] for target in targets.tolist()])
+    targets = torch.tensor([*goals], dtype=torch.int64)
+    goal = torch.stack([*goals.values()])
+    noise = torch.stack([noise_for(config.protocol, len(grid), index, target) for target in goals])
     image = run.scenes[index].image[None]
     store = run.store if config.store else None
     remembered = RememberedLooks(
         lambda: photograph_looks(run.eye, lambda: image, grid), store, lambda: run.digest(index)
     )
-    sizes = run.eye.reference, config.native
-    sensor: Any = run.eye.sensor
-    eyes = [Eye(sensor, run.eye.detector, reference=each) for each in sizes]
-    eyes.append(Eye(_BilinearFovea(sensor.side, sensor.scales), run.eye.detector, reference=config.native))
-    here, codes = CellLooks(remembered, grid, image), [_CodeLooks(eye, image, grid) for eye in eyes]
-    noise = torch.stack([noise_for(config.protocol, len(grid), index, target) for target in targets.tolist()])
+    looks_here = CellLooks(remembered, grid, image)
+    code_looks = {picture: _CodeLooks(eye, image, grid) for picture, eye in _eyes(config, run.eye).items()}
     results = []
-    for step, rule in product(range(len(_STEPS)), _RULES):
-        code, choice = codes[(step >= _NATIVE) + (step >= _BILINEAR)], Greedy(drawn_from(noise))
-        if step >= _INHIBITION:
-            choice = _Inhibited(noise, code, escape=step >= _ESCAPE)
-        looks: Looks = here if step < _SCORES else code
-        # Without a component for background the classes are components from 0 on.
-        first = int(step < _SCORES)
+    for step, rule in product(_STEPS, _RULES):
+        looks_of_code = code_looks[step.picture]
+        looks: Looks = looks_of_code if step.scores else looks_here
+        choice = Greedy(drawn_from(noise))
+        if step.inhibition:
+            choice = _Inhibited(noise, looks_of_code, escape=step.escape)
+        # Scores of the code have no component for background: classes are components from 0 on.
+        first = 0 if step.scores else 1
         observer = Semantic(len(run.scenes.classes) + first, prior=config.belief.prior, fusion=rule)
         results.append(_search(config, looks, observer, targets - 1 + first, goal, middle, choice))
     remembered.save()
     return list(torch.stack(results, 1))
+
+
+def _eyes(config: _SembaConfig, eye: Eye) -> dict[_Picture, Eye]:
+    """Make the eyes whose crops show the picture in each of the ways."""
+    sensor: Any = eye.sensor
+    bilinear = _BilinearFovea(sensor.side, sensor.scales)
+    return {
+        "shrunk": Eye(sensor, eye.detector, reference=eye.reference),
+        "native": Eye(sensor, eye.detector, reference=config.native),
+        "bilinear": Eye(bilinear, eye.detector, reference=config.native),
+    }
 
 
 def _search(

@@ -22,13 +22,12 @@ import torch
 from torch import Tensor
 
 from eval.bootstrap import Bootstrap
-from eval.comparison.looking import ComparedLooking
 from eval.comparison.summary import Curve, collect_records
 from eval.explore.report import success
 from eval.explore.run import ExploreConfig, ExploreRun
 from eval.search.report import performance
 from eval.search.run import SearchConfig, SearchRun
-from semfov.data.scene import Scenes
+from semfov.data.scene import Annotation, Scenes
 from semfov.detection import Detections
 from semfov.errors import check, lookup
 from semfov.eye import Eye
@@ -71,7 +70,10 @@ A Gaussian window of 10,000 px is flat, so the sharp sensor shows the same from 
 
 _SHIFTS = (1, 5, 15)
 _ANSWERS = ("all classes", "without background")
-_SCORE, _OVERLAP = 0.1, 0.5
+_SCORE = 0.1
+_OVERLAP = 0.5
+_PLACES = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
+"""Where the five looks fixate, as shares of width and height."""
 
 
 @dataclass(frozen=True)
@@ -126,31 +128,38 @@ def _compare_sensors(config: _SensorsConfig) -> None:
 
 def _row(config: _SensorsConfig, name: str) -> list[str]:
     """Write the row of a sensor."""
-    shared, folder = config.settings(name), config.folder(name)
-    belief, searchers, mapping = config.belief, policies(config), "random-raw"
+    searchers = policies(config)
+    mapping = "random-raw"
+    belief = config.belief
     model = None
     if config.fixations:
-        file, mapping = _observation(config, name), "random-calibrated"
+        file = _observation(config, name)
+        mapping = "random-calibrated"
         belief = replace(belief, model=str(file))
         model = FovealObservationModel.from_pretrained(file).requires_grad_(False)
-    common = {"data": config.data, "protocol": config.protocol, "store": config.store, **shared}
-    common["belief"] = belief
+    common = {"data": config.data, "protocol": config.protocol, "store": config.store, "belief": belief}
+    common |= config.settings(name)
+    folder = config.folder(name)
+
     search = SearchRun(SearchConfig(policies=searchers, out=folder / "search", **common))
-    performances = _curves(
-        search, name, lambda records: performance(records, searchers, config.protocol.shifts, "all targets")
-    )
+    finish(search, name)
+    searches = collect_records(search)[0]
+    performances = performance(searches, searchers, config.protocol.shifts, "all targets")
     explore = ExploreRun(ExploreConfig(policies=(mapping,), out=folder / "explore", **common))
-    map_curves = {answer: _curves(explore, name, lambda r, a=answer: success(r, [mapping], a)) for answer in _ANSWERS}
-    five = _five_looks(search, model, config.classes)
+    finish(explore, name)
+    maps = collect_records(explore)[0]
+
     pixels, seconds = cost(search.eye, search.scenes[0].image)
-    return [
-        name,
-        f"{pixels:,}",
-        f"{1e3 * seconds:.0f}",
-        *(percent(*_at(performances[policy], n)) for policy in searchers[1:] for n in _SHIFTS),
-        *(plus_minus(float(value), float(error), 3) for value, error in zip(five.value, five.error, strict=True)),
-        *(percent(*_at(map_curves[answer][mapping], _SHIFTS[-1])) for answer in _ANSWERS),
-    ]
+    cells = [name, f"{pixels:,}", f"{1e3 * seconds:.0f}"]
+    for policy in searchers[1:]:
+        cells += [_percent_after(performances[policy], shifts) for shifts in _SHIFTS]
+    looks = _five_looks(search, model, config.classes)
+    for value, error in zip(looks.value.tolist(), looks.error.tolist(), strict=True):
+        cells.append(plus_minus(value, error, 3))
+    for answer in _ANSWERS:
+        curve = success(maps, [mapping], answer)[mapping]
+        cells.append(_percent_after(curve, _SHIFTS[-1]))
+    return cells
 
 
 def policies(config: _SensorsConfig) -> tuple[str, ...]:
@@ -174,58 +183,79 @@ def _observation(config: _SensorsConfig, name: str) -> Path:
     return file
 
 
-def _curves(run: ComparedLooking, name: str, measure: Any) -> dict[str, Curve]:
-    """Finish a run, and average its records."""
-    finish(run, name)
-    curves: dict[str, Curve] = measure(collect_records(run)[0])
-    return curves
+def _percent_after(curve: Curve, shifts: int) -> str:
+    """Write a curve's value after some gaze shifts in percent, with its error over images."""
+    return percent(float(curve.mean[shifts]), float(curve.over_images[shifts]))
 
 
-def _at(curve: Curve, shift: int) -> tuple[float, float]:
-    return float(curve.mean[shift]), float(curve.over_images[shift])
+class _Seen(NamedTuple):
+    """What one look, and five looks, show of a photograph.
+
+    Attributes:
+        scores: `(C, 2)`, the largest score of each examined class in one look, and in five.
+        present: `(C,)`, whether the photograph has the class.
+        objects: `(3,)`, the objects that one look finds, that five find, and all.
+    """
+
+    scores: Tensor
+    present: Tensor
+    objects: Tensor
 
 
 def _five_looks(run: SearchRun, model: FovealObservationModel | None, classes: int) -> Bootstrap:
-    """Return what is seen in one look from the middle, and in that and four looks around it.
+    """Measure what is seen in one look from the middle, and in that and four looks around it.
 
     The area tells how well the largest score of a class says whether it is in a photograph. An object is found by a
     detection of its class with a score of 0.1 that overlaps it by half.
 
     Shapes: → `(4,)`.
     """
-    scores, there, groups = [], [], []
-    objects = torch.zeros(len(run.scenes), 3)
-    for index in range(len(run.scenes)):
-        grid, annotation = run.grid(index), run.scenes.annotation(index)
-        places = grid.extent * torch.tensor([[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
-        cells = grid.cell_of(places)
-        detections = run.detections(index)[cells]
-        boxes, labels = annotation.boxes[~annotation.crowd], annotation.labels[~annotation.crowd]
-        overlap = torch.stack([box_iou(boxes, each) for each in detections.boxes])
-        hits = (overlap >= _OVERLAP) & (detections.labels[:, None] == labels[:, None])
-        hits = (hits & (detections.confidence >= _SCORE)[:, None]).any(-1)
-        objects[index] = torch.stack([hits[0].sum(), hits.any(0).sum(), torch.tensor(len(boxes))])
-        chosen, present = _classes(run.scenes, index, classes, run.config.protocol.seed)
-        if model is not None:
-            distance = grid.box_distance(detections.boxes, grid.centres[cells])
-            calibrated = model.calibrate(detections.scores, distance)
-            detections = Detections(detections.boxes, calibrated, detections.mask, detections.confidence)
-        highest = detections.highest[:, torch.tensor(chosen, dtype=torch.int64)]
-        scores.append(torch.stack([highest[0], highest.amax(0)], -1))
-        there.append(present)
-        groups.append(torch.full((len(chosen),), index))
-    score, label, group = torch.cat(scores), torch.cat(there), torch.cat(groups)
-    of_scene = [(group == index).nonzero()[:, 0] for index in range(len(run.scenes))]
+    scenes = [_seen(run, index, model, classes) for index in range(len(run.scenes))]
 
     def measure(drawn: Tensor) -> Tensor:
-        cases = torch.cat([of_scene[index] for index in drawn.tolist()])
-        truth, counts = label[cases], objects[drawn].sum(0)
+        chosen = [scenes[index] for index in drawn.tolist()]
+        present = torch.cat([scene.present for scene in chosen])
         areas = torch.full((2,), torch.nan)
-        if truth.any() and not truth.all():
-            areas = torch.tensor([area_under_roc(score[cases, looks], truth) for looks in range(2)])
-        return torch.cat([areas, counts[:2] / counts[2]])
+        if present.any() and not present.all():
+            scores = torch.cat([scene.scores for scene in chosen])
+            areas = torch.tensor([area_under_roc(of_looks, present) for of_looks in scores.T])
+        found_in_one, found_in_five, objects = torch.stack([scene.objects for scene in chosen]).sum(0)
+        return torch.cat([areas, torch.stack([found_in_one, found_in_five]) / objects])
 
-    return Bootstrap.of(measure, range(len(run.scenes)), samples=200)
+    return Bootstrap.of(measure, range(len(scenes)), samples=200)
+
+
+def _seen(run: SearchRun, index: int, model: FovealObservationModel | None, classes: int) -> _Seen:
+    """Look at a photograph from the middle, and from four places around it.
+
+    Args:
+        run: takes the looks.
+        index: number of the photograph.
+        model: calibrates the scores; None leaves them as they are.
+        classes: largest number of classes that the photograph has, and that it lacks.
+    """
+    grid = run.grid(index)
+    cells = grid.cell_of(grid.extent * torch.tensor(_PLACES))
+    detections = run.detections(index)[cells]
+    objects = _found_objects(detections, run.scenes.annotation(index))
+    chosen, present = _classes(run.scenes, index, classes, run.config.protocol.seed)
+    if model is not None:
+        distance = grid.box_distance(detections.boxes, grid.centres[cells])
+        calibrated = model.calibrate(detections.scores, distance)
+        detections = Detections(detections.boxes, calibrated, detections.mask, detections.confidence)
+    highest = detections.highest[:, torch.tensor(chosen, dtype=torch.int64)]  # (5, C)
+    return _Seen(torch.stack([highest[0], highest.amax(0)], -1), present, objects)
+
+
+def _found_objects(detections: Detections, annotation: Annotation) -> Tensor:
+    """Count the annotated objects that the first look finds, that any look finds, and all, `(3,)`."""
+    boxes = annotation.boxes[~annotation.crowd]  # (M, 4)
+    labels = annotation.labels[~annotation.crowd]
+    overlap = torch.stack([box_iou(boxes, in_look) for in_look in detections.boxes])  # (5, M, N)
+    of_class = detections.labels[:, None] == labels[:, None]
+    sure = (detections.confidence >= _SCORE)[:, None]
+    found = ((overlap >= _OVERLAP) & of_class & sure).any(-1)  # (5, M)
+    return torch.tensor([float(found[0].sum()), float(found.any(0).sum()), float(len(boxes))])
 
 
 def _classes(scenes: Scenes, index: int, classes: int, seed: int) -> tuple[list[int], Tensor]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -117,11 +117,64 @@ class DecideConfig(ComparedConfig):
 
     def complete(self, folder: ModelFolder) -> Self:
         """Return the settings with the folder's models that its agent uses, where none are given explicitly."""
-        own = {name: folder.file(name) for name in ("windows", "verification") if folder.used(name)}
-        missing: dict[str, Any] = {
-            name: str(file) for name, file in own.items() if file is not None and getattr(self, name) is None
-        }
+        missing: dict[str, Any] = {}
+        for name in ("windows", "verification"):
+            file = folder.file(name) if folder.used(name) else None
+            if file is not None and getattr(self, name) is None:
+                missing[name] = str(file)
         return replace(self, **missing)
+
+
+class _Way(NamedTuple):
+    """A way to search with a fovea.
+
+    Attributes:
+        strategy: observer and policy.
+        rule: decides when a search is over, where no closer looks do.
+        verified: whether closer looks decide.
+    """
+
+    strategy: Strategy
+    rule: _Rule
+    verified: bool = False
+
+
+class _Scene(NamedTuple):
+    """A scene, and what all searches in it share.
+
+    Attributes:
+        index: its number.
+        image: `(1, 3, H, W)`.
+        grid: the grid over it.
+        annotation: its objects.
+        whole: detections in the whole image.
+        quarters: detections in each quarter; none for a run without plain rules.
+        everywhere: detections from every cell; None for a run without references.
+        remembered: looks at cells and at boxes, each taken when a search first needs it.
+    """
+
+    index: int
+    image: Tensor
+    grid: Grid
+    annotation: Annotation
+    whole: Detections
+    quarters: list[Detections]
+    everywhere: Detections | None
+    remembered: RememberedLooks[int | tuple[float, ...], Detections]
+
+    def boxes(self, target: int) -> Tensor:
+        """Select the annotated boxes of a class, `(M, 4)`."""
+        return self.annotation.boxes[self.annotation.labels == target]
+
+    def looks(self, target: int) -> Looks:
+        """Make the source of looks for a search."""
+        if self.everywhere is not None:
+            return StoredLooks(self.everywhere, self.grid, torch.tensor([target]))
+        return CellLooks(self.remembered, self.grid, self.grid.centres, target)
+
+    def close_up(self, box: Tensor) -> Detections:
+        """Look at a box closely."""
+        return self.remembered(tuple(box.tolist()))
 
 
 class DecisionRun(ComparedLooking):
@@ -142,34 +195,40 @@ class DecisionRun(ComparedLooking):
         # The key of the run, which the base makes first, depends on this model.
         self.verification: Verification | None = None
         super().__init__(config)
-        # All share one observer, so that the likelihoods of the looks are computed only once.
-        observer = self.strategies[AGENT].observer
-        chosen = observer.thresholds or Thresholds(0.9, 0.05)
-        self.thresholds = chosen.changed(config.confirm, config.stop_below, config.place)
-        # The shipped verification was fitted with the shipped model of searches.
-        if config.closer and (config.verification or config.belief.search_model is None):
+        # The shipped models of verification and of windows were fitted with the shipped model of searches.
+        is_shipped = config.belief.search_model is None
+        if config.closer and (config.verification or is_shipped):
             self.verification = if_shipped(make_verification, config.verification, self.eye)
-        self.verified = {AGENT, RANDOM} if self.verification is not None else set()
-        self.windows = None
-        if config.belief.search_model is None or config.windows is not None:
+        self.windows: GlimpseEvidence | None = None
+        if config.windows is not None or is_shipped:
             self.windows = if_shipped(_window_evidence, config.windows, self.eye)
         self.by_windows = window_eye(self.eye.detector, self.windows).eval().requires_grad_(False)
-        learned, random = Strategy(observer, Policy("non-predictive")), Strategy(observer, Policy("random"))
-        self.compared: dict[str, tuple[Strategy, _Rule]] = {AGENT: (learned, self._by_thresholds)}
-        if not config.references:
-            return
-        if self.verified:
-            self.compared[UNVERIFIED] = learned, self._by_thresholds
-        self.compared[RANDOM] = random, self._by_thresholds
-        model = if_shipped(make_observation, config.belief.model, self.eye)
-        if model is not None:
-            self.models = self.models._replace(observation=model)
-            published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Policy("predictive", model))
-            name = CALIBRATED if model.metadata.get("method") == "discriminative" else PUBLISHED
-            self.compared |= {
-                name: (published, self._by_thresholds),
-                f"{name}, a detection at the gaze": (published, at_the_gaze),
-            }
+
+        # All share one observer, so that the likelihoods of the looks are computed only once.
+        observer = self.strategies[AGENT].observer
+        thresholds = observer.thresholds or Thresholds(0.9, 0.05)
+        self.thresholds = thresholds.changed(config.confirm, config.stop_below, config.place)
+        learned = Strategy(observer, Policy("non-predictive"))
+        verified = self.verification is not None
+        self.compared = {AGENT: _Way(learned, self._by_thresholds, verified)}
+        if config.references:
+            if verified:
+                self.compared[UNVERIFIED] = _Way(learned, self._by_thresholds)
+            self.compared[RANDOM] = _Way(Strategy(observer, Policy("random")), self._by_thresholds, verified)
+            self.compared |= self._with_published_belief()
+
+    def _with_published_belief(self) -> dict[str, _Way]:
+        """Make the ways to search with the published belief; none where the eye has no observation model."""
+        model = if_shipped(make_observation, self.config.belief.model, self.eye)
+        if model is None:
+            return {}
+        self.models = self.models._replace(observation=model)
+        strategy = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Policy("predictive", model))
+        name = CALIBRATED if model.metadata.get("method") == "discriminative" else PUBLISHED
+        return {
+            name: _Way(strategy, self._by_thresholds),
+            f"{name}, a detection at the gaze": _Way(strategy, at_the_gaze),
+        }
 
     @cached_property
     def frequencies(self) -> list[Tensor]:
@@ -188,28 +247,6 @@ class DecisionRun(ComparedLooking):
         candidates = CandidateCells(grid, target, prior=prior)
         return Verifier(self.verification, candidates, thresholds, config.closer)
 
-    def _by_windows(self, source: WindowLooks, search: DrawnSearch, grid: Grid, annotation: Annotation) -> ResultRecord:
-        """Return what the agent that looks at windows makes of a search."""
-        config, target = self.config, search.target
-        assert self.windows is not None
-        goal = Goal.of(("background", *self.eye.detector.classes), target)
-        decisions = DecisionSettings(config.confirm, config.stop_below, None if config.closer else 0, "fit")
-        path = WindowEpisode(WindowTask(goal, self.windows, decisions), source, EpisodeLimits(PASSES)).run()
-        decision = path.decision
-        assert decision is not None
-        box = decision.box if decision.outcome == "found" else None
-        return {
-            "outcome": decision.outcome,
-            "probability": decision.probability,
-            "place": decision.place,
-            "looks": path.passes,
-            "closer": len(path.closer),
-            "right_place": None if box is None else bool(search.goal[cell_of(box, grid)]),
-            "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
-            "landing": None,
-            "landing_seen": None,
-        }
-
     def depends_on(self) -> dict[str, Any]:
         """List what searches depend on, the thresholds that are given, and the model of verification."""
         config = self.config
@@ -223,95 +260,136 @@ class DecisionRun(ComparedLooking):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run all searches of a scene; returns their records, and the seconds that each stage took."""
-        annotation, grid = self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
-        area = self.config.data.max_target_area or 1.0
-        searches = choose_searches(self.scenes, index, grid, self.config.protocol, 1, area)
-        records: list[ResultRecord] = []
+        largest_area = self.config.data.max_target_area or 1.0
+        searches = choose_searches(self.scenes, index, self.grid(index), self.config.protocol, 1, largest_area)
         if not searches:
-            return records, watch.seconds
+            return [], watch.seconds
+        scene = self._opened(index)
+        watch.lap("look")
+        windows = StoredWindowLooks(self.by_windows, self.scenes, index, None)
+        records: list[ResultRecord] = []
+        for search in searches:
+            searched = self._searched(scene, search)
+            if self.windows is not None:
+                records.append({"policy": WINDOWS, **searched, **self._by_windows(scene, search, windows)})
+            for name, outcome in self._by_cells(scene, search).items():
+                records.append({"policy": name, **searched, **outcome})
+        scene.remembered.save()
+        watch.lap("search")
+        return records, watch.seconds
+
+    def _opened(self, index: int) -> _Scene:
+        """Look at a scene as the references do: as a whole, at its quarters, and from every cell."""
+        grid = self.grid(index)
         # All searches together look from most of the cells; the agent's alone look from few.
         everywhere = self.detections(index) if self.config.references else None
+        image = self.scenes[index].image[None]
         with torch.inference_mode():
-            image = self.scenes[index].image[None]
-            sharp = self.eye.detector(image)
+            whole = self.eye.detector(image)
             tiles = [self.eye.detector(tile) for tile in quarters(image)] if self.config.rules else []
-        watch.lap("look")
         store = self.store if self.config.store and everywhere is None else None
         remembered: RememberedLooks[int | tuple[float, ...], Detections] = RememberedLooks(
             lambda: photograph_looks(self.eye, lambda: image, grid), store, lambda: self.digest(index)
         )
-        source = StoredWindowLooks(self.by_windows, self.scenes, index, None)
+        return _Scene(index, image, grid, self.scenes.annotation(index), whole, tiles, everywhere, remembered)
 
-        def close_up(box: Tensor) -> Detections:
-            return remembered(tuple(box.tolist()))
+    def _searched(self, scene: _Scene, search: DrawnSearch) -> ResultRecord:
+        """Describe a search, with what the references say of it."""
+        target = search.target
+        plain = None
+        tiled = None
+        if scene.quarters:
+            plain = plain_looks(self.eye, scene.image, scene.whole, target, scene.grid, search.goal)
+            tiled = max(float(look.highest[0, target]) for look in (scene.whole, *scene.quarters))
+        return {
+            "scene": self.scenes.ids[scene.index],
+            "target": target,
+            "present": search.present,
+            "sharp": float(scene.whole.highest[0, target]),
+            "frequency": float(self.frequencies[scene.index][target]),
+            "plain": plain,
+            "tiled": tiled,
+            "sharp_place": sharp_place(scene.whole, scene.grid, target, search.goal, scene.boxes(target)),
+        }
 
-        for search in searches:
-            target, goal = search.target, search.goal
-            common = {
-                "scene": self.scenes.ids[index],
-                "target": target,
-                "present": search.present,
-                "sharp": float(sharp.highest[0, target]),
-                "frequency": float(self.frequencies[index][target]),
-                "plain": plain_looks(self.eye, image, sharp, target, grid, goal) if tiles else None,
-                "tiled": max(float(look.highest[0, target]) for look in (sharp, *tiles)) if tiles else None,
-                "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
-            }
-            if self.windows is not None:
-                records.append({"policy": WINDOWS, **common, **self._by_windows(source, search, grid, annotation)})
-            looks: Looks = CellLooks(remembered, grid, grid.centres, target)
-            if everywhere is not None:
-                looks = StoredLooks(everywhere, grid, torch.tensor([target]))
-            # Ways with one observer have one here, too, so that looks are weighed once.
-            with_prior_of_fit: dict[Observer, tuple[Strategy, Prior]] = {}
-            for name, (compared, judge) in self.compared.items():
+    def _by_windows(self, scene: _Scene, search: DrawnSearch, source: WindowLooks) -> ResultRecord:
+        """Search by windows, and return the outcome."""
+        config = self.config
+        assert self.windows is not None
+        goal = Goal.of(("background", *self.eye.detector.classes), search.target)
+        decisions = DecisionSettings(config.confirm, config.stop_below, None if config.closer else 0, "fit")
+        path = WindowEpisode(WindowTask(goal, self.windows, decisions), source, EpisodeLimits(PASSES)).run()
+        decision = path.decision
+        assert decision is not None
+        box = decision.box if decision.outcome == "found" else None
+        return {
+            "outcome": decision.outcome,
+            "probability": decision.probability,
+            "place": decision.place,
+            "looks": path.passes,
+            "closer": len(path.closer),
+            "right_place": None if box is None else bool(search.goal[cell_of(box, scene.grid)]),
+            "overlap": overlap(decision.box, scene.boxes(search.target)),
+            "landing": None,
+            "landing_seen": None,
+        }
 
-                def by_thresholds(step: Step, judge: _Rule = judge, target: int = target) -> Tensor:
-                    return judge(step, target, grid)
+    def _by_cells(self, scene: _Scene, search: DrawnSearch) -> dict[str, ResultRecord]:
+        """Search in each of the compared ways, and return the outcomes by its name."""
+        looks = scene.looks(search.target)
+        # Ways with one observer have one here, too, so that looks are weighed once.
+        with_prior_of_fit: dict[Observer, tuple[Strategy, Prior]] = {}
+        outcomes = {}
+        for name, way in self.compared.items():
+            observer = way.strategy.observer
+            if observer not in with_prior_of_fit:
+                # Targets are drawn as they were in the fit, and there as often.
+                with_prior_of_fit[observer] = way.strategy.with_prior("fit", search.target)
+            changed, prior = with_prior_of_fit[observer]
+            way_of_search = way._replace(strategy=Strategy(changed.observer, way.strategy.policy))
+            with torch.inference_mode():
+                outcomes[name] = self._outcome(scene, search, looks, way_of_search, prior)
+        return outcomes
 
-                if compared.observer not in with_prior_of_fit:
-                    # Targets are drawn as they were in the fit, and there as often.
-                    with_prior_of_fit[compared.observer] = compared.with_prior("fit", target)
-                changed, prior = with_prior_of_fit[compared.observer]
-                strategy = Strategy(changed.observer, compared.policy)
-                verifier = self._verifier(grid, target, prior) if name in self.verified else None
-                rule: Callable[[Step], Tensor] = by_thresholds
-                if verifier is not None:
-                    rule = partial(_by_closer_looks, verifier=verifier, close_up=close_up)
-                with torch.inference_mode():
-                    steps = _search_steps(looks, strategy, target, search.start, search.noise, rule)
-                    last, path = steps[-1], torch.cat([step.cell for step in steps])
-                    if verifier is not None:
-                        verifier.end()
-                        verifier.look_closely(close_up)
-                        decision = verifier.final_decision()
-                    else:
-                        # If a detection at the gaze has ended the search, the target's place is the fixated cell.
-                        place = int(last.cell) if judge is at_the_gaze else None
-                        visited = [step.detections for step in steps]
-                        decision = decision_without_closer_looks(
-                            int(rule(last)), last.belief, visited, grid, target, place
-                        )
-                closely = 0 if verifier is None else len(verifier.looks)
-                records.append(
-                    {
-                        "policy": name,
-                        **common,
-                        "outcome": decision.outcome,
-                        "probability": decision.probability,
-                        "place": None if verifier is None else decision.place,
-                        "looks": len(steps) + closely,
-                        "closer": closely,
-                        "right_place": None if decision.cell is None else bool(goal[decision.cell]),
-                        "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
-                        "landing": landing([step.belief for step in steps], path, goal, target),
-                        "landing_seen": detected_on_landing(steps, path, goal, target, grid),
-                    }
-                )
-        remembered.save()
-        watch.lap("search")
-        return records, watch.seconds
+    def _outcome(self, scene: _Scene, search: DrawnSearch, looks: Looks, way: _Way, prior: Prior) -> ResultRecord:
+        """Search in one way, and return the outcome."""
+        target = search.target
+
+        def by_rule(step: Step) -> Tensor:
+            return way.rule(step, target, scene.grid)
+
+        verifier = self._verifier(scene.grid, target, prior) if way.verified else None
+        rule: Callable[[Step], Tensor] = by_rule
+        if verifier is not None:
+            rule = partial(_by_closer_looks, verifier=verifier, close_up=scene.close_up)
+        steps = _search_steps(looks, way.strategy, target, search.start, search.noise, rule)
+        last = steps[-1]
+        closer_looks = 0
+        place = None
+        if verifier is not None:
+            verifier.end()
+            verifier.look_closely(scene.close_up)
+            decision = verifier.final_decision()
+            closer_looks = len(verifier.looks)
+            place = decision.place
+        else:
+            # If a detection at the gaze has ended the search, the target's place is the fixated cell.
+            cell = int(last.cell) if way.rule is at_the_gaze else None
+            seen = [step.detections for step in steps]
+            decision = decision_without_closer_looks(int(rule(last)), last.belief, seen, scene.grid, target, cell)
+        path = torch.cat([step.cell for step in steps])
+        return {
+            "outcome": decision.outcome,
+            "probability": decision.probability,
+            "place": place,
+            "looks": len(steps) + closer_looks,
+            "closer": closer_looks,
+            "right_place": None if decision.cell is None else bool(search.goal[decision.cell]),
+            "overlap": overlap(decision.box, scene.boxes(target)),
+            "landing": landing([step.belief for step in steps], path, search.goal, target),
+            "landing_seen": detected_on_landing(steps, path, search.goal, target, scene.grid),
+        }
 
 
 def _window_evidence(name: str | None, eye: Eye) -> GlimpseEvidence:
@@ -415,11 +493,21 @@ LANDINGS_TEXT = (
 
 
 def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
-    """Cells under `LANDINGS`: number and mean probabilities before and after, of all landings, seen, and not seen."""
+    """Write the cells under `LANDINGS` for all landings, for those that are seen, and for those that are not.
+
+    Args:
+        landed: for each landing, the probabilities before and after it, and whether the target is seen.
+
+    Returns:
+        For each group, its number of landings and its mean probabilities.
+    """
+    everything = [probabilities for probabilities, _ in landed]
+    seen = [probabilities for probabilities, is_seen in landed if is_seen]
+    not_seen = [probabilities for probabilities, is_seen in landed if not is_seen]
     cells: list[str] = []
-    for group in (landed, [each for each in landed if each[1]], [each for each in landed if not each[1]]):
-        means = [sum(column) / len(column) for column in zip(*(pair for pair, _ in group), strict=True)]
-        cells += [str(len(group)), " → ".join(f"{value:.3f}" for value in means) or "-"]
+    for group in (everything, seen, not_seen):
+        means = [sum(column) / len(column) for column in zip(*group, strict=True)]
+        cells += [str(len(group)), " → ".join(f"{mean:.3f}" for mean in means) or "-"]
     return cells
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import pairwise
@@ -45,6 +45,8 @@ _Array = NDArray[np.float64]
 PEOPLE = "inter-observer"
 _BANDWIDTH = 0.08
 """Bandwidth of the clusters of fixations that make up the letters of a sequence, in longer sides of the picture."""
+_MAP = "map and centre bias"
+"""Row of the scores of a map without oculomotor biases."""
 _OF_ONE_MAP = {"readouts": 1, "units": 4}
 """Settings of the readout of a saliency map, which is one channel."""
 
@@ -77,55 +79,145 @@ class ViewingConfig(ViewingData):
     out: Path = Path("runs/human_viewing")
 
 
+class _Results:
+    """What the tables show, by model."""
+
+    def __init__(self) -> None:
+        self.scores: dict[str, Scores] = {}
+        self.splits: dict[str, Scores] = {}
+        self.sequences: dict[str, list[dict[str, float]]] = {}
+        self.glimpses: dict[str, Tensor] = {}
+
+    def tables(self) -> dict[str, list[str]]:
+        """Write the tables, each under its name on the page."""
+        return {
+            "viewing": viewing_table(self.scores),
+            "viewing terms": terms_table(self.scores),
+            "viewing splits": splits_table(self.splits),
+            "viewing glimpses": glimpses_table(self.glimpses),
+            "viewing sequences": sequences_table(self.sequences),
+        }
+
+
+class _Compared:
+    """A model that reads the maps of a source, fitted once for each fold of the pictures.
+
+    Args:
+        config: pictures, people, and the number of folds.
+        name: name of the model in the tables.
+        source: gives the maps.
+        fit: how the model is fitted.
+        fingerprint: fingerprint of pictures and people.
+    """
+
+    def __init__(
+        self, config: ViewingConfig, name: str, source: MapSource, fit: GazeFit, fingerprint: Sequence[str]
+    ) -> None:
+        self.config = config
+        self.name = name
+        self.source = source
+        # Pictures are looked at once, and only if a fold is not stored yet.
+        self.groups: Groups = cache(partial(look, config, source))
+        self.store = FoldStore(config.out, {**source.what, "data": fingerprint})
+        self.folds = [Fold(self.groups, number, config.folds, fit) for number in range(config.folds)]
+
+    def scores(self) -> Scores:
+        """Score the model on the held-out pictures of all folds."""
+        return self.store.scores(self.name, _bar(self.folds, self.name))
+
+    def splits(self) -> dict[str, Scores]:
+        """Score the model by what it was fitted to."""
+        without_saccades = replace(self.config.fit, saccade_epochs=0)
+        count = self.config.folds
+        splits = {f"{self.name}: all data sets, all people": self.scores()}
+        if len(self.config.fixations) > 1:
+            folds = [StudiedFold(self.groups, number, count, without_saccades, only=0) for number in range(count)]
+            scores = self.store.scores(f"{self.name} first data set", _bar(folds, "first data set"))
+            splits[f"{self.name}: the first data set alone"] = scores
+        by_people = _by_people(self.store, self.name, self.groups, without_saccades, count)
+        splits[f"{self.name}: half of the people, scored by the others"] = by_people
+        return splits
+
+    def glimpses(self) -> dict[str, Tensor]:
+        """Score the model on what a fovea has seen of some held-out pictures of the first data set."""
+        pictures = spread(len(self.config.people(0)), self.config.glimpses)
+        return glimpsed(self.name, self.source, self.config.pictures[0], self.store, self.folds, pictures)
+
+    def sequences(self) -> dict[str, list[dict[str, float]]]:
+        """Compare drawn scanpaths, and people, with the other people, on held-out pictures of the first data set.
+
+        Returns:
+            For the model and for people the measures `SEQUENCES` in each picture.
+        """
+        config = self.config
+        rows: dict[str, list[dict[str, float]]] = {self.name: [], PEOPLE: []}
+        what = {"name": self.name, "fit": config.fit.plain(), "folds": config.folds, "code": modules_digest(__name__)}
+        pictures = spread(len(config.people(0)), config.sequences)
+        for picture in tqdm(pictures, desc="sequences", unit="picture"):
+            name = f"{self.name} sequences {picture}"
+            stored = self.store.kept(name, {**what, "picture": picture}, partial(self._sequences_in, picture))
+            for row, measures in rows.items():
+                measures.append(dict(zip(SEQUENCES, stored[row].tolist(), strict=True)))
+        return rows
+
+    def _sequences_in(self, picture: int) -> dict[str, Tensor]:
+        """Measure drawn scanpaths, and those of people, in one picture.
+
+        A drawn scanpath has the first fixation and the length of a person's, and is compared with all others' but
+        theirs.
+        """
+        fold = self.folds[picture % self.config.folds]  # the one that holds it out
+        model = self.store.model(self.name, fold)
+        group, place = in_first(fold, picture)
+        paths = group.paths[place]
+        starts = torch.stack([path[0] for path in paths])
+        longest = max(map(len, paths))
+        terms = {"map": maps_of(model, group, [place])[0], CENTRE: model.centre_bias(group.size)[None]}
+        samples = model.sample(terms, group.size, starts, longest, torch.Generator().manual_seed(picture))
+        people = [path.double().numpy() for path in paths]
+        drawn = [sample[: len(path)].double().numpy() for sample, path in zip(samples, paths, strict=True)]
+        of_model = beside_others(drawn, people, group.size)
+        of_people = beside_others(people, people, group.size)
+        return {self.name: torch.tensor([*of_model.values()]), PEOPLE: torch.tensor([*of_people.values()])}
+
+
 def compare_viewing(config: ViewingConfig) -> None:
     """Fit all models to the folds of the pictures, and write the tables."""
     check(len(config.fixations) > 0, "fixations", "at least one file", "none")
     is_there = config.studied < len(config.detectors) or not config.detectors
     check(is_there, "studied", "the number of a detector", config.studied)
     prepare_worker()
-    detectors = [DetectorConfig(name=each) if isinstance(each, str) else each for each in config.detectors]
-    made: dict[str, Callable[[], MapSource]] = {name: partial(_saliency, name) for name in config.saliency}
-    made |= {each.name: partial(_features, each) for each in detectors}
-    data, fit, numbers = config.fingerprint, config.fit, range(config.folds)
-    rows: dict[str, Scores] = {}
-    splits: dict[str, Scores] = {}
-    drawn: dict[str, list[dict[str, float]]] = {}
-    seen: dict[str, Tensor] = {}
-    for name, source in made.items():
-        opened = source()
-        groups, store = cache(partial(look, config, opened)), FoldStore(config.out, {**opened.what, "data": data})
-        own = replace(fit, **_OF_ONE_MAP) if name in config.saliency else fit
-        folds = [Fold(groups, number, config.folds, own) for number in numbers]
-        rows[name] = store.scores(name, _bar(folds, name))
-        if detectors and name == detectors[config.studied].name:
-            splits[f"{name}: all data sets, all people"] = rows[name]
-            alone = replace(fit, saccade_epochs=0)
-            if len(config.fixations) > 1:
-                lone = [StudiedFold(groups, number, config.folds, alone, only=0) for number in numbers]
-                scores = store.scores(f"{name} first data set", _bar(lone, "first data set"))
-                splits[f"{name}: the first data set alone"] = scores
-            splits[f"{name}: half of the people, scored by the others"] = _by_people(
-                store, name, groups, alone, config.folds
-            )
+    fingerprint = config.fingerprint
+    results = _Results()
+    for name in config.saliency:
+        fit = replace(config.fit, **_OF_ONE_MAP)
+        results.scores[name] = _Compared(config, name, _saliency(name), fit, fingerprint).scores()
+    for number, entry in enumerate(config.detectors):
+        detector = DetectorConfig(name=entry) if isinstance(entry, str) else entry
+        compared = _Compared(config, detector.name, _features(detector), config.fit, fingerprint)
+        results.scores[detector.name] = compared.scores()
+        if number == config.studied:
+            results.splits = compared.splits()
             if config.sequences:
-                drawn |= _sequences(name, store, folds, config)
+                results.sequences = compared.sequences()
             if config.glimpses:
-                chosen = spread(len(config.people(0)), config.glimpses)
-                seen = glimpsed(name, opened, config.pictures[0], store, folds, chosen)
-    plain, store = cache(partial(look, config, _blank())), FoldStore(config.out, {"data": data})
-    known: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
-    for name, maps in known.items():
-        folds = [StudiedFold(plain, number, config.folds, fit, maps=maps) for number in numbers]
-        rows[name] = store.scores(name, _bar(folds, name))
-    tables = {
-        "viewing": viewing_table(rows),
-        "viewing terms": terms_table(rows),
-        "viewing splits": splits_table(splits),
-        "viewing glimpses": glimpses_table(seen),
-        "viewing sequences": sequences_table(drawn),
-    }
+                results.glimpses = compared.glimpses()
+    results.scores |= _reference_scores(config, fingerprint)
+    tables = results.tables()
     text = "\n".join(["\n".join([f"## {name}", "", *lines, ""]) for name, lines in tables.items()])
     write_tables(text, tables, config.out, config.page)
+
+
+def _reference_scores(config: ViewingConfig, fingerprint: Sequence[str]) -> dict[str, Scores]:
+    """Score the centre bias, and people by the other people, which read no map."""
+    groups: Groups = cache(partial(look, config, _blank()))
+    store = FoldStore(config.out, {"data": fingerprint})
+    references: dict[str, Maps] = {CENTRE: "none", PEOPLE: "other people"}
+    scores = {}
+    for name, maps in references.items():
+        folds = [StudiedFold(groups, number, config.folds, config.fit, maps=maps) for number in range(config.folds)]
+        scores[name] = store.scores(name, _bar(folds, name))
+    return scores
 
 
 def _bar(folds: Sequence[Fold], name: str) -> Iterator[Fold]:
@@ -167,17 +259,20 @@ def _blank() -> MapSource:
 
 
 def _by_people(store: FoldStore, name: str, groups: Groups, fit: GazeFit, count: int) -> Scores:
-    """Scores by half of the people on held-out pictures, of models that were fitted to the other half."""
+    """Score half of the people on held-out pictures, with models that were fitted to the other half."""
 
     def half(part: int) -> list[Viewed]:
-        order = [sorted({p.subject for some in group.people for p in some}, key=_in_order) for group in groups()]
-        return [viewed_by(group, every[part % 2 :: 2]) for group, every in zip(groups(), order, strict=True)]
+        halves = []
+        for group in groups():
+            subjects = {scanpath.subject for scanpaths in group.people for scanpath in scanpaths}
+            halves.append(viewed_by(group, sorted(subjects, key=_in_order)[part % 2 :: 2]))
+        return halves
 
     file = f"{name} half of the people"
-    folds = [
-        StudiedFold(cache(partial(half, number)), number, count, fit, judges=partial(half, number + 1))
-        for number in range(count)
-    ]
+    folds = []
+    for number in range(count):
+        fitted = cache(partial(half, number))
+        folds.append(StudiedFold(fitted, number, count, fit, judges=partial(half, number + 1)))
     return store.scores(file, _bar(folds, file))
 
 
@@ -186,46 +281,71 @@ def _in_order(subject: str) -> tuple[int, str]:
 
 
 def viewing_table(rows: Mapping[str, Scores]) -> list[str]:
-    """Each map with the centre bias, and with oculomotor biases too, by data set."""
+    """Write each map with the centre bias, and with oculomotor biases too, by data set."""
     sources = sorted({source for _, source in rows[CENTRE]})
-    head = ["", *(f"{figure}, {source + 1}" for source in sources for figure in ("NSS", "AUC", "gain"))]
-    body = [[CENTRE, *(cell for source in sources for cell in _figures(rows[PEOPLE], CENTRE, source))]]
-    for row, words in (("map and centre bias", "{}"), ("all terms", "{}, with oculomotor biases")):
-        for name, scores in rows.items():
-            if (row, sources[0]) in scores and (name, row) != (CENTRE, "map and centre bias"):
-                cells = [cell for source in sources for cell in _figures(scores, row, source)]
-                body.append([words.format(name), *cells])
-    return table([head, *body])
+    body = [["", *_headings(sources)], [CENTRE, *_cells(rows[PEOPLE], CENTRE, sources)]]
+    for name, scores in rows.items():
+        # The reference of the centre bias has no map, and a row already.
+        if name != CENTRE and (_MAP, sources[0]) in scores:
+            body.append([name, *_cells(scores, _MAP, sources)])
+    for name, scores in rows.items():
+        if ("all terms", sources[0]) in scores:
+            body.append([f"{name}, with oculomotor biases", *_cells(scores, "all terms", sources)])
+    return table(body)
 
 
 def terms_table(rows: Mapping[str, Scores]) -> list[str]:
-    """NSS and gain on the first data set with and without each term."""
+    """Write NSS and gain on the first data set with and without each term."""
     terms = (*ROWS[False], *ROWS[True])
-    head = ["", *(f"{term}: {figure}" for term in terms for figure in ("NSS", "gain"))]
-    body = []
+    head = [""]
+    for term in terms:
+        head += [f"{term}: NSS", f"{term}: gain"]
+    body = [head]
     for name, scores in rows.items():
-        if name not in (CENTRE, PEOPLE):
-            figures = [_figures(scores, term, 0) if (term, 0) in scores else ["", "", ""] for term in terms]
-            body.append([name, *(cell for nss, _, gain in figures for cell in (nss, gain))])
-    return table([head, *body])
+        if name in (CENTRE, PEOPLE):
+            continue
+        row = [name]
+        for term in terms:
+            nss, _, gain = _figures(scores, term, 0) if (term, 0) in scores else ("", "", "")
+            row += [nss, gain]
+        body.append(row)
+    return table(body)
 
 
 def splits_table(splits: Mapping[str, Scores]) -> list[str]:
-    """Return the studied detector, by what its model was fitted to."""
+    """Write the scores of the studied detector, by what its model was fitted to."""
     sources = sorted({source for scores in splits.values() for _, source in scores})
-    head = ["fitted to", *(f"{figure}, {source + 1}" for source in sources for figure in ("NSS", "AUC", "gain"))]
-    body = [
-        [name, *(cell for source in sources for cell in _figures(scores, "map and centre bias", source))]
-        for name, scores in splits.items()
-    ]
-    return table([head, *body])
+    body = [["fitted to", *_headings(sources)]]
+    body += [[name, *_cells(scores, _MAP, sources)] for name, scores in splits.items()]
+    return table(body)
 
 
-def _figures(scores: Scores, row: str, source: int) -> list[str]:
-    """NSS, AUC and information gain over the centre bias of the data set, with standard errors over pictures."""
-    own, base = scores[row, source].double().numpy(), scores[CENTRE, source].double().numpy()
-    columns = own[:, 0], own[:, 1], own[:, 2] - base[:, 2]
-    return [plus_minus(float(each.mean()), float(standard_error(each)), 3) for each in columns]
+def _headings(sources: Sequence[int]) -> list[str]:
+    """Name the columns of `_cells`."""
+    headings = []
+    for source in sources:
+        headings += [f"{figure}, {source + 1}" for figure in ("NSS", "AUC", "gain")]
+    return headings
+
+
+def _cells(scores: Scores, row: str, sources: Sequence[int]) -> list[str]:
+    """Write the figures of a row of scores, one data set after the other."""
+    cells: list[str] = []
+    for source in sources:
+        cells += _figures(scores, row, source)
+    return cells
+
+
+def _figures(scores: Scores, row: str, source: int) -> tuple[str, str, str]:
+    """Write NSS, AUC and information gain over the centre bias, with standard errors over pictures."""
+    nss, auc, information = scores[row, source].double().numpy().T
+    information_of_centre = scores[CENTRE, source].double().numpy()[:, 2]
+    return _mean(nss), _mean(auc), _mean(information - information_of_centre)
+
+
+def _mean(values: _Array) -> str:
+    """Write the mean over pictures with its standard error."""
+    return plus_minus(float(values.mean()), float(standard_error(values)), 3)
 
 
 def write_tables(text: str, tables: Mapping[str, list[str]], out: Path, page: Path | None) -> None:
@@ -259,56 +379,38 @@ def filled(page: str, tables: Mapping[str, Sequence[str]]) -> str:
 SEQUENCES = ("sequence score", "MultiMatch", "ScanMatch", "time delay embedding")
 
 
-def _sequences(
-    name: str, store: FoldStore, folds: Sequence[Fold], config: ViewingConfig
-) -> dict[str, list[dict[str, float]]]:
-    """Measures of drawn scanpaths and of people against the other people, on held-out pictures of the first data set.
-
-    A drawn scanpath has the first fixation and the length of a person's, and is compared with all others' but theirs.
-    """
-    number = len(config.people(0))
-    rows: dict[str, list[dict[str, float]]] = {name: [], PEOPLE: []}
-    what = {"name": name, "fit": config.fit.plain(), "folds": config.folds, "code": modules_digest(__name__)}
-    for picture in tqdm(spread(number, config.sequences), desc="sequences", unit="picture"):
-
-        def measured(picture: int = picture) -> dict[str, Tensor]:
-            fold = folds[picture % config.folds]  # the one that holds it out
-            model = store.model(name, fold)
-            group, place = in_first(fold, picture)
-            terms = {"map": maps_of(model, group, [place])[0], CENTRE: model.centre_bias(group.size)[None]}
-            paths = group.paths[place]
-            start, longest = torch.stack([path[0] for path in paths]), max(map(len, paths))
-            made = model.sample(terms, group.size, start, longest, torch.Generator().manual_seed(picture))
-            people = [path.double().numpy() for path in paths]
-            drawn = [one[: len(path)].double().numpy() for one, path in zip(made, paths, strict=True)]
-            measures = (beside_others(each, people, group.size) for each in (drawn, people))
-            return {row: torch.tensor([*each.values()]) for row, each in zip(rows, measures, strict=True)}
-
-        kept = store.kept(f"{name} sequences {picture}", {**what, "picture": picture}, measured)
-        for row, several in rows.items():
-            several.append(dict(zip(SEQUENCES, kept[row].tolist(), strict=True)))
-    return rows
-
-
 def beside_others(ours: Sequence[_Array], people: Sequence[_Array], size: tuple[int, int]) -> dict[str, float]:
-    """Means of the measures over pairs of a scanpath and that of another person than its own."""
-    every, width = np.concatenate(people), (size[1], size[0])
+    """Compare scanpaths with those of other people.
+
+    Args:
+        ours: scanpath n is that of person n, or drawn with their first fixation; each `(fixations, 2)`.
+        people: the scanpaths of people.
+        size: `(height, width)` of the picture.
+
+    Returns:
+        The mean of each measure over the pairs of scanpath n and that of another person than n.
+    """
+    height, width = size
+    fixations = np.concatenate(people)
+    # Clusters of people's fixations are the letters of which a scanpath is a word.
+    letters = cluster_labels(np.concatenate([*ours, fixations]), fixations, _BANDWIDTH * max(size)).tolist()
     ends = np.cumsum([0, *map(len, ours), *map(len, people)])
-    labels = cluster_labels(np.concatenate([*ours, every]), every, _BANDWIDTH * max(size)).tolist()
-    words = [labels[start:end] for start, end in pairwise(ends)]
-    pairs = [(i, j) for i in range(len(ours)) for j in range(len(people)) if i != j]
-    values = np.array(
-        [
-            (
-                sequence_score(words[i], words[len(ours) + j]),
-                multimatch(ours[i], people[j], width).mean,
-                scanmatch(_within(ours[i], width), _within(people[j], width), width),
-                time_delay_embedding(ours[i], people[j]) / max(size),
+    words = [letters[start:end] for start, end in pairwise(ends)]
+    words_of_people = words[len(ours) :]
+    measures = []
+    for number, path in enumerate(ours):
+        for person, other in enumerate(people):
+            if person == number:
+                continue
+            measures.append(
+                (
+                    sequence_score(words[number], words_of_people[person]),
+                    multimatch(path, other, (width, height)).mean,
+                    scanmatch(_within(path, (width, height)), _within(other, (width, height)), (width, height)),
+                    time_delay_embedding(path, other) / max(size),
+                )
             )
-            for i, j in pairs
-        ]
-    )
-    return dict(zip(SEQUENCES, np.nanmean(values, 0).tolist(), strict=True))
+    return dict(zip(SEQUENCES, np.nanmean(np.array(measures), 0).tolist(), strict=True))
 
 
 def _within(path: _Array, size: tuple[int, int]) -> _Array:
@@ -316,9 +418,9 @@ def _within(path: _Array, size: tuple[int, int]) -> _Array:
 
 
 def sequences_table(drawn: Mapping[str, Sequence[Mapping[str, float]]]) -> list[str]:
-    """Means over pictures of the measures of scanpaths against those of other people."""
-    body = []
+    """Write the means over pictures of the measures of scanpaths against those of other people."""
+    body = [["", *SEQUENCES]]
     for name, pictures in drawn.items():
-        columns = [np.array([each[measure] for each in pictures]) for measure in SEQUENCES]
-        body.append([name, *(plus_minus(float(c.mean()), float(standard_error(c)), 3) for c in columns)])
-    return table([["", *SEQUENCES], *body])
+        columns = [np.array([measures[measure] for measures in pictures]) for measure in SEQUENCES]
+        body.append([name, *map(_mean, columns)])
+    return table(body)

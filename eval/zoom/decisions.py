@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import product
 
 import torch
+from torch import Tensor
 
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.run import overlap
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.data.scene import Annotation
-from semfov.decision import OUTCOMES
 from semfov.metrics.calibration import BinarySums
 from semfov.runs.results import ResultRecord
 from semfov.runs.tables import mean_or_dash, share, table
@@ -20,8 +21,17 @@ from semfov.settings import DecisionSettings
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.looks import Window, WindowLooks
 
-OURS, UNVERIFIED = "semfov", "semfov, without closer looks"
-"""Names of searches with closer looks at places that seem to hold the target, and of searches without them."""
+OURS = "semfov"
+"""Name of searches with closer looks at places that seem to hold the target."""
+
+UNVERIFIED = f"{OURS}, without closer looks"
+"""Name of searches without them."""
+
+_OVERVIEW = "the overview, highest score"
+_SLICES = "all slices, highest score"
+
+_DECISIONS = ["", "found", "box right", "absent", "undecided", "passes, mean", "probability, mean"]
+"""Column headings of the table of decisions."""
 
 
 def decide_all(
@@ -87,44 +97,47 @@ def by_way(records: Sequence[ResultRecord]) -> dict[str, list[ResultRecord]]:
     return ways
 
 
-def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    """Scores `(M,)` by name that predict whether the target is present, and whether it is, `(M,)`."""
+def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, Tensor], Tensor]:
+    """Compare what ways of searching and their references say of presence.
+
+    Args:
+        records: the searches of all ways.
+
+    Returns:
+        The probability or score of each way `(M,)`; and whether the target is present, `(M,)`.
+    """
     ways = by_way(records)
-    by_name = {way: torch.tensor([record["probability"] for record in of]) for way, of in ways.items()}
     searches = next(iter(ways.values()))
-    scores = {"the overview, highest score": "overview", "all slices, highest score": "slices", FREQUENCY: "frequency"}
-    for name, key in scores.items():
-        by_name[name] = torch.tensor([record[key] for record in searches])
-    return by_name, torch.tensor([record["present"] for record in searches])
+    scores = {way: torch.tensor([record["probability"] for record in group]) for way, group in ways.items()}
+    for name, field in ((_OVERVIEW, "overview"), (_SLICES, "slices"), (FREQUENCY, "frequency")):
+        scores[name] = torch.tensor([record[field] for record in searches])
+    return scores, torch.tensor([record["present"] for record in searches])
 
 
 def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
-    """Tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
+    """Write the tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
     scores, there = presence_scores(records)
     ways = by_way(records)
     searches = next(iter(ways.values()))
-    passes = {way: mean_or_dash([record["passes"] for record in of]) for way, of in ways.items()}
-    passes["the overview, highest score"] = "1"
-    passes["all slices, highest score"] = mean_or_dash([record["count"] for record in searches])
-    passes[FREQUENCY] = "-"
-    places = {way: torch.tensor([right_box(record) for record in of]) for way, of in ways.items()}
+    places = {way: torch.tensor([right_box(record) for record in group]) for way, group in ways.items()}
     telling = Telling(scores, there, [record["scene"] for record in searches], places)
+
+    passes = {way: mean_or_dash([record["passes"] for record in group]) for way, group in ways.items()}
+    passes[_OVERVIEW] = "1"
+    passes[_SLICES] = mean_or_dash([record["count"] for record in searches])
+    passes[FREQUENCY] = "-"
     rows = [["", "passes", *TELLING, *CALIBRATED, "Brier"]]
     for (name, score), figures in zip(scores.items(), telling.rows(), strict=True):
-        brier = f"{BinarySums.of(score, there).brier:.3f}"
-        rows.append([name, passes[name], *figures, *calibrated(score, there), brier])
-    decided = [["", "found", "box right", "absent", "undecided", "passes, mean", "probability, mean"]]
-    for way, of in ways.items():
-        for kind in (True, False):
-            group = [r for r in of if r["present"] is kind]
-            counts = [share(sum(r["outcome"] == each for r in group), len(group)) for each in OUTCOMES[1:]]
-            right = telling.place(way) if kind else ""
-            looks, chance = (
-                mean_or_dash([r["passes"] for r in group]),
-                mean_or_dash([r["probability"] for r in group], 2),
-            )
-            name = f"it is {'there' if kind else 'not'}{way.removeprefix(OURS)}"
-            decided.append([name, counts[0], right, *counts[1:], looks, chance])
+        brier = BinarySums.of(score, there).brier
+        rows.append([name, passes[name], *figures, *calibrated(score, there), f"{brier:.3f}"])
+
+    decided = [_DECISIONS]
+    for way, group in ways.items():
+        variant = way.removeprefix(OURS)
+        present = [record for record in group if record["present"]]
+        absent = [record for record in group if not record["present"]]
+        decided.append(_decision_row(f"it is there{variant}", present, telling.place(way)))
+        decided.append(_decision_row(f"it is not{variant}", absent, ""))
     return [
         f"Is the target present? {len(searches)} searches, {int(there.sum())} of them for a present class; hit rates "
         f"in % at the given false alarm rates. `semfov` is the probability at the end of a search. {ERRORS_TEXT} "
@@ -144,7 +157,22 @@ def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
     ]
 
 
+def _decision_row(name: str, searches: Sequence[ResultRecord], box_right: str) -> list[str]:
+    """Write the cells of searches under `_DECISIONS`."""
+    outcomes = Counter(record["outcome"] for record in searches)
+    return [
+        name,
+        share(outcomes["found"], len(searches)),
+        box_right,
+        share(outcomes["absent"], len(searches)),
+        share(outcomes["undecided"], len(searches)),
+        mean_or_dash([record["passes"] for record in searches]),
+        mean_or_dash([record["probability"] for record in searches], 2),
+    ]
+
+
 def right_box(record: ResultRecord) -> float:
-    """1 if the box of a find of a present target is right (IoU 0.5), 0 if it is wrong, and NaN without such a find."""
-    found = record["present"] and record["outcome"] == "found"
-    return float((record["overlap"] or 0) >= 0.5) if found else torch.nan
+    """Return 1 if the box of a find of a present target is right (IoU 0.5), 0 if not, and NaN without such a find."""
+    if not record["present"] or record["outcome"] != "found":
+        return torch.nan
+    return float((record["overlap"] or 0) >= 0.5)

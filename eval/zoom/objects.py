@@ -64,13 +64,12 @@ def merged(looks: Sequence[WindowLook], target: int | None) -> Returned:
 
 def suppressed(looks: Sequence[WindowLook], target: int | None) -> Returned:
     """Return the objects of looks by plain suppression: boxes that a border cuts go, of those alike one stays."""
-    boxes, scores = (
-        torch.cat([each[0, ~look.cut] for look, each in zip(looks, column, strict=True)])
-        for column in zip(*((look.detections.boxes, look.detections.scores) for look in looks), strict=True)
-    )
+    boxes = torch.cat([look.detections.boxes[0, ~look.cut] for look in looks])
+    scores = torch.cat([look.detections.scores[0, ~look.cut] for look in looks])
     value, label = scores[:, 1:].max(-1)
     if target is not None:
-        value, label = scores[:, target], torch.full_like(label, target - 1)
+        value = scores[:, target]
+        label = torch.full_like(label, target - 1)
     kept = suppress(boxes, value, label, Selection(threshold=0.0, iou=0.5, limit=10_000, per_class=True))
     objects = Objects(boxes[kept], value[kept], label[kept] + 1, torch.zeros_like(kept))
     return Returned(objects, objects.above(LIKELY))
@@ -78,8 +77,12 @@ def suppressed(looks: Sequence[WindowLook], target: int | None) -> Returned:
 
 def sure_boxes(detections: Detections, target: int | None) -> Objects:
     """Return what a plain pass of the detector shows from 0.5 on."""
-    boxes, scores, labels = detections.boxes[0], detections.confidence[0], detections.labels[0]
-    kept = detections.mask[0] & (scores >= LIKELY) & (labels == (labels if target is None else target))
+    boxes = detections.boxes[0]
+    scores = detections.confidence[0]
+    labels = detections.labels[0]
+    kept = detections.mask[0] & (scores >= LIKELY)
+    if target is not None:
+        kept &= labels == target
     return Objects(boxes[kept], scores[kept], labels[kept], torch.zeros_like(labels[kept]))
 
 
@@ -129,7 +132,7 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
 
 
 def average_precision(scores: Tensor, right: Tensor, objects: int, counts: Tensor | None = None) -> float:
-    """Average precision as COCO computes it: the mean over 101 recalls of the highest precision at that recall or more.
+    """Compute average precision as COCO does: over 101 recalls, the mean of the highest precision there or beyond.
 
     Args:
         scores: `(N,)`, scores of boxes.
@@ -146,16 +149,26 @@ def average_precision(scores: Tensor, right: Tensor, objects: int, counts: Tenso
     if not objects:
         return torch.nan
     order = scores.argsort(descending=True, stable=True)
-    each = torch.ones(len(order)).double() if counts is None else counts[order].double()
-    hits = (right[order] * each).cumsum(0)
-    precision = hits / each.cumsum(0).clamp(min=1)
-    precision = precision.flip(0).cummax(0).values.flip(0) if len(hits) else precision
-    at = torch.searchsorted(hits / objects, torch.linspace(0, 1, _RECALLS, dtype=torch.float64) - 1e-9)
-    return float(torch.cat([precision, precision.new_zeros(1)])[at.clamp(max=len(hits))].mean())
+    repeats = torch.ones(len(order)).double() if counts is None else counts[order].double()
+    hits = (right[order] * repeats).cumsum(0)
+    precision = hits / repeats.cumsum(0).clamp(min=1)
+    if len(hits):
+        precision = precision.flip(0).cummax(0).values.flip(0)  # the highest at this recall or more
+    recalls = torch.linspace(0, 1, _RECALLS, dtype=torch.float64)
+    first_box = torch.searchsorted(hits / objects, recalls - 1e-9)  # with which each recall is reached
+    reached = torch.cat([precision, precision.new_zeros(1)])  # 0 for recalls that no box reaches
+    return float(reached[first_box.clamp(max=len(hits))].mean())
 
 
 class _Boxes(NamedTuple):
-    """All boxes of a way of looking after a number of passes, the best first, with their pictures; each `(N,)`."""
+    """All boxes of a way of looking after a number of passes, the best first.
+
+    Attributes:
+        scores: `(N,)`.
+        labels: `(N,)`, their classes.
+        right: `(N,)`, whether each shows an object.
+        pictures: `(N,)`, the picture that each is in.
+    """
 
     scores: Tensor
     labels: Tensor
@@ -164,18 +177,53 @@ class _Boxes(NamedTuple):
 
     @classmethod
     def of(cls, group: Sequence[ResultRecord], number: str) -> Self:
-        """Return the boxes of the records of all pictures."""
-        after = [record["after"][number] for record in group]
-        scores, labels, right = (
-            torch.tensor([value for each in after for value in each[name]]) for name in ("scores", "labels", "right")
+        """Join the boxes of the records of all pictures."""
+        scores: list[float] = []
+        labels: list[int] = []
+        right: list[int] = []
+        pictures: list[int] = []
+        for picture, record in enumerate(group):
+            after = record["after"][number]
+            scores += after["scores"]
+            labels += after["labels"]
+            right += after["right"]
+            pictures += [picture] * len(after["scores"])
+        # Scores are compared in single precision, as the detector gives them.
+        single = torch.tensor(scores)
+        order = single.argsort(descending=True, stable=True)
+        is_right = torch.tensor(right)[order] > 0
+        return cls(
+            single.double()[order], torch.tensor(labels).long()[order], is_right, torch.tensor(pictures).long()[order]
         )
-        pictures = torch.arange(len(after)).repeat_interleave(torch.tensor([len(each["scores"]) for each in after]))
-        order = scores.argsort(descending=True, stable=True)
-        return cls(scores.double()[order], labels.long()[order], right[order] > 0, pictures[order])
+
+
+class _Counts(NamedTuple):
+    """Numbers of objects in each picture after the last pass, `(P,)`, float64.
+
+    Attributes:
+        listed: objects that are listed.
+        right: those of them that are right.
+        expected: sum of the scores of all objects.
+        annotated: objects that are there.
+    """
+
+    listed: Tensor
+    right: Tensor
+    expected: Tensor
+    annotated: Tensor
+
+    @classmethod
+    def of(cls, group: Sequence[ResultRecord], last: str) -> Self:
+        """Read the numbers from the records of all pictures."""
+        rows = []
+        for record in group:
+            after = record["after"][last]
+            rows.append([after["listed"], after["listed right"], sum(after["scores"]), record["objects"]])
+        return cls(*torch.tensor(rows, dtype=torch.float64).unbind(1))
 
 
 def object_figures(groups: dict[str, list[ResultRecord]], numbers: Sequence[str]) -> Callable[[Tensor], Tensor]:
-    """Figures of each way of looking at some pictures.
+    """Prepare the figures of each way of looking at some pictures.
 
     Args:
         groups: for each way, a record of each picture.
@@ -188,38 +236,40 @@ def object_figures(groups: dict[str, list[ResultRecord]], numbers: Sequence[str]
         then that of the sum of all scores, and the expected calibration error of the scores.
     """
     boxes = {way: [_Boxes.of(group, number) for number in numbers] for way, group in groups.items()}
-    counts = {
-        way: torch.tensor(
-            [
-                [last["listed"], last["listed right"], sum(last["scores"]), record["objects"]]
-                for record in group
-                for last in [record["after"][numbers[-1]]]
-            ],
-            dtype=torch.float64,
-        )
-        for way, group in groups.items()
-    }
+    counts = {way: _Counts.of(group, numbers[-1]) for way, group in groups.items()}
 
     def figures(pictures: Tensor) -> Tensor:
-        rows = []
-        for way, some in boxes.items():
-            drawn = counts[way][pictures]
-            listed, hits, _, total = drawn.sum(0).tolist()
-            weight = pictures.bincount(minlength=len(counts[way]))
-            line = [average_precision(each.scores, each.right, int(total), weight[each.pictures]) for each in some]
-            off, apart = ((drawn[:, column] - drawn[:, 3]).abs().mean().item() for column in (0, 2))
-            line += [hits / max(listed, 1), hits / max(total, 1), listed / max(total, 1), off, apart]
-            last = some[-1]
-            repeated = torch.arange(len(last.scores)).repeat_interleave(weight[last.pictures])
-            line.append(BinarySums.of(last.scores[repeated], last.right[repeated]).ece if len(repeated) else 0)
-            rows.append(line)
+        rows = [_figures(boxes[way], counts[way], pictures) for way in groups]
         return torch.tensor(rows, dtype=torch.float64)
 
     return figures
 
 
+def _figures(boxes: Sequence[_Boxes], counts: _Counts, pictures: Tensor) -> list[float]:
+    """Compute the figures of one way of looking (`object_figures`).
+
+    Args:
+        boxes: its boxes after each number of passes.
+        counts: its numbers of objects after the last.
+        pictures: indices of the pictures, some of them repeated.
+    """
+    repeats = pictures.bincount(minlength=len(counts.listed))  # how often each picture counts
+    drawn = _Counts(*(column[pictures] for column in counts))
+    listed = float(drawn.listed.sum())
+    hits = float(drawn.right.sum())
+    annotated = float(drawn.annotated.sum())
+    figures = [average_precision(b.scores, b.right, int(annotated), repeats[b.pictures]) for b in boxes]
+    figures += [hits / max(listed, 1), hits / max(annotated, 1), listed / max(annotated, 1)]
+    figures.append(float((drawn.listed - drawn.annotated).abs().mean()))
+    figures.append(float((drawn.expected - drawn.annotated).abs().mean()))
+    last = boxes[-1]
+    repeated = torch.arange(len(last.scores)).repeat_interleave(repeats[last.pictures])
+    figures.append(BinarySums.of(last.scores[repeated], last.right[repeated]).ece if len(repeated) else 0)
+    return figures
+
+
 def object_table(records: Sequence[ResultRecord]) -> list[str]:
-    """Table of the figures of all ways, as Markdown."""
+    """Write the tables of the figures of all ways, as Markdown."""
     groups: dict[str, list[ResultRecord]] = {}
     for record in records:
         groups.setdefault(record["way"], []).append(record)
@@ -228,15 +278,16 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
     figures = Bootstrap.of(object_figures(groups, numbers), range(len(first)))
     heads = [f"AP50, {number}" for number in numbers]
     heads += ["precision", "recall", "boxes for each object"]
-    heads += [f"mean absolute error of the {number}" for number in ("count", "expected number")] + ["ECE"]
+    heads += ["mean absolute error of the count", "mean absolute error of the expected number", "ECE"]
     rows = [["", *heads]]
-    for way, value, error in zip(groups, figures.value.tolist(), figures.error.tolist(), strict=True):
-        rows.append([way, *(f"{each:.3f} ± {apart:.3f}" for each, apart in zip(value, error, strict=True))])
-    apart = figures.less(list(groups).index(SEMFOV))
-    less = [[f"difference to {SEMFOV}", *heads]]
-    for way, value, error in zip(groups, apart.value.tolist(), apart.error.tolist(), strict=True):
-        cells = [f"{each:+.3f} ± {spread:.3f}" for each, spread in zip(value, error, strict=True)]
-        less += [[way, *cells]] if way != SEMFOV else []
+    for way, values, errors in zip(groups, figures.value.tolist(), figures.error.tolist(), strict=True):
+        rows.append([way, *(f"{value:.3f} ± {error:.3f}" for value, error in zip(values, errors, strict=True))])
+    paired = figures.less(list(groups).index(SEMFOV))
+    differences = [[f"difference to {SEMFOV}", *heads]]
+    for way, values, errors in zip(groups, paired.value.tolist(), paired.error.tolist(), strict=True):
+        if way != SEMFOV:
+            cells = [f"{value:+.3f} ± {error:.3f}" for value, error in zip(values, errors, strict=True)]
+            differences.append([way, *cells])
     objects = sum(record["objects"] for record in first)
     return [
         f"Objects of {len(first)} pictures with {objects} annotated ones: average precision (IoU 0.5) after n passes; "
@@ -247,7 +298,7 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
         "",
         *table(rows),
         "",
-        *table(less),
+        *table(differences),
         "",
         *plain_table(groups, numbers),
         *in_all_table(records, numbers),
@@ -255,16 +306,17 @@ def object_table(records: Sequence[ResultRecord]) -> list[str]:
 
 
 def plain_table(groups: Mapping[str, Sequence[ResultRecord]], numbers: Sequence[str]) -> list[str]:
-    """Table of the mean of AP50 over the classes, and of what is kept of a plain pass, as Markdown."""
+    """Write the table of the mean of AP50 over the classes, and of what is kept of a plain pass, as Markdown."""
+    first = next(iter(groups.values()))
+    shown = sum(record["plain"] for record in first)  # a plain pass shows the same, whatever the way
     rows = [["", *(f"AP50, {number}" for number in numbers), "kept", "pictures without"]]
     for way, group in groups.items():
-        last, shown = [record["after"][numbers[-1]] for record in group], [record["plain"] for record in group]
-        kept = f"{sum(after['kept'] for after in last) / sum(shown):.3f}" if sum(shown) else "-"
-        without = sum(count > 0 and not after["listed"] for count, after in zip(shown, last, strict=True))
-        means = [class_mean(group, number) for number in numbers]
-        rows.append([way, *(f"{mean:.3f}" for mean in means), kept, str(without)])
+        means = [f"{class_mean(group, number):.3f}" for number in numbers]
+        kept = sum(record["after"][numbers[-1]]["kept"] for record in group)
+        without = sum(record["plain"] > 0 and not record["after"][numbers[-1]]["listed"] for record in group)
+        rows.append([way, *means, f"{kept / shown:.3f}" if shown else "-", str(without)])
     return [
-        f"The mean of AP50 over the classes that are annotated; the share of the {sum(shown)} boxes that one plain "
+        f"The mean of AP50 over the classes that are annotated; the share of the {shown} boxes that one plain "
         f"pass of the detector shows from {LIKELY} on of which a listed object has the class and an IoU of "
         f"{_SAME}, after {numbers[-1]} passes; and the pictures in which it shows some and nothing is listed.",
         "",
@@ -274,32 +326,42 @@ def plain_table(groups: Mapping[str, Sequence[ResultRecord]], numbers: Sequence[
 
 
 def class_mean(group: Sequence[ResultRecord], number: str) -> float:
-    """Mean over the annotated classes of the average precision after a number of passes."""
-    boxes, totals = _Boxes.of(group, number), Counter[int]()
+    """Average the average precision after a number of passes over the annotated classes."""
+    boxes = _Boxes.of(group, number)
+    objects = Counter[int]()
     for record in group:
-        totals.update({int(label): count for label, count in record["by class"].items()})
-    of_class = {label: boxes.labels == label for label in totals}
-    each = [average_precision(boxes.scores[mine], boxes.right[mine], totals[label]) for label, mine in of_class.items()]
-    return sum(each) / max(len(each), 1)
+        objects.update({int(label): count for label, count in record["by class"].items()})
+    precisions = []
+    for label, count in objects.items():
+        of_class = boxes.labels == label
+        precisions.append(average_precision(boxes.scores[of_class], boxes.right[of_class], count))
+    return sum(precisions) / max(len(precisions), 1)
 
 
 def in_all_table(records: Sequence[ResultRecord], numbers: Sequence[str]) -> list[str]:
-    """Table of the number of objects that are expected in all after numbers of passes, as Markdown."""
-    rows = [["", *numbers]]
+    """Write the table of the number of objects that are expected in all after numbers of passes, as Markdown."""
     expecting = [record for record in records if record["after"][numbers[0]].get("in all") is not None]
     if not expecting:
         return []
-    expected = torch.tensor(
-        [[record["after"][n]["in all"] for n in numbers] for record in expecting], dtype=torch.float64
-    )
+
+    def after_passes(name: str) -> Tensor:
+        """Read a value of each picture after each number of passes, `(P, len(numbers))`."""
+        values = [[record["after"][number][name] for number in numbers] for record in expecting]
+        return torch.tensor(values, dtype=torch.float64)
+
+    expected = after_passes("in all")
+    error = after_passes("error")
     true = torch.tensor([[record["objects"]] for record in expecting], dtype=torch.float64)
-    rows.append(["expected in all", *(f"{each:.1f}" for each in expected.mean(0).tolist())])
     off = (expected - true).abs()
-    rows.append(["off by", *(f"{each:.1f}" for each in off.mean(0).tolist())])
-    error = torch.tensor([[record["after"][n]["error"] for n in numbers] for record in expecting], dtype=torch.float64)
-    rows.append(["its error", *(f"{each:.1f}" for each in error.mean(0).tolist())])
-    rows.append(["within two errors", *(f"{each:.2f}" for each in (off <= 2 * error).double().mean(0).tolist())])
-    rows.append(["number given", *(f"{sum(r['after'][n]['given'] for r in expecting)}" for n in numbers)])
+    within = (off <= 2 * error).double()
+    rows = [
+        ["", *numbers],
+        ["expected in all", *(f"{mean:.1f}" for mean in expected.mean(0).tolist())],
+        ["off by", *(f"{mean:.1f}" for mean in off.mean(0).tolist())],
+        ["its error", *(f"{mean:.1f}" for mean in error.mean(0).tolist())],
+        ["within two errors", *(f"{mean:.2f}" for mean in within.mean(0).tolist())],
+        ["number given", *(f"{count:.0f}" for count in after_passes("given").sum(0).tolist())],
+    ]
     return [
         f"The number of objects that semfov expects in all after n passes, those that no look has shown included: the "
         f"mean over pictures, the mean absolute error, the error that it is given with, the share of the pictures in "

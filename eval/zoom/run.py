@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -147,56 +147,86 @@ class ZoomRun(WindowLooking, SceneRun):
         return records, watch.seconds
 
     def _finding(self, index: int, source: WindowLooks) -> Iterator[ResultRecord]:
-        """Look for all objects in every way; compare the objects of slices and of the agent, and the recall of all."""
-        cut, lattice = self.slices(index, source.lattice), source.lattice
-        annotation, target, config = self.annotation(index), self.target, self.config
-        targets = () if target is None else (target,)
+        """Look for all objects in every way, and compare the objects and the recall of the ways."""
+        looks = self._by_slices(index, source)
+        looks[SEMFOV], paths = self._by_semfov(source)
+        if "objects" in self.config.measures:
+            yield from self._objects(index, looks, paths)
+        if "recall" in self.config.measures:
+            looks |= self._references_of_recall(index, source)
+            for name, of_way in looks.items():
+                yield self._recall(name, index, of_way)
+                if name in (RASTER, SEMFOV):
+                    yield self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, of_way)])
 
-        def looked(steps: Iterator[WindowStep[Any]]) -> list[WindowLook]:
-            return [step.look for step in islice(steps, config.passes)]
+    def _first_looks(self, steps: Iterator[WindowStep[Any]]) -> list[WindowLook]:
+        """Take as many looks as there are passes for."""
+        return [step.look for step in islice(steps, self.config.passes)]
 
+    def _by_slices(self, index: int, source: WindowLooks) -> dict[str, list[WindowLook]]:
+        """Look at slices in the orders whose objects are compared with the agent's."""
+        cut = self.slices(index, source.lattice)
+        targets = () if self.target is None else (self.target,)
         orders = {RASTER: in_order(cut), "slices, ranked by the overview": ranked(cut, targets)}
-        if lattice.levels > 1:
+        if source.lattice.levels > 1:
             orders |= {
-                "slices, sparse": sparse(cut, targets, config.sparse),
-                "slices as in ASAHI": in_order(adaptive_slices(lattice)),
-                "quad-tree, best first": quad_tree(lattice, target, most=False),
+                "slices, sparse": sparse(cut, targets, self.config.sparse),
+                "slices as in ASAHI": in_order(adaptive_slices(source.lattice)),
+                "quad-tree, best first": quad_tree(source.lattice, self.target, most=False),
             }
-        seen = {name: looked(look_by_look(source, order, None)) for name, order in orders.items()}
+        return {name: self._first_looks(look_by_look(source, order, None)) for name, order in orders.items()}
+
+    def _by_semfov(self, source: WindowLooks) -> tuple[list[WindowLook], dict[int, ZoomPath]]:
+        """Look with the agent.
+
+        Args:
+            source: the looks at the picture.
+
+        Returns:
+            Its looks, and its records after the `numbers` of passes; an agent that ends early has the last one there.
+        """
+        targets = () if self.target is None else (self.target,)
         goal = Goal.of(("background", *self.scenes.classes), None, targets)
         episode = WindowEpisode(WindowTask(goal, self.evidence, min_gain=0.0), source)
         paths: dict[int, ZoomPath] = {}
-        while episode.passes < config.passes and episode.look() is not None:
+        while episode.passes < self.config.passes and episode.look() is not None:
             if episode.passes in self.numbers:
                 paths[episode.passes] = episode.record()
-        seen[SEMFOV] = [look.shown for look in episode.looks]
-        if "objects" in config.measures:
-            paths = {number: paths.get(number) or episode.record() for number in self.numbers}
-            yield from self._objects(index, seen, paths)
-        if "recall" not in config.measures:
-            return
-        seen["slices, random"] = looked(look_by_look(source, shuffled(cut, [config.seed, index]), None))
-        seen["semfov, four at a time"] = looked(find_everything(source, self.evidence, target, batch=4))
+        for number in self.numbers:
+            if number not in paths:
+                paths[number] = episode.record()
+        return [look.shown for look in episode.looks], paths
+
+    def _references_of_recall(self, index: int, source: WindowLooks) -> dict[str, list[WindowLook]]:
+        """Look in the ways of which only the recall is compared."""
+        config = self.config
+        cut = self.slices(index, source.lattice)
+        annotation = self.annotation(index)
+        looks: dict[str, Iterator[WindowStep[Any]]] = {
+            "slices, random": look_by_look(source, shuffled(cut, [config.seed, index]), None),
+            "semfov, four at a time": find_everything(source, self.evidence, self.target, batch=4),
+        }
         if self.observation is not None:
-            observed = ObservedRates(self.observation, lattice, foresight=self.evidence.foresight)
-            seen["by the observation model"] = looked(find_everything(source, observed, target))
-        finds: Callable[[WindowLook], Tensor] = lambda look: found_in([look], annotation, target)  # noqa: E731
-        every = [*half_steps(lattice)][1:]
-        seen["oracle"] = looked(look_by_look(source, oracle(source, [*every, *cut], finds, config.passes), None))
-        for name, looks in seen.items():
-            yield self._recall(name, index, looks)
-            if name in (RASTER, SEMFOV):
-                yield self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, looks)])
+            observed = ObservedRates(self.observation, source.lattice, foresight=self.evidence.foresight)
+            looks["by the observation model"] = find_everything(source, observed, self.target)
+
+        def finds(look: WindowLook) -> Tensor:
+            return found_in([look], annotation, self.target)
+
+        windows = [*half_steps(source.lattice)][1:]  # the first one is the overview
+        best_first = oracle(source, [*windows, *cut], finds, config.passes)
+        looks["oracle"] = look_by_look(source, best_first, None)
+        return {name: self._first_looks(steps) for name, steps in looks.items()}
 
     def _decisions(self, index: int, source: WindowLooks) -> list[ResultRecord]:
         """Search for classes that are present and for classes that are absent."""
-        config, annotation = self.config, self.scenes.annotation(index)
-        targets = (
-            choose_classes(self.scenes, index, annotation, config.sought, 1.0, config.seed)
-            if self.target is None
-            else [self.target]
-        )
-        names = "background", *self.scenes.classes
+        config = self.config
+        annotation = self.scenes.annotation(index)
+        if self.target is not None:
+            targets = [self.target]
+        else:
+            targets = choose_classes(self.scenes, index, annotation, config.sought, 1.0, config.seed)
+        names = ("background", *self.scenes.classes)
         cut = self.slices(index, source.lattice)
         limits = {"passes": config.passes, "closer": config.closer}
         records = decide_all(source, self.evidence, names, targets, annotation, cut, **limits)
@@ -269,28 +299,31 @@ class ZoomRun(WindowLooking, SceneRun):
                 "slices, ranked by the overview": ranked(cut, [target], most=True),
                 "quad-tree, best first": quad_tree(source.lattice, target, most=True),
             }
-            ways: dict[str, Iterator[WindowStep[Any]]] = {
-                **{name: look_by_look(source, order, None) for name, order in orders.items()},
-                SEMFOV: look_for(source, self.evidence, target),
-            }
+            ways: dict[str, Iterator[WindowStep[Any]]] = {}
+            for name, order in orders.items():
+                ways[name] = look_by_look(source, order, None)
+            ways[SEMFOV] = look_for(source, self.evidence, target)
             for name, steps in ways.items():
-                passes, hit = 0, False
-                for look in (step.look for step in islice(steps, limit)):
-                    passes += 1
-                    hit = look.window.level >= closest and float(look.show[target - 1]) >= SCORE_THRESHOLD
-                    if hit:
-                        break
+                hit = _passes_to_hit((step.look for step in islice(steps, limit)), target, closest)
                 records.append(
                     {
                         "measure": "first hit",
                         "way": name,
                         "scene": self.scenes.ids[index],
                         "target": self.scenes.classes[target - 1],
-                        "passes": passes if hit else limit,
-                        "hit": hit,
+                        "passes": limit if hit is None else hit,
+                        "hit": hit is not None,
                     }
                 )
         return records
+
+
+def _passes_to_hit(looks: Iterable[WindowLook], target: int, level: int) -> int | None:
+    """Count the looks until one of a level or a closer one shows the target; None if none does."""
+    for passes, look in enumerate(looks, 1):
+        if look.window.level >= level and float(look.show[target - 1]) >= SCORE_THRESHOLD:
+            return passes
+    return None
 
 
 def without_cut(look: WindowLook) -> WindowLook:

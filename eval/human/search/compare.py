@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -42,40 +42,56 @@ def compare(config: PeopleSearchConfig) -> None:
     Raises:
         DataError: the file of a model has no picture that people searched.
     """
-    screen = config.screen.width, config.screen.height
+    screen = (config.screen.width, config.screen.height)
     grid = Grid(config.belief.columns, config.belief.rows, screen)
     people = read_searches(config.people, screen)
-    stems = [path.stem for path in config.files]
-    for name in stems:
-        check(stems.count(name) == 1, "files", "files of different names", f"{name!r} {stems.count(name)} times")
-    searchers = {path.stem: read_searches(path, screen, path.stem) for path in config.files}
-    pictures = {each.picture for each in people}
-    for name, searches in searchers.items():
-        if not pictures & {each.picture for each in searches}:
-            raise DataError(f"{name}: expected searches in pictures that people searched, got only other pictures")
-    floors = {name: _floor(name, people, grid, config) for name in (RANDOM, CENTRE)}
+    pictures = {search.picture for search in people}
+    models = _from_files(config, screen, pictures)
+    baselines = {name: _floor(name, people, grid, config) for name in (RANDOM, CENTRE)}
+    searchers = {"people": people, **models, **baselines}
+    tables = {f"all {len(pictures)} pictures": _scored(searchers, people, grid, config)}
     policies: dict[str, list[Fixations]] = {}
-    run: PeopleSearchRun | None = None
     if config.pictures:
         run = PeopleSearchRun(config)
         finish(run, "searching")
         policies = run.searches([*gather(run)])
-    every = {"people": people, **searchers, **floors}
-    tables = {f"all {len(pictures)} pictures": _scored(every, people, grid, config)}
-    if run is not None:
-        here = set(run.scenes.ids)
-        few = {name: [each for each in searches if each.picture in here] for name, searches in every.items()}
-        few = {name: searches for name, searches in few.items() if searches}
-        title = f"the {len(here)} available pictures"
-        tables[title] = _scored({**few, **policies}, few["people"], grid, config)
-    people_report(config, tables, {**floors, **policies})
+        available = _in_pictures(searchers, set(run.scenes.ids))
+        title = f"the {len(set(run.scenes.ids))} available pictures"
+        tables[title] = _scored({**available, **policies}, available["people"], grid, config)
+    people_report(config, tables, {**baselines, **policies})
+
+
+def _from_files(
+    config: PeopleSearchConfig, screen: tuple[int, int], pictures: Collection[str]
+) -> dict[str, list[Fixations]]:
+    """Read the searches of models from files, which should be in pictures that people searched."""
+    names = [path.stem for path in config.files]
+    for name in names:
+        count = names.count(name)
+        check(count == 1, "files", "files of different names", f"{name!r} {count} times")
+    searchers = {path.stem: read_searches(path, screen, path.stem) for path in config.files}
+    for name, searches in searchers.items():
+        if not any(search.picture in pictures for search in searches):
+            raise DataError(f"{name}: expected searches in pictures that people searched, got only other pictures")
+    return searchers
+
+
+def _in_pictures(searchers: Mapping[str, Sequence[Fixations]], pictures: Collection[str]) -> dict[str, list[Fixations]]:
+    """Select the searches in some pictures, and the searchers that have any."""
+    selected = {}
+    for name, searches in searchers.items():
+        in_pictures = [search for search in searches if search.picture in pictures]
+        if in_pictures:
+            selected[name] = in_pictures
+    return selected
 
 
 def _scored(
-    searchers: dict[str, list[Fixations]], people: list[Fixations], grid: Grid, config: PeopleSearchConfig
+    searchers: Mapping[str, list[Fixations]], people: list[Fixations], grid: Grid, config: PeopleSearchConfig
 ) -> dict[str, Beside]:
-    settings: dict[str, Any] = {"bandwidth": config.bandwidth, "bootstrap": config.bootstrap}
-    beside = People(people, grid, longest=config.protocol.shifts + 1, **settings)
+    """Score searchers beside people."""
+    longest = config.protocol.shifts + 1
+    beside = People(people, grid, longest=longest, bandwidth=config.bandwidth, bootstrap=config.bootstrap)
     return {name: beside.score(searches) for name, searches in searchers.items()}
 
 
@@ -89,8 +105,8 @@ def _floor(name: str, people: Sequence[Fixations], grid: Grid, config: PeopleSea
 
 
 def _centre(people: Sequence[Fixations], grid: Grid) -> _Array:
-    """How often people fixate each cell after their first fixation in all pictures, plus one."""
-    points = np.concatenate([each.points[1:] for each in people])
+    """Count how often people fixate each cell after their first fixation in all pictures, plus one."""
+    points = np.concatenate([search.points[1:] for search in people])
     counts = torch.bincount(grid.cell_of(torch.from_numpy(points)), minlength=len(grid))
     return np.asarray(counts.double().numpy() + 1)
 
@@ -113,7 +129,10 @@ def people_report(
 ) -> None:
     """Write all output and print the tables; scanpaths are those of random baselines and policies, by name."""
     out = config.out
-    summary = "\n".join(line for title, rows in tables.items() for line in [f"**{title}**", "", *_table(rows), ""])
+    lines = []
+    for title, rows in tables.items():
+        lines += [f"**{title}**", "", *_table(rows), ""]
+    summary = "\n".join(lines)
     files = {
         "summary.md": summary,
         "summary.csv": _csv(tables),
@@ -129,22 +148,25 @@ def people_report(
     for number, (title, rows) in enumerate(tables.items(), start=1):
         from semfov.viz import plot_curves
 
-        figure = plot_curves(
-            {name: each.curve for name, each in rows.items()}, title=title, label="targets found (%)", most=102
-        )
+        curves = {name: scores.curve for name, scores in rows.items()}
+        figure = plot_curves(curves, title=title, label="targets found (%)", most=102)
         written.append(save_figure(figure, out / f"performance_{number}.png"))
     announce(summary, written)
 
 
-def _cells(each: Beside) -> list[tuple[float, float]]:
-    none = float("nan")
-    figures = [each.area, each.tfp_auc, (each.mismatch, none), each.ratio]
-    return [*figures, each.multimatch, each.mean(4), each.mean(5)] if each.alike else [*figures, *[(none, none)] * 3]
+def _cells(scores: Beside) -> list[tuple[float, float]]:
+    """List the figures of a searcher under `_HEAD` with their standard errors, NaN where there is none."""
+    nothing = (math.nan, math.nan)
+    alike = [scores.multimatch, scores.sequence_score, scores.edit_distance] if scores.alike else [nothing] * 3
+    return [scores.area, scores.tfp_auc, (scores.mismatch, math.nan), scores.ratio, *alike]
 
 
 def _table(rows: Rows) -> list[str]:
-    body = [[name, *(_with_error(*cell) for cell in _cells(each))] for name, each in rows.items()]
-    return table([["", *_HEAD], *body])
+    """Write a table of searchers, as Markdown."""
+    body = [["", *_HEAD]]
+    for name, scores in rows.items():
+        body.append([name, *(_with_error(value, error) for value, error in _cells(scores))])
+    return table(body)
 
 
 def _with_error(value: float, error: float) -> str:
@@ -154,27 +176,32 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _csv(tables: Mapping[str, Rows]) -> str:
+    """Write all figures, one a row, with the single dimensions of MultiMatch."""
     lines = [["table", "row", "figure", "value", "error"]]
     for title, rows in tables.items():
-        for name, each in rows.items():
-            named = dict(zip(_HEAD, _cells(each), strict=True))
-            if each.alike:
-                named |= {f"MultiMatch {what}": each.mean(n) for n, what in enumerate(DIMENSIONS)}
-            lines += [[title, name, what, f"{value:.5f}", f"{error:.5f}"] for what, (value, error) in named.items()]
+        for name, scores in rows.items():
+            figures = dict(zip(_HEAD, _cells(scores), strict=True))
+            if scores.alike:
+                figures |= {f"MultiMatch {dimension}": scores.mean(n) for n, dimension in enumerate(DIMENSIONS)}
+            for figure, (value, error) in figures.items():
+                lines.append([title, name, figure, f"{value:.5f}", f"{error:.5f}"])
     return csv_text(lines)
 
 
 def _curves(tables: Mapping[str, Rows]) -> str:
+    """Write the performance after each gaze shift, one a row."""
     lines = [["table", "row", "gaze shifts", "found"]]
     for title, rows in tables.items():
-        for name, each in rows.items():
-            lines += [[title, name, str(n), f"{value:.5f}"] for n, value in enumerate(each.curve)]
+        for name, scores in rows.items():
+            lines += [[title, name, str(shifts), f"{share:.5f}"] for shifts, share in enumerate(scores.curve)]
     return csv_text(lines)
 
 
 def _manifest(config: PeopleSearchConfig) -> dict[str, object]:
-    files = [config.people, *config.files]
-    files = [file for path in files for file in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
+    """Describe what the scores were made of."""
+    files: list[Path] = []
+    for path in (config.people, *config.files):
+        files += sorted(path.glob("*.json")) if path.is_dir() else [path]
     return {
         "command": ["python", "-m", "eval.human", *sys.argv[1:]],
         "commit": commit(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,9 @@ _Array = NDArray[np.float64]
 DIMENSIONS = ("shape", "direction", "length", "position")
 """The dimensions of MultiMatch that need no fixation durations."""
 
+_SHIFTS = 6
+"""Gaze shifts over which performance by category is compared: the first seven fixations."""
+
 
 @dataclass(frozen=True)
 class Beside:
@@ -53,15 +57,26 @@ class Beside:
     ratio: tuple[float, float]
     alike: Mapping[str, _Array]
 
-    def mean(self, figure: int) -> tuple[float, float]:
-        """Mean over pictures of one measure of `alike`, and its standard error."""
-        values = np.array([each[figure] for each in self.alike.values()])
+    def mean(self, measure: int) -> tuple[float, float]:
+        """Average one measure of `alike` over pictures, with its standard error."""
+        values = np.array([measures[measure] for measures in self.alike.values()])
         return _mean_and_error(values[np.isfinite(values)])
 
     @property
     def multimatch(self) -> tuple[float, float]:
         """Mean of the four dimensions of MultiMatch, and its standard error over pictures."""
-        return _mean_and_error(np.array([each[:4].mean() for each in self.alike.values() if np.isfinite(each[0])]))
+        of_pictures = [measures[: len(DIMENSIONS)] for measures in self.alike.values()]
+        return _mean_and_error(np.array([scores.mean() for scores in of_pictures if np.isfinite(scores[0])]))
+
+    @property
+    def sequence_score(self) -> tuple[float, float]:
+        """Mean sequence score, and its standard error over pictures."""
+        return self.mean(len(DIMENSIONS))
+
+    @property
+    def edit_distance(self) -> tuple[float, float]:
+        """Mean edit distance, and its standard error over pictures."""
+        return self.mean(len(DIMENSIONS) + 1)
 
 
 class People:
@@ -78,87 +93,127 @@ class People:
     def __init__(
         self, searches: Sequence[Fixations], grid: Grid, *, longest: int, bandwidth: float, bootstrap: int
     ) -> None:
-        self.searches, self.grid, self.longest = list(searches), grid, longest
-        self.bandwidth, self.bootstrap = bandwidth, bootstrap
+        self.searches = list(searches)
+        self.grid = grid
+        self.longest = longest
+        self.bootstrap = bootstrap
         self.pictures = by_picture(self.searches)
-        self.cells = {name: [in_cells(each, grid) for each in people] for name, people in self.pictures.items()}
-        self.points = {name: np.concatenate([each.points for each in people]) for name, people in self.pictures.items()}
-        self.clusters: dict[str, Any] = {}
-        self.words = {name: self._words(name, people) for name, people in self.pictures.items()}
-        finds = [shift_found(each, longest) for each in self.searches]
-        self.curve = mean_performance(finds, [each.target for each in self.searches], 6)
+        self.clusters: dict[str, Any] = {}  # in each picture, of all people's fixations
+        self.cells: dict[str, list[_Array]] = {}
+        self.words: dict[str, list[list[int]]] = {}
+        for name, people in self.pictures.items():
+            self.clusters[name] = fitted_clusters(np.concatenate([search.points for search in people]), bandwidth)
+            self.cells[name] = [in_cells(search, grid) for search in people]
+            self.words[name] = self._words(name, people)
+        finds = [shift_found(search, longest) for search in self.searches]
+        self.curve = mean_performance(finds, [search.target for search in self.searches], _SHIFTS)
 
     def score(self, searches: Sequence[Fixations]) -> Beside:
         """Score a searcher; each person is compared with all other people."""
-        finds = np.array([shift_found(each, self.longest) for each in searches])
-        shifts = self.longest - 1
-        curve = mean_performance(finds.tolist(), [each.subject for each in searches], shifts)
-        areas = defaultdict(list)
-        for at, each in zip(finds, searches, strict=True):
-            areas[each.picture].append(performance_area(cumulative_performance(np.array([at]), shifts)))
-        by_category = mean_performance(finds.tolist(), [each.target for each in searches], 6)
-        ratios = defaultdict(list)
-        for each in searches:
-            ratios[each.picture].append(scanpath_ratio(each.points + 0.5, each.box or (0, 0, 0, 0)))
-        ratio = np.array([np.nanmean(v) for v in ratios.values() if np.isfinite(v).any()])
+        finds = [shift_found(search, self.longest) for search in searches]
+        targets = [search.target for search in searches]
+        curve = mean_performance(finds, [search.subject for search in searches], self.longest - 1)
+        by_category = mean_performance(finds, targets, _SHIFTS)
         return Beside(
-            curve,
-            (performance_area(curve), float(standard_error(np.array([np.mean(v) for v in areas.values()])))),
-            (tfp_auc(finds.tolist(), [each.target for each in searches]), self._error(finds, searches)),
-            probability_mismatch(by_category, self.curve),
-            _mean_and_error(ratio),
-            self._alike(searches),
+            curve=curve,
+            area=(performance_area(curve), self._area_error(finds, searches)),
+            tfp_auc=(tfp_auc(finds, targets), self._tfp_auc_error(finds, searches)),
+            mismatch=probability_mismatch(by_category, self.curve),
+            ratio=_mean_ratio(searches),
+            alike=self._alike(searches),
         )
 
-    def _alike(self, searches: Sequence[Fixations]) -> dict[str, _Array]:
-        themselves = {id(each) for each in self.searches}
-        alike = {}
-        for name, ours in by_picture(searches).items():
-            if name not in self.pictures:
-                continue
-            words = self._words(name, ours)
-            rows: list[Any] = []
-            for mine, word in zip(ours, words, strict=True):
-                path = in_cells(mine, self.grid)
-                for other, cells, letters in zip(self.pictures[name], self.cells[name], self.words[name], strict=True):
-                    # Each pair of people is counted only once.
-                    if id(mine) in themselves and other.subject <= mine.subject:
-                        continue
-                    both = shift_found(mine, 10**6) >= 0 and shift_found(other, 10**6) >= 0
-                    figures = multimatch(path, cells, (self.grid.columns, self.grid.rows))[:4] if both else [np.nan] * 4
-                    rows.append([*figures, sequence_score(word, letters), edit_distance(word, letters)])
-            if rows:
-                table = np.array(rows, dtype=np.float64)
-                with_all = table[np.isfinite(table[:, 0])]
-                first = with_all[:, :4].mean(0) if len(with_all) else np.full(4, np.nan)
-                alike[name] = np.concatenate([first, table[:, 4:].mean(0)])
-        return alike
+    def _area_error(self, finds: Sequence[int], searches: Sequence[Fixations]) -> float:
+        """Compute the standard error over pictures of the area under performance."""
+        areas = defaultdict(list)
+        for found, search in zip(finds, searches, strict=True):
+            performance = cumulative_performance(np.array([found]), self.longest - 1)
+            areas[search.picture].append(performance_area(performance))
+        return float(standard_error(np.array([np.mean(of_picture) for of_picture in areas.values()])))
 
-    def _words(self, name: str, searches: Sequence[Fixations]) -> list[list[int]]:
-        if name not in self.clusters:
-            self.clusters[name] = fitted_clusters(self.points[name], self.bandwidth)
-        labels = self.clusters[name].predict(np.concatenate([each.points for each in searches]))
-        ends = np.cumsum([len(each) for each in searches]).tolist()
-        return [labels[start:end].tolist() for start, end in zip([0, *ends], ends, strict=False)]
-
-    def _error(self, finds: NDArray[np.int64], searches: Sequence[Fixations]) -> float:
-        """Compute standard error of TFP-AUC by bootstrap: pictures are resampled with replacement, target by target."""
-        pictures = defaultdict(list)
-        for at, each in zip(finds.tolist(), searches, strict=True):
-            pictures[each.target, each.picture].append(max(0, 7 - at) if at >= 0 else 0)
+    def _tfp_auc_error(self, finds: Sequence[int], searches: Sequence[Fixations]) -> float:
+        """Compute the standard error of TFP-AUC by bootstrap: pictures are drawn with replacement, target by target."""
         # A search that succeeds after n gaze shifts counts in 7 - n of the seven values that are summed.
-        categories = defaultdict(list)
-        for (target, _), values in pictures.items():
-            categories[target].append((float(np.sum(values)), len(values)))
+        counts = defaultdict(list)
+        for found, search in zip(finds, searches, strict=True):
+            counts[search.target, search.picture].append(max(0, _SHIFTS + 1 - found) if found >= 0 else 0)
+        pictures_of = defaultdict(list)
+        for (target, _), of_picture in counts.items():
+            pictures_of[target].append((float(np.sum(of_picture)), len(of_picture)))
         generator = np.random.default_rng(0)
         sums = np.zeros(self.bootstrap)
-        for members in categories.values():
-            table = np.array(members)
-            drawn = table[generator.integers(0, len(table), (self.bootstrap, len(table)))].sum(1)
-            sums += drawn[:, 0] / drawn[:, 1]
-        return float((sums / len(categories)).std(ddof=1))
+        for pictures in pictures_of.values():
+            table = np.array(pictures)
+            samples = generator.integers(0, len(table), (self.bootstrap, len(table)))
+            counted, number = table[samples].sum(1).T
+            sums += counted / number
+        return float((sums / len(pictures_of)).std(ddof=1))
+
+    def _alike(self, searches: Sequence[Fixations]) -> dict[str, _Array]:
+        """Compare searches with people's, picture by picture (`Beside.alike`)."""
+        alike = {}
+        for name, in_picture in by_picture(searches).items():
+            if name not in self.pictures:
+                continue
+            pairs = self._pairs(name, in_picture)
+            if pairs:
+                measures = np.array(pairs, dtype=np.float64)
+                scanpaths = measures[:, : len(DIMENSIONS)]
+                compared = scanpaths[np.isfinite(scanpaths[:, 0])]
+                multimatch_mean = compared.mean(0) if len(compared) else np.full(len(DIMENSIONS), np.nan)
+                alike[name] = np.concatenate([multimatch_mean, measures[:, len(DIMENSIONS) :].mean(0)])
+        return alike
+
+    def _pairs(self, name: str, searches: Sequence[Fixations]) -> list[list[float]]:
+        """Compare each search in a picture with those of all other people.
+
+        Args:
+            name: the picture.
+            searches: searches in it, of a model or of the people themselves.
+
+        Returns:
+            For each pair the six measures of `Beside.alike`; MultiMatch is NaN unless both searches succeed.
+        """
+        themselves = {id(search) for search in self.searches}
+        pairs = []
+        for search, word in zip(searches, self._words(name, searches), strict=True):
+            path = in_cells(search, self.grid)
+            people = zip(self.pictures[name], self.cells[name], self.words[name], strict=True)
+            for other, path_of_other, word_of_other in people:
+                # Each pair of people is counted only once.
+                if id(search) in themselves and other.subject <= search.subject:
+                    continue
+                scanpath_measures = [math.nan] * len(DIMENSIONS)
+                if _succeeds(search) and _succeeds(other):
+                    match = multimatch(path, path_of_other, (self.grid.columns, self.grid.rows))
+                    scanpath_measures = [*match[: len(DIMENSIONS)]]
+                similarity = sequence_score(word, word_of_other)
+                pairs.append([*scanpath_measures, similarity, edit_distance(word, word_of_other)])
+        return pairs
+
+    def _words(self, name: str, searches: Sequence[Fixations]) -> list[list[int]]:
+        """Write each search in a picture as a word, whose letters are the clusters of its fixations."""
+        letters = self.clusters[name].predict(np.concatenate([search.points for search in searches]))
+        ends = np.cumsum([len(search) for search in searches])[:-1]
+        return [word.tolist() for word in np.split(letters, ends)]
+
+
+def _succeeds(search: Fixations) -> bool:
+    """Tell whether a search finds its target, however many fixations it takes."""
+    return shift_found(search, 10**6) >= 0
+
+
+def _mean_ratio(searches: Sequence[Fixations]) -> tuple[float, float]:
+    """Average the scanpath ratio of the successful searches, with its standard error over pictures."""
+    ratios = defaultdict(list)
+    for search in searches:
+        ratios[search.picture].append(scanpath_ratio(search.points + 0.5, search.box or (0, 0, 0, 0)))
+    with_success = [of_picture for of_picture in ratios.values() if np.isfinite(of_picture).any()]
+    return _mean_and_error(np.array([np.nanmean(of_picture) for of_picture in with_success]))
 
 
 def _mean_and_error(values: _Array) -> tuple[float, float]:
-    """Mean and standard error; NaN if there are too few values."""
-    return (float(values.mean()), float(standard_error(values))) if len(values) else (float("nan"), float("nan"))
+    """Average values, with the standard error; NaN if there are none."""
+    if not len(values):
+        return math.nan, math.nan
+    return float(values.mean()), float(standard_error(values))
