@@ -102,13 +102,13 @@ class FittedGaze(NamedTuple):
     scores: Mapping[str, Scores]
 
 
-def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> FittedGaze:
+def fit_gaze_model(config: GazeModelFit, detector: Detector, folder: Path) -> FittedGaze:
     """Look at all pictures, evaluate on folds, and make a model of all in the way that predicts best.
 
     Args:
         config: pictures, fixations, and how the model is fitted.
         detector: gives the feature maps.
-        store: folder that keeps models and scores of folds.
+        folder: folder that keeps models and scores of folds.
 
     Returns:
         The model, with the scores.
@@ -120,20 +120,20 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> Fit
     source = features_of(detector, config.layers)
     groups = look(config, source)
     _check_pictures(config, groups)
-    kept = FoldStore(store, {**source.what, "data": config.fingerprint})
-    numbers = range(config.folds)
-    scores = {ANEW: kept.scores(detector.name, [Fold(lambda: groups, n, config.folds, config.fit) for n in numbers])}
+    store = FoldStore(folder, {**source.what, "data": config.fingerprint})
+    scores = {ANEW: store.scores(detector.name, _folds(config, groups, None))}
     shipped = _adaptable(config, detector, groups)
     if shipped is not None:
-        folds = [AdaptedFold(lambda: groups, number, config.folds, config.fit, shipped) for number in numbers]
-        scores[ADAPTED] = kept.scores(f"{detector.name} adapted", folds)
-    way = max(scores, key=lambda way: _likelihood(scores[way]) if config.folds else 0.0)
-    everything = [list(range(len(group))) for group in groups]
+        scores[ADAPTED] = store.scores(f"{detector.name} adapted", _folds(config, groups, shipped))
+    # Without folds nothing tells which way predicts better.
+    way = max(scores, key=lambda way: _likelihood(scores[way])) if config.folds else ANEW
+
+    all_pictures = [list(range(len(group))) for group in groups]
     if shipped is None or way == ANEW:
-        model = fitted_density(config.fit, groups, everything, "all pictures")
+        model = fitted_density(config.fit, groups, all_pictures, "all pictures")
         model.likeness = fitted_likeness(model, groups)
     else:
-        model = adapted_density(shipped, groups, everything, "adapting, all pictures")
+        model = adapted_density(shipped, groups, all_pictures, "adapting, all pictures")
     _describe_viewing(model, groups)
     settings = detector.settings()
     model.metadata |= {
@@ -149,6 +149,17 @@ def fit_gaze_model(config: GazeModelFit, detector: Detector, store: Path) -> Fit
     return FittedGaze(model, way, scores)
 
 
+def _folds(config: GazeModelFit, groups: list[Viewed], shipped: FixationDensity | None) -> list[Fold]:
+    """Make the folds on which models are fitted anew, or a shipped one is adapted."""
+    folds: list[Fold] = []
+    for number in range(config.folds):
+        if shipped is None:
+            folds.append(Fold(lambda: groups, number, config.folds, config.fit))
+        else:
+            folds.append(AdaptedFold(lambda: groups, number, config.folds, config.fit, shipped))
+    return folds
+
+
 def _adaptable(config: GazeModelFit, detector: Detector, groups: Sequence[Viewed]) -> FixationDensity | None:
     """Find the shipped model of a detector that can be adapted, and compared with one that is fitted anew.
 
@@ -161,12 +172,17 @@ def _adaptable(config: GazeModelFit, detector: Detector, groups: Sequence[Viewed
         The model; None where there is none for the layers, where it was fitted to some of these pictures, which it
         would predict too well, or where folds are too small.
     """
-    shipped = FixationDensity.if_shipped(detector.name) if config.adapt else None
-    if shipped is None or shipped.layers != {name: maps.shape[1] for name, maps in groups[0].features.maps.items()}:
+    if not config.adapt:
         return None
-    is_new = not set(config.fingerprint) & set(shipped.metadata.get("data", []))
-    fewest = sum(map(len, groups)) * (config.folds - 1) // max(config.folds, 1)
-    return shipped if is_new and fewest >= _FEWEST_ADAPTED else None
+    shipped = FixationDensity.if_shipped(detector.name)
+    channels = {name: maps.shape[1] for name, maps in groups[0].features.maps.items()}
+    if shipped is None or shipped.layers != channels:
+        return None
+    if set(config.fingerprint) & set(shipped.metadata.get("data", [])):
+        return None
+    # In a fold a model is fitted to the other folds.
+    pictures_of_fold = sum(map(len, groups)) * (config.folds - 1) // max(config.folds, 1)
+    return shipped if pictures_of_fold >= _FEWEST_ADAPTED else None
 
 
 def _likelihood(scores: Scores) -> float:
