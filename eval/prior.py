@@ -158,20 +158,19 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
     for record in records:
         by_question.setdefault(record["question"], []).append(record)
     for beginning, name in _MISSING.items():
-        by_question[name] = [
-            record
-            for question, some in by_question.items()
-            for record in some
-            if question.startswith(beginning) and not record["present"]
-        ]
+        missing = []
+        for question, group in by_question.items():
+            if question.startswith(beginning):
+                missing += [record for record in group if not record["present"]]
+        by_question[name] = missing
     heads = ["mean p", "Brier", "difference", "best", "ECE", "area", *_DECIDED, "passes"]
     rows = [["searches for", "`prior=`", "number", "there", *heads]]
-    for question, some in by_question.items():
-        there = torch.tensor([record["present"] for record in some])
+    for question, group in by_question.items():
+        there = torch.tensor([record["present"] for record in group])
         frequency = f"{float(there.double().mean()):.3f}"
         for way, name in _PRIORS.items():
-            if some and way in some[0]:
-                rows.append([question, name, str(len(some)), frequency, *_measured(some, way)])
+            if group and way in group[0]:
+                rows.append([question, name, str(len(group)), frequency, *_measured(group, way)])
     return "\n".join(
         [
             "Probability that a photograph holds the class: with the share of the searches of the fit, with one half, "
@@ -187,27 +186,40 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
 
 def _measured(records: Sequence[ResultRecord], way: str) -> list[str]:
     """Measure probabilities, in the order of the headings, and count decisions and passes."""
-    probability = torch.tensor([record[way]["probability"] for record in records], dtype=torch.float64)
     there = torch.tensor([record["present"] for record in records])
-    usual = torch.tensor([record["fit"]["probability"] for record in records], dtype=torch.float64)
-    squares = torch.stack([(values - there.double()).square() for values in (probability, usual)])
-    brier = Bootstrap.of(lambda chosen: squares[:, chosen].mean(1), [record["scene"] for record in records])
-    apart = brier.less(1)
-    difference = "" if way == "fit" else plus_minus(float(apart.value[0]), float(apart.error[0]), 3, sign="+")
-    area = best = "-"
+    probability = torch.tensor([record[way]["probability"] for record in records], dtype=torch.float64)
+    brier, difference = _brier(records, way, there)
+    area = "-"
+    best = "-"
     if there.any() and not there.all():
         area = f"{area_under_roc(probability, there):.3f}"
         best = f"{_best_brier(probability, there):.3f}"
+    passes = sum(record[way]["passes"] for record in records) / len(records)
     return [
         f"{float(probability.mean()):.3f}",
-        plus_minus(float(brier.value[0]), float(brier.error[0]), 3),
+        brier,
         difference,
         best,
         f"{BinarySums.of(probability, there).ece:.3f}",
         area,
         *_decided(records, way),
-        f"{sum(record[way]['passes'] for record in records) / len(records):.1f}",
+        f"{passes:.1f}",
     ]
+
+
+def _brier(records: Sequence[ResultRecord], way: str, there: Tensor) -> tuple[str, str]:
+    """Write the Brier score, and its difference to the one with the prior of the fit, paired over photographs."""
+    squares = []
+    for prior in (way, "fit"):
+        probability = torch.tensor([record[prior]["probability"] for record in records], dtype=torch.float64)
+        squares.append((probability - there.double()).square())
+    errors = torch.stack(squares)  # (2, M)
+    brier = Bootstrap.of(lambda chosen: errors[:, chosen].mean(1), [record["scene"] for record in records])
+    score = plus_minus(float(brier.value[0]), float(brier.error[0]), 3)
+    if way == "fit":
+        return score, ""
+    apart = brier.less(1)
+    return score, plus_minus(float(apart.value[0]), float(apart.error[0]), 3, sign="+")
 
 
 def _best_brier(probability: Tensor, there: Tensor) -> float:
@@ -218,16 +230,15 @@ def _best_brier(probability: Tensor, there: Tensor) -> float:
 
 
 def _decided(records: Sequence[ResultRecord], way: str) -> list[str]:
-    """Compute which % end right, wrong and undecided, and found and absent where the target is there and where not."""
-    right_outcomes = ["found" if record["present"] else "absent" for record in records]
-    outcomes = [record[way]["outcome"] for record in records]
-    right = sum(outcome == correct for outcome, correct in zip(outcomes, right_outcomes, strict=True))
-    undecided = outcomes.count("undecided")
-    counts = (right, len(records) - right - undecided, undecided)
-    cells = [share(count, len(records)) for count in counts]
-    for present in (True, False):
-        some = [record[way]["outcome"] for record in records if record["present"] == present]
-        cells += [share(some.count(outcome), len(some)) for outcome in ("found", "absent")]
+    """Write which % end right, wrong and undecided, and found and absent where the target is there and where not."""
+    of_present = [record[way]["outcome"] for record in records if record["present"]]
+    of_absent = [record[way]["outcome"] for record in records if not record["present"]]
+    right = of_present.count("found") + of_absent.count("absent")
+    undecided = of_present.count("undecided") + of_absent.count("undecided")
+    wrong = len(records) - right - undecided
+    cells = [share(count, len(records)) for count in (right, wrong, undecided)]
+    for outcomes in (of_present, of_absent):
+        cells += [share(outcomes.count("found"), len(outcomes)), share(outcomes.count("absent"), len(outcomes))]
     return cells
 
 

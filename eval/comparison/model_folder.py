@@ -29,33 +29,46 @@ def with_models(config: _Config) -> _Config:
     for name in ("model", "search_model", "map_model"):
         value = getattr(config.belief, name)
         check(value is None, f"belief.{name}", "null, since models defines it", value)
-    files = {part: folder.file(part) for part in ("observation", "search")}
-    names = {"model": "observation", "search_model": "search"}
+    observation = folder.file("observation")
     columns, rows = folder.manifest.grid
-    models: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
-    models["map_model"] = _text(config.models if files["observation"] else None)
-    belief = replace(config.belief, columns=columns, rows=rows, **models)  # type: ignore[arg-type]
-    detector = _detector_of(folder, config.detector)
-    named = type(config)().policies != config.policies
-    policies = tuple(_recommended_policy(folder, config) if each == "recommended" else each for each in config.policies)
+    belief = replace(
+        config.belief,
+        columns=columns,
+        rows=rows,
+        model=_text(observation),
+        search_model=_text(folder.file("search")),
+        map_model=None if observation is None else str(config.models),
+    )
+    config = replace(
+        config,
+        detector=_detector_of(folder, config.detector),
+        sensor=sensor_settings(folder.manifest.sensor),
+        belief=belief,
+        policies=_policies_of(folder, config),
+    )
+    return config.complete(folder)
+
+
+def _policies_of(folder: ModelFolder, config: ComparedConfig) -> tuple[str | PolicyConfig, ...]:
+    """Choose the policies that a folder has the models for.
+
+    Raises:
+        InputError: a policy that the settings name needs a model that the folder lacks.
+    """
+    are_default = config.policies == type(config)().policies
     chosen = []
-    for policy in policies:
-        missing = next((part for part in _needs(policy, config) if files[part] is None), None)
+    for name in config.policies:
+        policy = _recommended_policy(folder, config) if name == "recommended" else name
+        missing = next((part for part in _needs(policy, config) if folder.file(part) is None), None)
         if missing is None:
             chosen.append(policy)
-        elif named:
-            why = folder.manifest.parts[missing].why if missing in folder.manifest.parts else "not fitted"
+        elif not are_default:
+            parts = folder.manifest.parts
+            why = parts[missing].why if missing in parts else "not fitted"
             raise InputError(
                 f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
             )
-    config = replace(
-        config,
-        detector=detector,
-        sensor=sensor_settings(folder.manifest.sensor),
-        belief=belief,
-        policies=tuple(chosen),
-    )
-    return config.complete(folder)
+    return tuple(chosen)
 
 
 def _detector_of(folder: ModelFolder, settings: DetectorConfig) -> DetectorConfig:

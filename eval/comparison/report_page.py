@@ -25,6 +25,8 @@ from semfov.runs.results import ResultRecord
 _MOST_BYTES = 4_500_000
 """Size of a page in bytes from which no further episode is added."""
 
+_BYTES_OF_VALUE = 7  # of a value in the text of the page
+
 
 def write_run_report(
     run: ComparedLooking,
@@ -37,26 +39,50 @@ def write_run_report(
     others: Mapping[str, FloatArray] | None = None,
     episodes: int = 18,
 ) -> Path:
-    """Write `report.html` to the folder of a run."""
+    """Write `report.html` to the folder of a run.
+
+    Args:
+        run: the run.
+        records: its records.
+        curves: for each way to average, the curves of the policies.
+        titles: title of each way to average.
+        label: what the curves show.
+        shifts: numbers of gaze shifts of the tables.
+        others: curves of others' for comparison, which join the first way to average.
+        episodes: largest number of episodes to step through.
+
+    Returns:
+        The path of the page.
+    """
     sections = []
-    for order, (average, policies) in enumerate(curves.items()):
-        first = next(iter(policies.values()))
-        added = dict(others or {}) if order == 0 else {}
-        means = {**{name: curve.mean for name, curve in policies.items()}, **added}
-        errors = {name: curve.over_images for name, curve in policies.items()}
-        at = [n for n in shifts if n < len(first.mean)]
-        rows = [["policy", *(str(n) for n in at), LAST_COLUMN], *curve_rows(policies, at)]
-        rows += [[name, *(f"{100 * curve[n]:.1f}" for n in at), ""] for name, curve in added.items()]
-        caption = f"{label} after n gaze shifts ± standard error over {first.images} images, {first.episodes} episodes"
-        title = escape(titles[average])
-        sections.append(f"<section><h2>{title[:1].upper()}{title[1:]}</h2>")
-        sections.append(curves_html(means, errors, label) + table_html(rows, caption) + "</section>")
+    for number, (average, policies) in enumerate(curves.items()):
+        joined = others if others and number == 0 else {}
+        sections.append(_section(titles[average], label, policies, joined, shifts))
     values = {name: value for name, value in run.config.plain().items() if name not in WHERE}
     settings = escape(yaml.safe_dump(values, sort_keys=False))
     sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
     data = _episodes(run, _choose_episodes(records, list(run.policies), episodes))
     title = f"semfov: {run.task} with {run.eye.detector.name}"
     return write_page(run.config.out / "report.html", title, data, sections="\n".join(sections))
+
+
+def _section(
+    title: str, label: str, policies: Mapping[str, Curve], others: Mapping[str, FloatArray], shifts: Sequence[int]
+) -> str:
+    """Draw the curves of policies and of others, with a table of their values after some numbers of gaze shifts."""
+    first = next(iter(policies.values()))
+    means = {name: curve.mean for name, curve in policies.items()} | dict(others)
+    errors = {name: curve.over_images for name, curve in policies.items()}
+    columns = [number for number in shifts if number < len(first.mean)]
+    rows = [["policy", *map(str, columns), LAST_COLUMN], *curve_rows(policies, columns)]
+    for name, mean in others.items():
+        rows.append([name, *(f"{100 * mean[number]:.1f}" for number in columns), ""])
+    caption = f"{label} after n gaze shifts ± standard error over {first.images} images, {first.episodes} episodes"
+    heading = escape(title)
+    return (
+        f"<section><h2>{heading[:1].upper()}{heading[1:]}</h2>\n"
+        f"{curves_html(means, errors, label)}{table_html(rows, caption)}</section>"
+    )
 
 
 def _choose_episodes(records: list[ResultRecord], policies: Sequence[str], count: int) -> list[ResultRecord]:
@@ -78,30 +104,33 @@ def _choose_episodes(records: list[ResultRecord], policies: Sequence[str], count
 
 
 def _episodes(run: ComparedLooking, records: Sequence[ResultRecord]) -> list[Data]:
-    data, size, settings, pictures = [], 0, run.eye.settings(), set[str]()
+    """Describe episodes for the page, as many as it has room for."""
+    settings = run.eye.settings()
+    episodes: list[Data] = []
+    size = 0
+    pictures = set[str]()  # the page holds each picture once
     for record in records:
         if sum(map(len, pictures)) + size > _MOST_BYTES:
             break
         index = list(run.scenes.ids).index(record["scene"])
-        scene, scanpath = run.scenes[index], replay(run, index, record)
+        scene = run.scenes[index]
+        scanpath = replay(run, index, record)
         views = Stimulus.of(run.eye, scene.image).views(scanpath.fixations)
         boxes = None if scanpath.target is None else scene.boxes[scene.labels == scanpath.target]
-        name = f"{scene.name}, {record['policy']}"
-        data.append(
-            episode_data(
-                scanpath,
-                scene.image,
-                views,
-                name=name,
-                settings=settings,
-                boxes=boxes,
-                classes=10,
-                width=256,
-                quality=60,
-            )
+        episode = episode_data(
+            scanpath,
+            scene.image,
+            views,
+            name=f"{scene.name}, {record['policy']}",
+            settings=settings,
+            boxes=boxes,
+            classes=10,
+            width=256,
+            quality=60,
         )
-        shown = [data[-1]["image"], *(each["view"] for each in data[-1]["fixations"])]
+        episodes.append(episode)
+        shown = [episode["image"], *(fixation["view"] for fixation in episode["fixations"])]
         pictures.update(picture for picture in shown if picture is not None)
-        size += sum(len(each["data"]) for each in [*data[-1]["maps"], data[-1]["entropy"]])
-        size += 7 * scanpath.values.numel()
-    return data
+        size += sum(len(quantised["data"]) for quantised in (*episode["maps"], episode["entropy"]))
+        size += _BYTES_OF_VALUE * scanpath.values.numel()
+    return episodes

@@ -38,9 +38,11 @@ class ObservedRates:
     """
 
     def __init__(self, model: FovealObservationModel, lattice: Lattice, *, foresight: float = 0.35) -> None:
-        fitted = model.miss_rate is not None and "cells" in model.metadata
-        check(fitted, "model", "one that train.fit_fom fitted with --mosaics", "one without counts of cells")
-        self.model, self.lattice, self.foresight = model, lattice, foresight
+        has_counts = model.miss_rate is not None and "cells" in model.metadata
+        check(has_counts, "model", "one that train.fit_fom fitted with --mosaics", "one without counts of cells")
+        self.model = model
+        self.lattice = lattice
+        self.foresight = foresight
         counts = torch.tensor(model.metadata["cells"], dtype=torch.float32) + 1
         self.share = counts / counts.sum()
 
@@ -48,20 +50,28 @@ class ObservedRates:
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
         """As `GlimpseEvidence.rates`, but without the rates of earlier looks."""
         octaves = self.lattice.octaves
-        here = octaves[look.level]
-        scores = look.scores / look.scores.sum(-1, keepdim=True).clamp(min=1)
-        vectors = torch.cat([1 - scores.sum(-1, keepdim=True), scores], -1).clamp(min=0)
-        calibrated = self.model.calibrate(vectors, here.expand(vectors.shape[:-1]))
-        unseen = self.share * self.model.miss_likelihood(here)
-        held = torch.where((look.scores > 0).any(-1, keepdim=True), calibrated, unseen / unseen.sum())[..., 1:]
-        # The gist marks the cell of an object's centre; the object also covers the cells around it.
-        detected = F.max_pool2d(look.found.float().movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
-        held = held * (1 - detected) * look.scale**2
+        held = self._held(look, octaves[look.level])  # (rows, columns, K)
         rates = torch.zeros(len(targets), STEPS, *look.scores.shape[:2])
         for step in range(min(STEPS, len(octaves) - 1 - look.level)):
-            new = held * (1 - self.model.miss_likelihood(octaves[look.level + 1 + step])[1:])
-            rates[:, step] = torch.cat([new.sum(-1, keepdim=True), new], -1)[..., targets].movedim(-1, 0)
+            detection_rate = 1 - self.model.miss_likelihood(octaves[look.level + 1 + step])[1:]
+            new = held * detection_rate
+            with_any = torch.cat([new.sum(-1, keepdim=True), new], -1)  # target 0 is any class
+            rates[:, step] = with_any[..., targets].movedim(-1, 0)
         return (rates + 1e-9).log()
+
+    def _held(self, look: Gist, octave: Tensor) -> Tensor:
+        """Compute the expected number of undetected objects of each class in the cells, `(rows, columns, K)`."""
+        scores = look.scores / look.scores.sum(-1, keepdim=True).clamp(min=1)
+        background = 1 - scores.sum(-1, keepdim=True)
+        vectors = torch.cat([background, scores], -1).clamp(min=0)
+        with_hints = self.model.calibrate(vectors, octave.expand(vectors.shape[:-1]))
+        joint = self.share * self.model.miss_likelihood(octave)
+        without_hints = joint / joint.sum()
+        has_hints = (look.scores > 0).any(-1, keepdim=True)
+        probability = torch.where(has_hints, with_hints, without_hints)[..., 1:]
+        # The gist marks the cell of an object's centre; the object also covers the cells around it.
+        detected = F.max_pool2d(look.found.float().movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
+        return probability * (1 - detected) * look.scale**2
 
     def taper(self, span: int) -> Tensor:
         """Weights of the cells along a side of a window, `(span,)`: ones."""
@@ -70,9 +80,10 @@ class ObservedRates:
 
 def make_zoom_observation(name: str | None, eye: WindowEye) -> FovealObservationModel | None:
     """Load an observation model by magnification, by name or the one shipped for the eye; None if none is shipped."""
-    own = f"{eye.detector.name}-zoom"
-    if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():
-        return None
-    model = FovealObservationModel.from_pretrained(name or own)
+    if name is None:
+        name = f"{eye.detector.name}-zoom"
+        if not (FovealObservationModel.shipped / f"{name}.safetensors").is_file():
+            return None
+    model = FovealObservationModel.from_pretrained(name)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)

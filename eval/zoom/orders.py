@@ -14,7 +14,7 @@ from semfov.zoom.slices import raw, slices
 
 
 def adaptive_slices(lattice: Lattice, overlap: float = 0.15) -> list[Window]:
-    r"""Square slices whose number and side follow from the size of the picture, as in ASAHI.
+    r"""Make square slices whose number and side follow from the size of the picture, as in ASAHI.
 
     A picture whose longer side exceeds :math:`512 (4 - 3 l) + 1` pixels is covered by 4 × 3 slices with an overlap l,
     another one by 3 × 2; n × m slices need the side
@@ -24,15 +24,23 @@ def adaptive_slices(lattice: Lattice, overlap: float = 0.15) -> list[Window]:
     Zhang, H. et al. (2023), Adaptive slicing-aided hyper inference for small object detection in high-resolution remote
     sensing images, Remote Sensing 15(5):1249.
     """
-    many = max(lattice.size) > 512 * (4 - 3 * overlap) + 1
-    counts = (4, 3) if many else (3, 2)
-    side = int(max(length / (n - (n - 1) * overlap) for length, n in zip(lattice.size, counts, strict=True))) + 1
+    width, height = lattice.size
+    is_large = max(width, height) > 512 * (4 - 3 * overlap) + 1
+    columns, rows = (4, 3) if is_large else (3, 2)
+    side_by_width = width / (columns - (columns - 1) * overlap)
+    side_by_height = height / (rows - (rows - 1) * overlap)
+    side = int(max(side_by_width, side_by_height)) + 1
     return slices(lattice, side, side - int(side * overlap))
 
 
 def in_order(windows: Sequence[Window]) -> Order:
     """Return the windows in their order."""
-    return lambda looks, done: [(windows[len(looks) - 1], 0.0)] if len(looks) <= len(windows) else []
+
+    def order(looks: Sequence[WindowLook], done: set[Window]) -> list[WindowChoice]:
+        # The first look was the overview.
+        return [(windows[len(looks) - 1], 0.0)] if len(looks) <= len(windows) else []
+
+    return order
 
 
 def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> Order:
@@ -51,7 +59,7 @@ def sparse(windows: Sequence[Window], targets: Sequence[int], least: float) -> O
     def order(looks: Sequence[WindowLook], done: set[Window]) -> Sequence[WindowChoice]:
         nonlocal chosen
         if chosen is None:
-            chosen = [each for each in windows if raw(looks[0], each, targets, most=True) >= least]
+            chosen = [window for window in windows if raw(looks[0], window, targets, most=True) >= least]
         return in_order(chosen)(looks, done)
 
     return order
@@ -64,7 +72,7 @@ def shuffled(windows: Sequence[Window], seed: Sequence[int]) -> Order:
 
 
 def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
-    """Best first: repeatedly the quarter of a seen window with the highest raw score.
+    """Look best first: repeatedly at the quarter of a seen window with the highest raw score.
 
     Args:
         lattice: lattice of the picture.
@@ -79,35 +87,41 @@ def quad_tree(lattice: Lattice, target: int | None, *, most: bool) -> Order:
     queued = set[Window]()
 
     def order(looks: Sequence[WindowLook], done: set[Window]) -> list[WindowChoice]:
-        new = [entry for entry in _quarters(lattice, looks[-1], target, most) if entry[1] not in queued]
-        queued.update(window for _, window in new)
-        frontier.extend(new)
+        for score, window in _quarters(lattice, looks[-1], target, most):
+            if window not in queued:
+                queued.add(window)
+                frontier.append((score, window))
+        if not frontier:
+            return []
+        # The highest score first; among equals the larger window, and the upper left one.
         frontier.sort(key=lambda entry: (-entry[0], entry[1].level, entry[1].cells))
-        return [frontier.pop(0)[::-1]] if frontier else []
+        score, window = frontier.pop(0)
+        return [(window, score)]
 
     return order
 
 
 def _quarters(lattice: Lattice, look: WindowLook, target: int | None, most: bool) -> list[tuple[float, Window]]:
+    """List the quarters of a window on the next level, with their highest or summed scores."""
     level = look.window.level + 1
     if level >= lattice.levels:
         return []
-    span, (across, down) = lattice.span(level), lattice.places(level)
+    targets = [] if target is None else [target]
+    span = lattice.span(level)
+    columns, rows = lattice.places(level)
     left, top = look.window.cells[:2]
-    places = sorted(
-        {
-            (min(top + dy, down - 1), min(left + dx, across - 1))
-            for dy in (0, span)
-            for dx in (0, span)
-            if top + dy < lattice.rows and left + dx < lattice.columns
-        }
-    )
-    windows = [Window.on(lattice, (level, column, row)) for row, column in places]
-    return [(raw(look, window, [] if target is None else [target], most=most), window) for window in windows]
+    places = set()
+    for row in (top, top + span):
+        for column in (left, left + span):
+            if row < lattice.rows and column < lattice.columns:
+                # A window that would reach over the border is moved inside.
+                places.add((min(row, rows - 1), min(column, columns - 1)))
+    windows = [Window.on(lattice, (level, column, row)) for row, column in sorted(places)]
+    return [(raw(look, window, targets, most=most), window) for window in windows]
 
 
 def oracle(source: WindowLooks, windows: Sequence[Window], finds: Callable[[WindowLook], Tensor], most: int) -> Order:
-    """Repeatedly the window that shows most of the objects not seen before.
+    """Look repeatedly at the window that shows most of the objects not seen before.
 
     Args:
         source: the looks at the picture.
