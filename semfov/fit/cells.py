@@ -152,4 +152,8 @@ def _closest_looks(observer: SemanticMap, mapped: MappedLooks, generator: torch.
     order = torch.randperm(len(mapped.fixations), generator=generator)[: 2 ** (_COUNTS - 1)]
     looks = observer.weigh(mapped.detections[order], mapped.fixations[order], mapped.grid)
     cells = torch.arange(len(mapped.grid))
-    return torch.stack([looks.ratio[looks.distance[: 2**n].argmin(0), cells] for n in range(_COUNTS)])
+    ratios = []
+    for doubling in range(_COUNTS):
+        closest = looks.distance[: 2**doubling].argmin(0)  # (X·Y,), number of the look
+        ratios.append(looks.ratio[closest, cells])
+    return torch.stack(ratios)

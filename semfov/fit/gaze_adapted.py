@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import deepcopy
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -100,23 +101,42 @@ def adapted_density(
         The adapted model, in `eval` mode.
     """
     adaptation = Adaptation(model)
-    chosen = [(group, numbers) for group, numbers in zip(groups, pictures, strict=True) if len(numbers)]
-    readouts = [_readouts(model, group, numbers) for group, numbers in chosen]
-    others = [_centres_of_others(groups, pictures, group, numbers) for group, numbers in chosen]
-    counts = [group.counts[torch.as_tensor(numbers)] for group, numbers in chosen]
-    shares = [count / count.sum((1, 2), keepdim=True).clamp(min=1) for count in counts]
+    parts = []
+    for group, numbers in zip(groups, pictures, strict=True):
+        if len(numbers):
+            readouts = _readouts(model, group, numbers)
+            centres = _centres_of_others(groups, pictures, group, numbers)
+            counts = group.counts[torch.as_tensor(numbers)]
+            shares = counts / counts.sum((1, 2), keepdim=True).clamp(min=1)
+            parts.append(_GroupToAdapt(group.size, readouts, centres, shares))
 
     def loss_of(_: int) -> Tensor:
         """Average the negative log likelihood of a fixation over all pictures."""
-        losses = [
-            -(adaptation(of_group, learned, group.size) * share).sum((1, 2))
-            for (group, _), of_group, learned, share in zip(chosen, readouts, others, shares, strict=True)
-        ]
+        losses = []
+        for part in parts:
+            log_density = adaptation(part.readouts, part.centres, part.size)
+            losses.append(-(log_density * part.shares).sum((1, 2)))
         return torch.cat(losses).mean()
 
-    numbers = [adaptation.gain, adaptation.spread, adaptation.kept, adaptation.learned]
-    descend(numbers, loss_of, _STEPS, _RATE, decay=0.0, title=title)
+    parameters = [adaptation.gain, adaptation.spread, adaptation.kept, adaptation.learned]
+    descend(parameters, loss_of, _STEPS, _RATE, decay=0.0, title=title)
     return adaptation.adapted(log_centre(groups, pictures)).eval()
+
+
+class _GroupToAdapt(NamedTuple):
+    """Pictures of one size, to which a model is adapted.
+
+    Attributes:
+        size: `(height, width)` of the pictures.
+        readouts: `(P, rows, columns)`, what the model reads from each.
+        centres: `(P, rows, columns)`, log density of the fixations in all other pictures.
+        shares: `(P, rows, columns)`, share of the fixations in each cell.
+    """
+
+    size: tuple[int, int]
+    readouts: Tensor
+    centres: Tensor
+    shares: Tensor
 
 
 @torch.no_grad()
@@ -131,10 +151,10 @@ def _centres_of_others(
     """Compute the log density of the fixations in all pictures but one, for each of a group, `(P, rows, columns)`."""
     centres = []
     for left_out in numbers:
-        others = [
-            [number for number in of_group if each is not group or number != left_out]
-            for each, of_group in zip(groups, pictures, strict=True)
-        ]
+        others = []
+        for other_group, of_group in zip(groups, pictures, strict=True):
+            is_same = other_group is group
+            others.append([number for number in of_group if not (is_same and number == left_out)])
         centres.append(_resized(log_centre(groups, others), cells_of(group.size)))
     return torch.stack(centres)
 

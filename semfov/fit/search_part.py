@@ -106,14 +106,11 @@ class SearchFit(PartFit):
             if not episodes:
                 continue
             grid = run.grid(index)
+            scene = run.scenes.ids[index]
             looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
             # All strategies break ties in the same way, so that their difference is paired.
-            noise = torch.stack(
-                [
-                    noise_for(protocol, len(grid), run.scenes.ids[index], episode.target, episode.repetition)
-                    for episode in episodes
-                ]
-            )
+            noises = [noise_for(protocol, len(grid), scene, trial.target, trial.repetition) for trial in episodes]
+            noise = torch.stack(noises)  # (B, shifts + 1, X·Y)
             for name, strategy in strategies.items():
                 with torch.inference_mode():
                     ends = run_episodes(episodes, strategy, looks, noise, shifts=protocol.shifts, batch=protocol.batch)

@@ -46,12 +46,21 @@ _CROWDED = 1 / 3  # share of the photographs that the crowded mosaics show, thos
 
 
 def crowded(scenes: Scenes, share: float) -> ChosenScenes:
-    """Choose the given share of a set's scenes, those with the most objects; among equals the first scenes count."""
+    """Choose the scenes with the most objects.
+
+    Args:
+        scenes: the scenes.
+        share: share of them that is chosen.
+
+    Returns:
+        The chosen scenes, in the order of the set; among scenes with as many objects the first ones are chosen.
+    """
     check(0 < share <= 1, "share", "above 0 and at most 1", share)
     check(len(scenes) > 0, "scenes", "at least one scene", len(scenes))
-    counts = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
-    order = sorted(range(len(scenes)), key=lambda index: -counts[index])
-    chosen = sorted(order[: math.ceil(share * len(scenes))])
+    objects = [len(scenes.annotation(index).boxes) for index in range(len(scenes))]
+    by_objects = sorted(range(len(scenes)), key=lambda index: -objects[index])
+    count = math.ceil(share * len(scenes))
+    chosen = sorted(by_objects[:count])
     ids: list[int] | list[str] = [scenes.ids[index] for index in chosen]  # type: ignore[assignment]
     return ChosenScenes([(scenes, index) for index in chosen], ids, json_sha256([scenes.fingerprint, ids]))
 
@@ -240,16 +249,13 @@ class MosaicFit:
     def search(self, model: GlimpseEvidence) -> dict[str, list[MosaicSearch]]:
         """Search pictures to fit decisions on (`searched`), and pictures to choose thresholds on (`judged`)."""
         prepare_worker()
-        return {
-            use: [
-                search
-                for kind in kinds
-                for search in search_pictures(
-                    model, self.pictures[kind], self.opened(kind), self.config, f"searching, {kind}"
-                )
-            ]
-            for use, kinds in self._searched().items()
-        }
+        searched: dict[str, list[MosaicSearch]] = {}
+        for use, kinds in self._searched().items():
+            searched[use] = []
+            for kind in kinds:
+                title = f"searching, {kind}"
+                searched[use] += search_pictures(model, self.pictures[kind], self.opened(kind), self.config, title)
+        return searched
 
     def fit_decisions(self, model: GlimpseEvidence, searched: Mapping[str, Sequence[MosaicSearch]]) -> list[str]:
         """Fit the decisions of searches: the probability of presence, and the thresholds; returns lines of Markdown."""
@@ -299,12 +305,17 @@ class MosaicFit:
         """Fit the probability that an object is there, and the spread of expected numbers; returns lines."""
         prepare_worker()
         searched = self._searched()
-        counts = self.config.some_explored
-        fitted, judged = (
-            {kind: (self.pictures[kind], self.opened(kind)[: counts.get(kind)]) for kind in dict.fromkeys(kinds)}
-            for kinds in ((*searched["searched"], *counts), searched["judged"])
-        )
+        fitted = self._explored([*searched["searched"], *self.config.some_explored])
+        judged = self._explored(searched["judged"])
         return fit_certainty(model, fitted, judged, passes=self.config.passes)
+
+    def _explored(self, kinds: Sequence[str]) -> dict[str, tuple[Scenes, list[StoredWindowLooks]]]:
+        """Collect the pictures of kinds with the looks at those of them that are explored: of some kinds the first."""
+        explored = {}
+        for kind in kinds:
+            count = self.config.some_explored.get(kind)
+            explored[kind] = (self.pictures[kind], self.opened(kind)[:count])
+        return explored
 
     def _searched(self) -> dict[str, tuple[str, ...]]:
         """List the kinds of pictures to fit decisions on, and to choose thresholds on."""

@@ -261,22 +261,30 @@ def left_out(
     """
     numbers = {}
     for kind, explorations in explored.items():
-        others = [exploration for other, group in explored.items() if other != kind for exploration in group]
+        others: list[Exploration] = []
+        for other, group in explored.items():
+            if other != kind:
+                others += group
         if not others:
             continue
         certainty = fit(others)
-        judged = [
-            exploration for exploration in explorations if exploration.target is not None and _shows_half(exploration)
-        ]
-        for after in checked:
-            rows = []
-            for exploration in judged:
-                claim = exploration.number(certainty, min(after, exploration.looks))
-                if claim is not None:
-                    rows.append((*claim, exploration.held))
-            if rows:
-                numbers[kind, after] = _Numbers(*torch.tensor(rows, dtype=torch.float64).unbind(-1))
+        judged = [found for found in explorations if found.target is not None and _shows_half(found)]
+        for looks in checked:
+            claimed = _claimed(judged, certainty, looks)
+            if claimed is not None:
+                numbers[kind, looks] = claimed
     return numbers
+
+
+def _claimed(explorations: Sequence[Exploration], certainty: Certainty, looks: int) -> _Numbers | None:
+    """Claim the number of objects after some looks, or after all of fewer; None if none is claimed."""
+    rows = []
+    for exploration in explorations:
+        claim = exploration.number(certainty, min(looks, exploration.looks))
+        if claim is not None:
+            mean, variance = claim
+            rows.append((mean, variance, exploration.held))
+    return _Numbers(*torch.tensor(rows, dtype=torch.float64).unbind(-1)) if rows else None
 
 
 def _shows_half(exploration: Exploration) -> bool:

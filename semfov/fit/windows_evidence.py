@@ -177,11 +177,14 @@ def _rates_before(first: Gist, log_rates: Tensor, look: Gist) -> Tensor:
     """Read the rates of the overview `(T, 3, …)` in the cells of a closer look, for windows an octave closer."""
     # The rate of a cell of the overview spreads over the cells of the lattice in it.
     rates = log_rates.exp() / first.scale**2
-    cells = rates.repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
-    rows, columns = (count * look.scale for count in look.scores.shape[:2])
+    in_lattice = rates.repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
     left, top = look.first
-    shown = cells[..., top : top + rows, left : left + columns]
-    return torch.stack([before_of(of_target.numpy(), look) for of_target in shown[:, min(look.level, STEPS - 1)]])
+    bottom = top + look.scores.shape[0] * look.scale
+    right = left + look.scores.shape[1] * look.scale
+    # The overview, of level 0, predicts windows of level 1 in its first step.
+    step = min(look.level, STEPS - 1)
+    shown = in_lattice[:, step, top:bottom, left:right]
+    return torch.stack([before_of(of_target.numpy(), look) for of_target in shown])
 
 
 class ZoomExample(NamedTuple):
@@ -229,16 +232,27 @@ class ZoomExample(NamedTuple):
     def of_results(
         cls, labels: Tensor, results: Sequence[WindowResult], score_threshold: float = SCORE_THRESHOLD
     ) -> "ZoomExample":
-        """Pair looks at a picture, the overview first, with those inside them; labels `(M,)` of its objects."""
-        strongest = torch.stack([result.show for result in results]).amax(0)
-        is_shown = strongest >= score_threshold
-        is_hinted = (strongest >= _HINT) & ~is_shown
-        classes = F.one_hot(labels - 1, len(strongest)).float()
-        predicting = [(result.gist, result.found) for result in results if result.gist is not None]
-        _, seen = predicting[0]
-        counts = [LookCounts.of(gist, results, classes, seen | found) for gist, found in predicting]
-        shown, hinted = (chosen.nonzero()[:, 0] + 1 for chosen in (is_shown, is_hinted))
-        return cls(counts[0], tuple(counts[1:]), shown, hinted)
+        """Pair looks at a picture with those inside them.
+
+        Args:
+            labels: `(M,)`, classes of its objects, 1..K.
+            results: the looks, the overview first.
+            score_threshold: score from which on a look shows a class.
+
+        Returns:
+            The example.
+        """
+        highest = torch.stack([result.show for result in results]).amax(0)  # (K,), in any look
+        is_shown = highest >= score_threshold
+        is_hinted = (highest >= _HINT) & ~is_shown
+        one_hot = F.one_hot(labels - 1, len(highest)).float()
+        in_overview = results[0].found
+        overview, *closer = [
+            LookCounts.of(result.gist, results, one_hot, in_overview | result.found)
+            for result in results
+            if result.gist is not None
+        ]
+        return cls(overview, tuple(closer), is_shown.nonzero()[:, 0] + 1, is_hinted.nonzero()[:, 0] + 1)
 
     def drawn_targets(self) -> Tensor:
         """Draw classes, 1..K: some that its looks show, and some that they only hint at; at least one."""

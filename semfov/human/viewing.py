@@ -149,10 +149,22 @@ def counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, in
 
 
 def _numbers_of_cells(points: Tensor, size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
-    """Find the cells that hold points, by number; those outside the picture belong to the nearest cell."""
-    x = ((points[:, 0] + 0.5) * (cells[1] / size[1])).floor().clamp(0, cells[1] - 1)
-    y = ((points[:, 1] + 0.5) * (cells[0] / size[0])).floor().clamp(0, cells[0] - 1)
-    return (y * cells[1] + x).long()
+    """Find the cells that hold points, by number; those outside the picture belong to the nearest cell.
+
+    Args:
+        points: `(n, 2)`, x and y in pixels.
+        size: `(height, width)` of the picture.
+        cells: numbers of rows and columns.
+
+    Returns:
+        `(n,)`.
+    """
+    height, width = size
+    rows, columns = cells
+    x, y = (points + 0.5).unbind(-1)  # pixels begin at 0
+    column = (x * (columns / width)).floor().clamp(0, columns - 1)
+    row = (y * (rows / height)).floor().clamp(0, rows - 1)
+    return (row * columns + column).long()
 
 
 class MapSource(NamedTuple):
@@ -291,14 +303,16 @@ class Events(NamedTuple):
     def of(cls, paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> "Events":
         """Make the events of a picture of `(height, width)` with cells `(rows, columns)`."""
         before = [torch.zeros(0, LONGEST - 1, 2)]
-        for path in paths:
+        points = [torch.zeros(0, 2)]
+        person = [torch.zeros(0, dtype=torch.long)]
+        for number, path in enumerate(paths):
+            predicted = path[1:]
             # The fixations before each one are a window of the path, padded at its beginning.
             padded = F.pad(path, (0, 0, LONGEST - 1, 0), value=math.nan)
             before.append(padded.unfold(0, LONGEST - 1, 1)[1 : len(path)].mT)
-        points = torch.cat([torch.zeros(0, 2), *(path[1:] for path in paths)])
-        counts = torch.tensor([len(path) - 1 for path in paths]).long()
-        person = torch.arange(len(paths)).repeat_interleave(counts)
-        return cls(torch.cat(before), _numbers_of_cells(points, size, cells), person)
+            points.append(predicted)
+            person.append(torch.full((len(predicted),), number))
+        return cls(torch.cat(before), _numbers_of_cells(torch.cat(points), size, cells), torch.cat(person))
 
     def some(self, index: Tensor) -> "Events":
         """Select events by number."""

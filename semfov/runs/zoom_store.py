@@ -48,27 +48,12 @@ class WindowLookStore(DetectionStore):
         return Window((x, y, magnification), int(level), (first_column, first_row, last_column, last_row), within)
 
     def pack(self, looks: Sequence[WindowLook]) -> dict[str, Tensor]:
-        """Convert looks to tensors for a file.
-
-        The cells of all gists follow one another; those without a score are left out. A look without a gist has a scale
-        of 0.
-        """
-        gists = [look.gist for look in looks if look.gist is not None]
-        frames = [[0, 0, 0] if look.gist is None else [look.gist.scale, *look.gist.scores.shape[:2]] for look in looks]
-        scores = torch.cat([torch.zeros(0, self.classes), *(gist.scores.flatten(0, 1) for gist in gists)])
-        sizes = torch.cat([torch.zeros(0), *(gist.size.flatten() for gist in gists)])
-        no_cells = torch.zeros(0, self.classes, dtype=torch.bool)
-        found = torch.cat([no_cells, *(gist.found.flatten(0, 1) for gist in gists)])
-        has_score = (scores > 0).any(-1)
+        """Convert looks to tensors for a file."""
         return {
             **super().pack([look.detections for look in looks]),
             "cut": torch.cat([look.cut for look in looks]),
             "show": torch.stack([look.show for look in looks]),
-            "gist.frames": torch.tensor(frames),
-            "gist.cells": has_score.nonzero()[:, 0],
-            "gist.scores": scores[has_score].float(),
-            "gist.sizes": sizes[has_score].float(),
-            "gist.found": found.flatten().nonzero()[:, 0],
+            **_pack_gists([look.gist for look in looks], self.classes),
         }
 
     def unpack(self, tensors: Mapping[str, Tensor], actions: Sequence[Window]) -> list[WindowLook]:
@@ -82,8 +67,44 @@ class WindowLookStore(DetectionStore):
         ]
 
 
+def _pack_gists(gists: Sequence[Gist | None], classes: int) -> dict[str, Tensor]:
+    """Convert the gists of looks to tensors for a file.
+
+    The cells of all gists follow one another; scores and sizes of cells without a score are left out.
+
+    Args:
+        gists: the gists; None for a look without one, whose scale is written as 0.
+        classes: number of classes K.
+
+    Returns:
+        Tensors by name.
+    """
+    frames = []
+    scores = [torch.zeros(0, classes)]
+    sizes = [torch.zeros(0)]
+    found = [torch.zeros(0, classes, dtype=torch.bool)]
+    for gist in gists:
+        if gist is None:
+            frames.append([0, 0, 0])
+            continue
+        rows, columns = gist.scores.shape[:2]
+        frames.append([gist.scale, rows, columns])
+        scores.append(gist.scores.flatten(0, 1))
+        sizes.append(gist.size.flatten())
+        found.append(gist.found.flatten(0, 1))
+    all_scores = torch.cat(scores)  # (cells, K)
+    has_score = (all_scores > 0).any(-1)
+    return {
+        "gist.frames": torch.tensor(frames),
+        "gist.cells": has_score.nonzero()[:, 0],
+        "gist.scores": all_scores[has_score].float(),
+        "gist.sizes": torch.cat(sizes)[has_score].float(),
+        "gist.found": torch.cat(found).flatten().nonzero()[:, 0],
+    }
+
+
 def _unpack_gists(tensors: Mapping[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
-    """Convert the tensors of a file back to the gists of looks at windows; None for looks without one."""
+    """Convert the tensors of `_pack_gists` back to the gists of looks at windows."""
     frames = tensors["gist.frames"].tolist()
     classes = tensors["gist.scores"].shape[-1]
     counts = [rows * columns for _, rows, columns in frames]
