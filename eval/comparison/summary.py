@@ -43,13 +43,21 @@ class Curve:
 
 def curve_of(records: Iterable[ResultRecord], measure: Callable[[ResultRecord], FloatArray]) -> Curve:
     """Average episodes: first over the episodes of each image, then over images."""
-    rows = [(record["scene"], record["repetition"], measure(record)) for record in records]
-    means = np.stack([*by_scene((scene, curve) for scene, _, curve in rows).values()])
-    repetitions = defaultdict(list)
-    for scene, repetition, curve in rows:
-        repetitions[repetition].append((scene, curve))
-    over_repetitions = np.stack([np.mean([*by_scene(group).values()], axis=0) for group in repetitions.values()])
-    return Curve(means.mean(0), standard_error(means), standard_error(over_repetitions), len(means), len(rows))
+    episodes: list[tuple[Any, FloatArray]] = []
+    by_repetition: dict[int, list[tuple[Any, FloatArray]]] = defaultdict(list)
+    for record in records:
+        episode = (record["scene"], measure(record))
+        episodes.append(episode)
+        by_repetition[record["repetition"]].append(episode)
+    of_images = np.stack([*by_scene(episodes).values()])
+    of_repetitions = np.stack([np.mean([*by_scene(group).values()], axis=0) for group in by_repetition.values()])
+    return Curve(
+        mean=of_images.mean(0),
+        over_images=standard_error(of_images),
+        over_repetitions=standard_error(of_repetitions),
+        images=len(of_images),
+        episodes=len(episodes),
+    )
 
 
 def collect_records(run: ComparedLooking) -> tuple[list[ResultRecord], dict[str, float]]:
@@ -118,9 +126,10 @@ def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> st
     rows: list[list[object]] = [[average, "policy", "shifts", value, *errors, "images", "episodes"]]
     for average, policies in curves.items():
         for policy, curve in policies.items():
-            for shift in range(len(curve.mean)):
-                figures = (f"{values[shift]:.6f}" for values in (curve.mean, curve.over_images, curve.over_repetitions))
-                rows.append([average, policy, shift, *figures, curve.images, curve.episodes])
+            columns = zip(curve.mean, curve.over_images, curve.over_repetitions, strict=True)
+            for shift, figures in enumerate(columns):
+                cells = [f"{figure:.6f}" for figure in figures]
+                rows.append([average, policy, shift, *cells, curve.images, curve.episodes])
     return csv_text(rows)
 
 
@@ -173,10 +182,11 @@ def manifest(run: ComparedLooking, program: str, seconds: dict[str, float]) -> s
 
 
 def sensing(run: ComparedLooking) -> str:
-    """Detector, sensor and observation model of a run, as text for titles."""
-    sensor, model, seeing = run.config.sensor, run.config.belief.model, run.eye.sensor
-    what = f"{run.eye.detector.name}, {sensor.name} fovea ({seeing.describe(seeing.settings())})"
+    """Name detector, sensor and observation model of a run, for titles."""
+    sensor = run.eye.sensor
+    description = sensor.describe(sensor.settings())
+    text = f"{run.eye.detector.name}, {run.config.sensor.name} fovea ({description})"
     if run.models.observation is None:
-        return what
-    own = Path(model or observation_name(run.eye)).name.removesuffix(".safetensors")
-    return f"{what}, observation model {own}"
+        return text
+    model = run.config.belief.model or observation_name(run.eye)
+    return f"{text}, observation model {Path(model).name.removesuffix('.safetensors')}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
 from semfov.runs.tables import percent, plus_minus, table
 from semfov.viz.style import line_style, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _Array = NDArray[np.float64]
 _Measure = Callable[[ResultRecord], float]
@@ -37,15 +41,39 @@ def measured(records: list[ResultRecord], measure: _Measure) -> dict[Any, float]
     return by_scene((record["scene"], measure(record)) for record in records)
 
 
-def compared(
-    records: list[ResultRecord], others: list[ResultRecord], measure: _Measure
-) -> tuple[float, float, float, float]:
-    """Mean over scenes with its standard error, then mean difference from `others`, paired by scene, with its error."""
-    mine, theirs = measured(records, measure), measured(others, measure)
-    values = np.array([*mine.values()])
-    apart = np.array([value - theirs[scene] for scene, value in mine.items()])
-    errors = (float(standard_error(each)) for each in (values, apart))
-    return float(values.mean()), next(errors), float(apart.mean()), next(errors)
+class Comparison(NamedTuple):
+    """A measure over scenes beside that of others.
+
+    Attributes:
+        mean: mean over scenes.
+        error: its standard error.
+        difference: mean difference from the others, paired by scene.
+        difference_error: its standard error.
+    """
+
+    mean: float
+    error: float
+    difference: float
+    difference_error: float
+
+
+def compared(records: list[ResultRecord], others: list[ResultRecord], measure: _Measure) -> Comparison:
+    """Compare a measure of records with that of others in the same scenes."""
+    of_scenes = measured(records, measure)
+    of_others = measured(others, measure)
+    values = np.array([*of_scenes.values()])
+    differences = np.array([value - of_others[scene] for scene, value in of_scenes.items()])
+    return Comparison(
+        float(values.mean()),
+        float(standard_error(values)),
+        float(differences.mean()),
+        float(standard_error(differences)),
+    )
+
+
+def _found_by(record: ResultRecord, seconds: float) -> float:
+    """Return 1 if a search has found its target by `seconds`, else 0."""
+    return float(record["found"] and record["seconds"] <= seconds)
 
 
 def _value_by(record: ResultRecord, seconds: float, what: str) -> float:
@@ -76,27 +104,34 @@ def _head_summary(records: list[ResultRecord], config: HeadConfig) -> str:
 
 
 def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what: str) -> list[str]:
-    limit, ours = config.seconds, searches[OURS]
+    """Write the table of searches."""
+
+    def seconds_spent(record: ResultRecord) -> float:
+        return record["seconds"] if record["found"] else config.seconds
+
+    def passes_spent(record: ResultRecord) -> float:
+        return float(record["passes"] if record["found"] else config.passes)
+
+    ours = searches[OURS]
     times = _budgets(config)
-    less = "difference to semfov"
-    rows = [["", *(f"found in {second:g} s, %" for second in times), "seconds", less, "passes", less]]
+    difference = "difference to semfov"
+    rows = [["", *(f"found in {time:g} s, %" for time in times), "seconds", difference, "passes", difference]]
     for way, group in searches.items():
         row = [way]
-        for second in times:
-            mean, error, *_ = compared(group, ours, lambda r, s=second: float(r["found"] and r["seconds"] <= s))  # type: ignore[misc]
-            row.append(percent(mean, error))
-        for measure in (
-            lambda r: r["seconds"] if r["found"] else limit,
-            lambda r: float(r["passes"]) if r["found"] else float(config.passes),
-        ):
-            mean, error, apart, error_apart = compared(group, ours, measure)
-            row += [plus_minus(mean, error, 2), "" if way == OURS else plus_minus(apart, error_apart, 2)]
+        for time in times:
+            found = compared(group, ours, partial(_found_by, seconds=time))
+            row.append(percent(found.mean, found.error))
+        for measure in (seconds_spent, passes_spent):
+            spent = compared(group, ours, measure)
+            row.append(plus_minus(spent.mean, spent.error, 2))
+            row.append("" if way == OURS else plus_minus(spent.difference, spent.difference_error, 2))
         rows.append(row)
     scenes = len({record["scene"] for record in ours})
     return [
         f"{len(ours)} searches in {scenes} {what}, each until the gaze rests on a cell that a target overlaps. A "
-        f"search that does not succeed within {limit:g} s and {config.passes} passes counts with these numbers. Means "
-        f"over {what} ± standard errors; `difference to semfov`: difference from semfov, paired by scene.",
+        f"search that does not succeed within {config.seconds:g} s and {config.passes} passes counts with these "
+        f"numbers. Means over {what} ± standard errors; `difference to semfov`: difference from semfov, paired by "
+        "scene.",
         "",
         *table(rows),
         "",
@@ -104,26 +139,20 @@ def _searching(searches: dict[str, list[ResultRecord]], config: HeadConfig, what
 
 
 def _exploring(explorations: dict[str, list[ResultRecord]], config: HeadConfig, what: str) -> list[str]:
-    ours, times = explorations[OURS], _budgets(config)
+    """Write the table of explorations."""
+    ours = explorations[OURS]
+    times = _budgets(config)
     last = times[-1]
-    rows = [
-        [
-            "",
-            *(f"after {second:g} s" for second in times),
-            f"difference to semfov, after {last:g} s",
-            "objects alone",
-            "looks",
-        ]
-    ]
+    after = [f"after {time:g} s" for time in times]
+    rows = [["", *after, f"difference to semfov, {after[-1]}", "objects alone", "looks"]]
     for way, group in explorations.items():
-        row = [way]
-        for second in times:
-            mean, error, apart, error_apart = compared(group, ours, lambda r, s=second: _value_by(r, s, "success"))  # type: ignore[misc]
-            row.append(percent(mean, error))
-        row.append("" if way == OURS else plus_minus(100 * apart, 100 * error_apart))
-        mean, error, *_ = compared(group, ours, lambda r: _value_by(r, last, "objects"))
-        looks, _, *_ = compared(group, ours, lambda r: float(len(r["seconds"])))
-        rows.append([*row, percent(mean, error), f"{looks:.1f}"])
+        success = [compared(group, ours, partial(_value_by, seconds=time, what="success")) for time in times]
+        objects = compared(group, ours, partial(_value_by, seconds=last, what="objects"))
+        looks = compared(group, ours, lambda record: float(len(record["seconds"])))
+        row = [way, *(percent(figures.mean, figures.error) for figures in success)]
+        at_end = success[-1]
+        row.append("" if way == OURS else plus_minus(100 * at_end.difference, 100 * at_end.difference_error))
+        rows.append([*row, percent(objects.mean, objects.error), f"{looks.mean:.1f}"])
     return [
         f"Explorations of {len(ours)} {what}: percentage of the cells with objects, weighted by area, whose most "
         "probable class, background included, is that of an object there. `objects alone`: the same without background "
@@ -134,26 +163,33 @@ def _exploring(explorations: dict[str, list[ResultRecord]], config: HeadConfig, 
     ]
 
 
-def _curves(records: list[ResultRecord], config: HeadConfig):  # type: ignore[no-untyped-def]
-    from matplotlib.figure import Figure
-
-    seconds = np.linspace(0, config.seconds, 101)
+def _curves(records: list[ResultRecord], config: HeadConfig) -> list[Path]:
+    """Draw the curves of searches and of explorations over time; returns the paths of the figures."""
     measures: dict[str, tuple[str, Callable[..., float]]] = {
-        "search": ("share of targets found", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
-        "exploration": ("share of cells named right", lambda r, s: _value_by(r, s, "success")),
+        "search": ("share of targets found", _found_by),
+        "exploration": ("share of cells named right", partial(_value_by, what="success")),
     }
     written = []
     for task, (title, measure) in measures.items():
-        ways = [*dict.fromkeys(record["way"] for record in records if record["task"] == task)]
-        if not ways:
-            continue
-        figure = Figure(figsize=(6, 4), layout="constrained")
-        axes = figure.subplots()
-        for order, way in enumerate(ways):
-            group = [record for record in records if record["task"] == task and record["way"] == way]
-            line = [np.mean([*measured(group, partial(measure, s=s)).values()]) for s in seconds]
-            axes.plot(seconds, line, label=way, **line_style(order, len(ways)))
-        axes.set(xlabel="seconds", ylabel=title, ylim=(0, None))
-        axes.legend(fontsize="small")
-        written.append(save_figure(figure, config.out / f"{task}.png"))
+        of_task = [record for record in records if record["task"] == task]
+        if of_task:
+            figure = _plot(of_task, measure, title, config.seconds)
+            written.append(save_figure(figure, config.out / f"{task}.png"))
     return written
+
+
+def _plot(records: list[ResultRecord], measure: Callable[..., float], title: str, duration: float) -> Figure:
+    """Plot the mean over scenes of a measure by `seconds`, a line for each way of moving eye and head."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    times = np.linspace(0, duration, 101)
+    ways = [*dict.fromkeys(record["way"] for record in records)]
+    for order, way in enumerate(ways):
+        group = [record for record in records if record["way"] == way]
+        line = [np.mean([*measured(group, partial(measure, seconds=time)).values()]) for time in times]
+        axes.plot(times, line, label=way, **line_style(order, len(ways)))
+    axes.set(xlabel="seconds", ylabel=title, ylim=(0, None))
+    axes.legend(fontsize="small")
+    return figure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from pathlib import Path
@@ -203,19 +203,23 @@ class HeadRun(SceneRun):
         legal = self.scenes.targets(index)
         return sorted(generator.permutation(legal)[: self.config.targets].tolist())
 
-    def _searches(self, index: int, views: Views, looks: Detect) -> list[ResultRecord]:
-        config, records = self.config, list[ResultRecord]()
-        places, labels = self.places(index), self.scenes.annotation(index).labels
-        gain = SearchGain(views, config.foresight)
-        observer = SceneObserver(SemanticSearch(self.searching, footprint="overlap"), views, unseen_chance=config.prior)
+    def _searches(self, index: int, views: Views, detect: Detect) -> list[ResultRecord]:
+        """Search a scene for its targets with every way of moving eye and head."""
+        places = self.places(index)
+        labels = self.scenes.annotation(index).labels
+        gain = SearchGain(views, self.config.foresight)
+        belief = SemanticSearch(self.searching, footprint="overlap")
+        observer = SceneObserver(belief, views, unseen_chance=self.config.prior)
+        records: list[ResultRecord] = []
         for target in self.targets(index):
-            target_places, start = places[labels == target], self.start(index, views, target)
+            target_places = places[labels == target]
+            start = self.start(index, views, target)
             if bool(_rests_on(views, start, target_places).any()):
                 continue  # no search starts on its target
             for name, acquire in self.ways(gain, start).items():
-                steps, found = list[HeadStep](), False
-                closer = self._closer(name, gain, target)
-                for step in self._steps(views, looks, observer, acquire, start, target, index, closer):
+                steps: list[HeadStep] = []
+                found = False
+                for step in self._steps(index, name, acquire, gain, observer, detect, start, target):
                     steps.append(step)
                     found = bool(_rests_on(views, step.action, target_places).any())
                     if found:
@@ -235,37 +239,27 @@ class HeadRun(SceneRun):
                 )
         return records
 
-    def _closer(self, way: str, gain: LookGain, target: int | None) -> CloserLookOffers | None:
-        """Make what offers closer looks to our own way where the head zooms."""
-        zooms = len(gain.views.fields) > 1
-        return CloserLookOffers(gain, self.config.speeds, target) if way == OURS and zooms else None
-
-    def _steps(self, views, looks, observer, acquire, start, target, index, closer):  # type: ignore[no-untyped-def]
-        config = self.config
-        return look_around(
-            views, looks, observer, acquire, start, target=target, closer=closer,
-            passes=config.passes, duration=config.seconds, seed=[config.seed, index, target or 0],
-        )  # fmt: skip
-
-    def _explorations(self, index: int, views: Views, looks: Detect) -> list[ResultRecord]:
-        answers = _scene_answers(
-            views, self.places(index), self.scenes.annotation(index).labels, len(self.scenes.classes)
-        )
-        area, config = views.world.area * answers.any(-1), self.config
-        gain = ExploreGain(views, config.unseen)
+    def _explorations(self, index: int, views: Views, detect: Detect) -> list[ResultRecord]:
+        """Explore a scene with every way of moving eye and head."""
+        labels = self.scenes.annotation(index).labels
+        answers = _scene_answers(views, self.places(index), labels, len(self.scenes.classes))
+        weight = views.world.area * answers.any(-1)  # only cells with an answer count
+        gain = ExploreGain(views, self.config.unseen)
         observer = SceneObserver(SemanticMap(self.observation), views)
-        start, records = self.start(index, views, 0), list[ResultRecord]()
+        start = self.start(index, views, 0)
+        records: list[ResultRecord] = []
         for name, acquire in self.ways(gain, start).items():
-            seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()
-            closer = self._closer(name, gain, None)
-            for step in self._steps(views, looks, observer, acquire, start, None, index, closer):
+            seconds: list[float] = []
+            success: list[float] = []
+            objects: list[float] = []
+            actions: list[int] = []
+            for step in self._steps(index, name, acquire, gain, observer, detect, start, None):
                 # A cell that was never seen gets no answer, even if the prior favours a class.
-                probabilities = step.belief.class_probabilities().masked_fill(step.belief.owner[..., None] < 0, 0.0)
-                right = (right_cells(probabilities, answers)[0] * area).sum() / area.sum()
-                besides = (right_cells(probabilities[..., 1:], answers[:, 1:])[0] * area).sum() / area.sum()
+                is_unseen = step.belief.owner[..., None] < 0
+                probabilities = step.belief.class_probabilities().masked_fill(is_unseen, 0.0)
+                success.append(_share_right(probabilities, answers, weight))
+                objects.append(_share_right(probabilities[..., 1:], answers[:, 1:], weight))
                 seconds.append(step.seconds)
-                success.append(float(right))
-                objects.append(float(besides))
                 actions.append(step.action)
             records.append(
                 {
@@ -279,6 +273,46 @@ class HeadRun(SceneRun):
                 }
             )
         return records
+
+    def _steps(
+        self,
+        index: int,
+        way: str,
+        acquire: Callable[[int], AcquisitionFunction],
+        gain: LookGain,
+        observer: SceneObserver,
+        detect: Detect,
+        start: int,
+        target: int | None,
+    ) -> Iterator[HeadStep]:
+        """Look around a scene in one of the `ways`; our own one offers closer looks where the head zooms."""
+        config = self.config
+        views = gain.views
+        zooms = len(views.fields) > 1
+        return look_around(
+            views,
+            detect,
+            observer,
+            acquire,
+            start,
+            target=target,
+            closer=CloserLookOffers(gain, config.speeds, target) if way == OURS and zooms else None,
+            passes=config.passes,
+            duration=config.seconds,
+            seed=[config.seed, index, target or 0],
+        )
+
+
+def _share_right(probabilities: Tensor, answers: Tensor, weight: Tensor) -> float:
+    """Compute the share of the cells whose most probable class is right.
+
+    Args:
+        probabilities: `(1, S, C)`.
+        answers: `(S, C)` boolean, the right classes of each cell.
+        weight: `(S,)`, how much each cell counts.
+    """
+    is_right = right_cells(probabilities, answers)[0]
+    return float((is_right * weight).sum() / weight.sum())
 
 
 def turns(steps: list[HeadStep], views: Views) -> int:

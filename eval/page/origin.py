@@ -20,10 +20,22 @@ def missing(names: Iterable[str], runs: Runs) -> list[str]:
 
 def origin(folders: Iterable[Path]) -> str:
     """Return commits, days and numbers of photographs of runs, each only once, as the pages say them."""
-    manifests = [json.loads((folder / MANIFEST).read_text(encoding="utf-8")) for folder in folders]
-    # A commit by its seven digits, with `+` after uncommitted changes.
-    found = [each["commit"] for each in manifests]
-    commits = ["no commit" if commit is None else commit[:7] + commit[40:] for commit in found]
-    days = [each["date"] for each in manifests]
-    counts = [f"{each['scenes']} photographs" for each in manifests]
-    return ", ".join(" and ".join(dict.fromkeys(values)) for values in (commits, days, counts))
+    commits = []
+    days = []
+    counts = []
+    for folder in folders:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        commits.append("no commit" if manifest["commit"] is None else _short(manifest["commit"]))
+        days.append(manifest["date"])
+        counts.append(f"{manifest['scenes']} photographs")
+    return ", ".join([_listed(commits), _listed(days), _listed(counts)])
+
+
+def _short(commit: str) -> str:
+    """Shorten a commit of 40 digits to seven; what follows them, `+` after uncommitted changes, stays."""
+    return commit[:7] + commit[40:]
+
+
+def _listed(values: Iterable[str]) -> str:
+    """List different values, each only once."""
+    return " and ".join(dict.fromkeys(values))

@@ -79,9 +79,10 @@ def _with_columns(lines: Sequence[str], columns: Sequence[str]) -> list[str]:
     >>> _with_columns(["| a | b | c |", "|---|---|---|", "| 1 | 2 | 3 |"], ["c"])
     ['| a | c |', '|---|---|', '| 1 | 3 |']
     """
-    heads, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)
-    places = [0, *(heads.index(column) for column in columns)]
-    return table([[row[place] for place in places] for row in (heads, *rows)])
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    headings, _, *body = rows  # the second one is the rule
+    places = [0, *(headings.index(column) for column in columns)]
+    return table([[row[place] for place in places] for row in (headings, *body)])
 
 
 def by_samples(folder: Path, shifts: Sequence[int], field: str = "right") -> list[str]:
@@ -102,14 +103,15 @@ def photographs(runs: Runs) -> list[str]:
     run = runs["search-published-nano"]
     scenes = make_scenes(run.data, COCO_CLASSES)
     labels = [scenes.annotation(index).labels for index in range(len(scenes))]
-    counts = np.array([len(each) for each in labels])
+    counts = np.array([len(of_photograph) for of_photograph in labels])
     person = COCO_CLASSES.index("person") + 1
+    with_person = sum(bool((of_photograph == person).any()) for of_photograph in labels)
     targets = sum(len(scenes.targets(index)) for index in range(len(scenes)))
     figures = {
         "photographs": f"{len(scenes):,}",
         "boxes": f"{counts.sum():,}",
         "boxes in a photograph, median": f"{np.median(counts):g}",
-        "photographs with a person": f"{sum(bool((each == person).any()) for each in labels)}",
+        "photographs with a person": str(with_person),
         "pairs of photograph and target": f"{targets:,}",
     }
     return table([["of the photographs of this page", ""], *([name, value] for name, value in figures.items())])

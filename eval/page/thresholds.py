@@ -27,14 +27,15 @@ def _answers_at(finding: Finding, measure: Measure, name: str, runs: Runs) -> di
 
 
 def _verdict_text(answers: dict[float, Answer]) -> str:
-    """Verdicts, each with the thresholds at which it is reached.
+    """Write the verdicts, each with the thresholds at which it is reached.
 
     >>> _verdict_text({0.02: Answer("", "holds"), 0.1: Answer("", "holds"), 0.25: Answer("", "level")})
     'holds at 0.02, 0.1; level at 0.25'
     """
-    verdicts = dict.fromkeys(answer.verdict for answer in answers.values())
-    at = {word: ", ".join(f"{t:g}" for t, answer in answers.items() if answer.verdict == word) for word in verdicts}
-    return "; ".join(f"{word} at {thresholds}" for word, thresholds in at.items())
+    thresholds: dict[str, list[str]] = {}
+    for threshold, answer in answers.items():
+        thresholds.setdefault(answer.verdict, []).append(f"{threshold:g}")
+    return "; ".join(f"{verdict} at {', '.join(listed)}" for verdict, listed in thresholds.items())
 
 
 def words_of_verdicts(runs: Runs) -> list[str]:

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from statistics import mean, median
 
 import torch
@@ -11,9 +12,9 @@ from torch import Tensor
 from eval.bootstrap import Bootstrap
 from eval.comparison.records import gather
 from eval.comparison.summary import announce, write_summary
-from eval.zoom.decisions import decision_tables, presence_scores
+from eval.zoom.decisions import by_way, decision_tables, presence_scores
 from eval.zoom.folds import outcomes_in_folds
-from eval.zoom.objects import object_table
+from eval.zoom.objects import SEMFOV, object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish
@@ -36,63 +37,73 @@ def zoom(config: ZoomConfig) -> None:
         written.append(_curves(records, run))
     if decided := [record for record in records if record["measure"] == "decision"]:
         scores, there = presence_scores(decided)
-        sure = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in scores.items()}
-        written.append(save_figure(plot_reliability(sure), config.out / "reliability.png"))
+        predictions = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in scores.items()}
+        written.append(save_figure(plot_reliability(predictions), config.out / "reliability.png"))
     announce(text, written)
 
 
 def curve(records: list[ResultRecord], passes: int) -> list[float]:
-    """Share of all objects found after each pass; if a way of looking ends early, its last share stays."""
-    total = sum(record["objects"] for record in records)
-    counts = [sum(r["found"][min(n, len(r["found"])) - 1] for r in records) for n in range(1, passes + 1)]
-    return [count / max(total, 1) for count in counts]
+    """Compute the share of all objects found after each pass; if a way of looking ends early, its last share stays."""
+    objects = sum(record["objects"] for record in records)
+    shares = []
+    for last in range(passes):
+        found = sum(record["found"][min(last, len(record["found"]) - 1)] for record in records)
+        shares.append(found / max(objects, 1))
+    return shares
 
 
 def zoom_summary(records: list[ResultRecord], run: ZoomRun) -> str:
-    """Tables as Markdown."""
-    groups: dict[tuple[str, str], list[ResultRecord]] = defaultdict(list)
+    """Write the tables of all measures, as Markdown."""
+    groups: dict[str, list[ResultRecord]] = defaultdict(list)
     for record in records:
-        groups[record["measure"], record["way"]].append(record)
-    finding = {way: group for (measure, way), group in groups.items() if measure == "recall"}
-    returned = [record for record in records if record["measure"] == "objects"]
-    lines = object_table(returned) if returned else []
-    lines += recalls(finding, run) if finding else []
-    hits = {way: group for (measure, way), group in groups.items() if measure == "first hit"}
-    if hits:
-        rows = [["", "mean", "median", "failures at the cap"]]
-        for way, group in hits.items():
-            counts = [record["passes"] for record in group]
-            failed = sum(not record["hit"] for record in group) / len(group)
-            rows.append([way, f"{mean(counts):.2f}", f"{median(counts):g}", f"{100 * failed:.1f} %"])
-        count = len(next(iter(hits.values())))
-        lines += [
-            f"Passes to the first confirmed hit, including the overview, in {count} searches for a class that one of "
-            "the slices shows with a score of 0.3 or more.",
-            "",
-            *table(rows),
-            "",
-        ]
-    if decided := [record for record in records if record["measure"] == "decision"]:
-        lines += decision_tables(decided)
+        groups[record["measure"]].append(record)
+    lines: list[str] = []
+    if groups["objects"]:
+        lines += object_table(groups["objects"])
+    if groups["recall"]:
+        lines += recalls(by_way(groups["recall"]), run)
+    if groups["first hit"]:
+        lines += _first_hits(by_way(groups["first hit"]))
+    if groups["decision"]:
+        lines += decision_tables(groups["decision"])
     return "\n".join(lines)
 
 
+def _first_hits(hits: dict[str, list[ResultRecord]]) -> list[str]:
+    """Write the table of passes to the first confirmed hit, by way of looking."""
+    rows = [["", "mean", "median", "failures at the cap"]]
+    for way, group in hits.items():
+        passes = [record["passes"] for record in group]
+        failed = sum(not record["hit"] for record in group) / len(group)
+        rows.append([way, f"{mean(passes):.2f}", f"{median(passes):g}", f"{100 * failed:.1f} %"])
+    count = len(next(iter(hits.values())))
+    return [
+        f"Passes to the first confirmed hit, including the overview, in {count} searches for a class that one of "
+        "the slices shows with a score of 0.3 or more.",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
 def recalls(finding: dict[str, list[ResultRecord]], run: ZoomRun) -> list[str]:
-    """Table of recall for every way of looking."""
+    """Write the table of recall for every way of looking."""
     passes = run.config.passes
-    at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
+    at = sorted({number for number in (1, 4, 8, 12, 16, 24) if number <= passes} | {passes})
     pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
     figures = Bootstrap.of(partial(recall_and_precision, finding, at), range(len(run.scenes)))
     rows = [["", *map(str, at), "area under the curve", "boxes for each object", "precision"]]
     for (way, group), value, error in zip(finding.items(), figures.value, figures.error, strict=True):
-        cells, right = recall_cells(value, error)
-        boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
-        rows.append([way, *cells, f"{mean(curve(group, passes)):.3f}", f"{boxes:.2f}", right])
-    apart = figures.less(list(finding).index("semfov"))
-    less = [["difference to semfov", *map(str, at), "precision"]]
-    for way, value, error in zip(finding, apart.value, apart.error, strict=True):
-        cells, right = recall_cells(value, error, "+")
-        less += [[way, *cells, right]] if way != "semfov" else []
+        recall, precision = recall_cells(value, error)
+        area = mean(curve(group, passes))
+        boxes = sum(record["boxes"] for record in group) / max(sum(record["objects"] for record in group), 1)
+        rows.append([way, *recall, f"{area:.3f}", f"{boxes:.2f}", precision])
+    paired = figures.less(list(finding).index(SEMFOV))
+    differences = [[f"difference to {SEMFOV}", *map(str, at), "precision"]]
+    for way, value, error in zip(finding, paired.value, paired.error, strict=True):
+        if way != SEMFOV:
+            recall, precision = recall_cells(value, error, "+")
+            differences.append([way, *recall, precision])
     what = "objects" if run.config.target is None else run.config.target
     objects = sum(record["objects"] for record in next(iter(finding.values())))
     return [
@@ -103,13 +114,13 @@ def recalls(finding: dict[str, list[ResultRecord]], run: ZoomRun) -> list[str]:
         "",
         *table(rows),
         "",
-        *table(less),
+        *table(differences),
         "",
     ]
 
 
 def recall_and_precision(finding: dict[str, list[ResultRecord]], at: Sequence[int], pictures: Tensor) -> Tensor:
-    """Recall after `at` passes, and the share of right boxes after the last, for each way of looking at pictures.
+    """Compute recall after some passes, and the share of right boxes after the last, for each way of looking.
 
     Args:
         finding: for each way of looking, a record of each picture.
@@ -122,26 +133,29 @@ def recall_and_precision(finding: dict[str, list[ResultRecord]], at: Sequence[in
     rows = []
     for group in finding.values():
         chosen = [group[picture] for picture in pictures.tolist()]
-        line, boxes = curve(chosen, max(at)), sum(record["boxes"] for record in chosen)
+        shares = curve(chosen, max(at))
+        boxes = sum(record["boxes"] for record in chosen)
         precision = sum(record["right"] for record in chosen) / boxes if boxes else torch.nan
-        rows.append([*(line[n - 1] for n in at), precision])
+        rows.append([*(shares[passes - 1] for passes in at), precision])
     return torch.tensor(rows, dtype=torch.float64)
 
 
 def recall_cells(value: Tensor, error: Tensor, sign: str = "") -> tuple[list[str], str]:
-    """Cells of a table row for figures of `recall_and_precision` and their standard errors: recall, and precision."""
-    cells = [f"{each:{sign}.3f} ± {apart:.3f}" for each, apart in zip(value.tolist(), error.tolist(), strict=True)]
-    return cells[:-1], cells[-1] if value[-1].isfinite() else "-"
+    """Write the cells of recall, and that of precision, for `recall_and_precision` and its standard errors."""
+    figures = zip(value.tolist(), error.tolist(), strict=True)
+    *recall, precision = (f"{figure:{sign}.3f} ± {deviation:.3f}" for figure, deviation in figures)
+    return recall, precision if value[-1].isfinite() else "-"
 
 
-def _curves(records: list[ResultRecord], run: ZoomRun):  # type: ignore[no-untyped-def]
+def _curves(records: list[ResultRecord], run: ZoomRun) -> Path:
+    """Plot recall over passes, a line for each way of looking; returns the path of the figure."""
     from matplotlib.figure import Figure
 
+    passes = run.config.passes
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
-    for way in dict.fromkeys(record["way"] for record in records if record["measure"] == "recall"):
-        group = [record for record in records if record["way"] == way and record["measure"] == "recall"]
-        axes.plot(range(1, run.config.passes + 1), curve(group, run.config.passes), label=way)
+    for way, group in by_way([record for record in records if record["measure"] == "recall"]).items():
+        axes.plot(range(1, passes + 1), curve(group, passes), label=way)
     axes.set(xlabel="passes of the detector", ylabel="recall", ylim=(0, None))
     axes.legend(fontsize="small")
     return save_figure(figure, run.config.out / "recall.png")
