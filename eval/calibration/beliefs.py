@@ -92,9 +92,10 @@ class BeliefCalibrationRun(ComparedLooking):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run both searches of a scene; returns their records, and the seconds that each stage took."""
-        watch, grid = Stopwatch(), self.grid(index)
-        area = self.config.data.max_target_area or 1.0
-        searches = choose_searches(self.scenes, index, grid, self.config.protocol, 1, area)
+        watch = Stopwatch()
+        grid = self.grid(index)
+        largest_area = self.config.data.max_target_area or 1.0
+        searches = choose_searches(self.scenes, index, grid, self.config.protocol, 1, largest_area)
         if not searches:
             return [], watch.seconds
         detections = self.detections(index)
@@ -110,20 +111,24 @@ class BeliefCalibrationRun(ComparedLooking):
         return records, watch.seconds
 
     def _search(self, search: DrawnSearch, looks: CellLooks) -> ResultRecord:
-        target, goal = search.target, search.goal
+        """Search by the guide, and update all beliefs with its looks."""
+        target = search.target
+        goal = search.goal
         most = min(self.config.protocol.shifts + 1, COUNTS[-1])
 
         def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
             return list(rollout(looks, self.observers[name], acquisition, search.start, choice, most=most))
 
-        led = walk(self.guide, Policy("non-predictive")(target, looks.grid), Greedy(drawn_from(search.noise)))
-        path = torch.cat([step.cell for step in led])
+        most_probable = Policy("non-predictive")(target, looks.grid)
+        guided = walk(self.guide, most_probable, Greedy(drawn_from(search.noise)))
+        path = torch.cat([step.cell for step in guided])
         beliefs: dict[str, ResultRecord] = {}
         for name in self.observers:
-            steps = led if name == self.guide else walk(name, Uniform(), Given(path[None]))
-            judged = {str(n): _judge_cells(steps[n - 1], target, goal) for n in COUNTS if n <= len(steps)}
-            beliefs[name] = {"looks": judged, "landing": landing([step.belief for step in steps], path, goal, target)}
-        return {"seen": detected_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
+            # The others look along the path of the guide.
+            steps = guided if name == self.guide else walk(name, Uniform(), Given(path[None]))
+            sums = {str(count): _judge_cells(steps[count - 1], target, goal) for count in COUNTS if count <= len(steps)}
+            beliefs[name] = {"looks": sums, "landing": landing([step.belief for step in steps], path, goal, target)}
+        return {"seen": detected_on_landing(guided, path, goal, target, looks.grid), "beliefs": beliefs}
 
 
 def _judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:
@@ -133,10 +138,11 @@ def _judge_cells(step: Step, target: int, goal: Tensor) -> ResultRecord:
     """
     belief = step.belief
     band = 1 + torch.bucketize(belief.closest[0].double(), torch.tensor(BANDS, dtype=torch.float64))
-    group = band.masked_fill(step.visited[0], 0)
+    group = band.masked_fill(step.visited[0], 0)  # fixated cells are group 0
     probability = belief.probability(target)[0]
-    return {
-        name: AddedSums.of(probability[group == number], goal[group == number]).record()
-        for number, name in enumerate(CELL_GROUPS)
-        if (group == number).any()
-    }
+    sums = {}
+    for number, name in enumerate(CELL_GROUPS):
+        inside = group == number
+        if inside.any():
+            sums[name] = AddedSums.of(probability[inside], goal[inside]).record()
+    return sums

@@ -59,9 +59,11 @@ def _add_up(records: Iterable[ResultRecord]) -> _Sums:
 
 def _pooled(sums: _Sums, belief: str, looks: int) -> AddedSums:
     """Compute sums over all cells, whatever their group."""
-    return sum(
-        (sums[belief, looks, group] for group in CELL_GROUPS if (belief, looks, group) in sums), AddedSums.nothing()
-    )
+    total = AddedSums.nothing()
+    for group in CELL_GROUPS:
+        if (belief, looks, group) in sums:
+            total = total + sums[belief, looks, group]
+    return total
 
 
 def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCalibrationRun) -> str:
@@ -70,29 +72,29 @@ def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCa
     there = sum(record["present"] for record in records)
     by_looks = [["looks", "belief", "cells", *_HEAD]]
     for looks in _judged_after(sums):
-        rows = [(belief, _pooled(sums, belief, looks)) for belief in beliefs]
-        by_looks += [[str(looks), belief, str(each.count), *_measures_row(each)] for belief, each in rows]
+        by_looks += [[str(looks), belief, *_measures_row(_pooled(sums, belief, looks))] for belief in beliefs]
     last = _judged_after(sums)[-1]
     by_distance = [["distance", "belief", "cells", *_HEAD]]
     for group in CELL_GROUPS:
-        pairs = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
-        by_distance += [[group, belief, str(each.count), *_measures_row(each)] for belief, each in pairs]
-    notes = [
-        f"Left out because no fitted model is shipped: {name} ({reason})." for name, reason in run.left_out.items()
-    ]
+        with_group = [belief for belief in beliefs if (belief, last, group) in sums]
+        by_distance += [[group, belief, *_measures_row(sums[belief, last, group])] for belief in with_group]
+    notes = []
+    for name, reason in run.left_out.items():
+        notes.append(f"Left out because no fitted model is shipped: {name} ({reason}).")
     if MAP in beliefs:
         notes.append(
             f"The {MAP} assumes that classes are as frequent as they are in photographs. Here half of the target "
             "classes are present, so its probabilities are expected to be too low."
         )
-    every = _pooled(sums, beliefs[0], last)
-    alone = AddedSums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
+    cells = _pooled(sums, beliefs[0], last)
+    holds = torch.arange(cells.count) < cells.bins[2].sum()  # as many cells as hold the target
+    constant = AddedSums.of(torch.full((cells.count,), cells.rate), holds)
     return "\n".join(
         [
             f"Does a cell hold the target? {len(records)} searches ({sensing(run)}), {there} of them for a class that "
             f"is present. The {run.guide} belief guides the gaze, which does not stop at the target; all beliefs are "
-            f"updated with the same looks. A constant prediction of {every.rate:.4f}, the share of cells that hold the "
-            f"target, would have an NLL of {alone.nll:.4f}, a Brier score of {alone.brier:.4f} and an ECE of 0.",
+            f"updated with the same looks. A constant prediction of {cells.rate:.4f}, the share of cells that hold the "
+            f"target, would have an NLL of {constant.nll:.4f}, a Brier score of {constant.brier:.4f} and an ECE of 0.",
             "",
             *table(by_looks),
             "",
@@ -116,27 +118,29 @@ def _judged_after(sums: _Sums) -> list[int]:
 
 
 def _measures_row(sums: AddedSums) -> list[str]:
-    """Write the measures as cells of a table row."""
-    return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
+    """Write the number of cells and the measures as cells of a table row."""
+    measures = (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)
+    return [str(sums.count), *(f"{measure:.4f}" for measure in measures)]
 
 
 def _landing_table(records: Sequence[ResultRecord]) -> list[list[str]]:
-    """Rows of the table about the first look on the target (`landing`)."""
+    """Write the rows of the table about the first look on the target (`landing`)."""
     landed = [record for record in records if record["seen"] is not None]
-    return [
-        [belief, *landing_cells([(record["beliefs"][belief]["landing"], record["seen"]) for record in landed])]
-        for belief in records[0]["beliefs"]
-    ]
+    rows = []
+    for belief in records[0]["beliefs"]:
+        landings = [(record["beliefs"][belief]["landing"], record["seen"]) for record in landed]
+        rows.append([belief, *landing_cells(landings)])
+    return rows
 
 
 def _beliefs_csv(sums: _Sums) -> str:
-    """All measures as CSV: a row for each belief, number of looks and group of cells."""
+    """Write all measures as CSV: a row for each belief, number of looks and group of cells."""
     rows: list[list[object]] = [
         ["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"]
     ]
-    for belief, looks, group, each in _sums_by_name(sums):
-        values = each.nll, each.brier, each.ece, each.probability, each.rate
-        rows.append([belief, looks, group, each.count, *(f"{value:.6f}" for value in values)])
+    for belief, looks, group, of_group in _sums_by_name(sums):
+        measures = (of_group.nll, of_group.brier, of_group.ece, of_group.probability, of_group.rate)
+        rows.append([belief, looks, group, of_group.count, *(f"{measure:.6f}" for measure in measures)])
     return csv_text(rows)
 
 
@@ -160,16 +164,14 @@ def _sums_by_name(sums: _Sums) -> Iterator[tuple[str, int, str, AddedSums]]:
 
 def _curves(sums: _Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
     """Collect the arguments of `plot_cell_reliability`."""
-    beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), _judged_after(sums)
-    panels = {
-        f"after {looks} looks" if looks > 1 else "after 1 look": {
-            belief: _pooled(sums, belief, looks).bins for belief in beliefs
-        }
-        for looks in numbers
-    }
-    last = numbers[-1]
-    errors = {
-        belief: {group: sums[belief, last, group].ece for group in CELL_GROUPS if (belief, last, group) in sums}
-        for belief in beliefs
-    }
+    beliefs = list(dict.fromkeys(belief for belief, _, _ in sums))
+    panels: dict[str, dict[str, Tensor]] = {}
+    for looks in _judged_after(sums):
+        title = f"after {looks} looks" if looks > 1 else "after 1 look"
+        panels[title] = {belief: _pooled(sums, belief, looks).bins for belief in beliefs}
+    last = _judged_after(sums)[-1]
+    errors: dict[str, dict[str, float]] = {}
+    for belief in beliefs:
+        groups = [group for group in CELL_GROUPS if (belief, last, group) in sums]
+        errors[belief] = {group: sums[belief, last, group].ece for group in groups}
     return panels, errors
