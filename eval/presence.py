@@ -28,7 +28,7 @@ def _threshold_for(absent: Tensor, share: float) -> float:
 
 
 def hits_at(score: Tensor, present: Tensor, share: float) -> float:
-    """Hit rate at a given false alarm rate: the fraction of the cases with the target that reach the threshold.
+    """Compute the hit rate at a given false alarm rate: the share of the present targets that reach the threshold.
 
     Shapes: score `(M,)`, present `(M,)`.
     """
@@ -42,7 +42,10 @@ def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
     Shapes: score `(M,)`, present `(M,)`.
     """
     # NumPy sorts faster than torch on one thread.
-    hit, miss = (np.sort(kind.detach().cpu().numpy()) for kind in scores_by_presence(score, present))
-    levels = np.unique(np.concatenate([hit, miss]))[::-1]
-    shares = [1 - np.searchsorted(kind, levels) / len(kind) for kind in (miss, hit)]
-    return [0.0, *shares[0].tolist()], [0.0, *shares[1].tolist()]
+    with_target, without_target = scores_by_presence(score, present)
+    of_present = np.sort(with_target.detach().cpu().numpy())
+    of_absent = np.sort(without_target.detach().cpu().numpy())
+    thresholds = np.unique(np.concatenate([of_present, of_absent]))[::-1]
+    false_alarm_rate = 1 - np.searchsorted(of_absent, thresholds) / len(of_absent)
+    hit_rate = 1 - np.searchsorted(of_present, thresholds) / len(of_present)
+    return [0.0, *false_alarm_rate.tolist()], [0.0, *hit_rate.tolist()]

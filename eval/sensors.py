@@ -116,10 +116,12 @@ class _SensorsConfig(LookingConfig):
 def _compare_sensors(config: _SensorsConfig) -> None:
     """Fit, search and explore with every sensor, and write the table."""
     check(config.protocol.shifts >= _SHIFTS[-1], "protocol.shifts", f"{_SHIFTS[-1]} or more", config.protocol.shifts)
-    rows = [_row(config, name) for name in config.candidates]
-    head = ["sensor", "detector's pixels", "ms", *(f"{p}, CP@{n}" for p in policies(config)[1:] for n in _SHIFTS)]
-    head += [f"{what}, {looks}" for what in ("area", "recall") for looks in ("1 look", "5 looks")]
+    head = ["sensor", "detector's pixels", "ms"]
+    for policy in policies(config)[1:]:
+        head += [f"{policy}, CP@{shifts}" for shifts in _SHIFTS]
+    head += ["area, 1 look", "area, 5 looks", "recall, 1 look", "recall, 5 looks"]
     head += [f"map after {_SHIFTS[-1]}, {answer}" for answer in _ANSWERS]
+    rows = [_row(config, name) for name in config.candidates]
     text = "\n".join(table([head, *rows])) + "\n"
     write_text(config.out / "summary.md", text)
     write_text(config.out / "config.yaml", config.yaml())
@@ -137,7 +139,7 @@ def _row(config: _SensorsConfig, name: str) -> list[str]:
         mapping = "random-calibrated"
         belief = replace(belief, model=str(file))
         model = FovealObservationModel.from_pretrained(file).requires_grad_(False)
-    common = {"data": config.data, "protocol": config.protocol, "store": config.store, "belief": belief}
+    common: dict[str, Any] = {"data": config.data, "protocol": config.protocol, "store": config.store, "belief": belief}
     common |= config.settings(name)
     folder = config.folder(name)
 

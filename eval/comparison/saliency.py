@@ -89,19 +89,37 @@ def saliency_table(
     image: Tensor,
     grid: Grid,
 ) -> Tensor:
-    """Saliency of every cell of a photograph; image `(3, H, W)` → `(X·Y, X·Y)`."""
+    """Compute the saliency of every cell of a photograph.
+
+    Args:
+        model: gives the saliency of pictures.
+        view: whether it sees the foveated view from each cell, or the photograph as it is.
+        reduction: how the saliency of pixels becomes that of cells.
+        sensor: the sensor of the views.
+        reference: longer side of a photograph for which the sensor is made.
+        image: the photograph, `(3, H, W)`.
+        grid: the cells.
+
+    Returns:
+        `(X·Y, X·Y)`, a row for each fixated cell; for the photograph as it is `(1, X·Y)`.
+    """
     with one_thread(), torch.inference_mode():
         if view == "picture":
             return cell_saliency(model(image[None]), grid.columns, grid.rows, reduction)
         state, fixations = open_at_reference(sensor, reference, image, grid.centres)
         # One view at a time: rounding then does not depend on which views share a batch.
-        seen = (sensor.picture(state, point[None]) for point in fixations)
-        return torch.cat([cell_saliency(model(each), grid.columns, grid.rows, reduction) for each in seen])
+        rows = []
+        for fixation in fixations:
+            foveated = sensor.picture(state, fixation[None])
+            rows.append(cell_saliency(model(foveated), grid.columns, grid.rows, reduction))
+        return torch.cat(rows)
 
 
 def open_at_reference(sensor: Sensor, reference: float, image: Tensor, points: Tensor) -> tuple[Any, Tensor]:
     """Open a photograph `(3, H, W)`, resized to a longer side of `reference`, and move `points` `(F, 2)` there."""
-    scale = reference / max(image.shape[-2:])
-    size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)
-    ratio = points.new_tensor(size) / points.new_tensor((image.shape[-1], image.shape[-2]))
-    return sensor.open(resize(image[None], size), ratio.new_ones(2)), (points + 0.5) * ratio - 0.5
+    height, width = image.shape[-2:]
+    scale = reference / max(height, width)
+    size = (round(width * scale), round(height * scale))
+    ratio = points.new_tensor(size) / points.new_tensor((width, height))
+    state = sensor.open(resize(image[None], size), ratio.new_ones(2))
+    return state, (points + 0.5) * ratio - 0.5

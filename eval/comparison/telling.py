@@ -86,18 +86,22 @@ class Telling:
 
     def differences(self, name: str) -> list[str]:
         """Table of the differences of all ways to one of them, paired over the searches."""
-        apart = self.figures.less(self.names.index(name))
-        heads = [*TELLING, *(["place right"] if self.places else [])]
+        differences = self.figures.less(self.names.index(name))
+        low, high = differences.interval()
+        heads = [*TELLING, "place right"] if self.places else TELLING
         rows = [[f"difference to {name}", *heads]]
-        low, high = apart.interval()
         for way, other in enumerate(self.names):
             if other == name:
                 continue
-            value, error = apart.value[way], apart.error[way]
-            area = plus_minus(float(value[0]), float(error[0]), 3, sign="+") if value[0].isfinite() else "-"
-            spans = zip(value[1:], low[way, 1:], high[way, 1:], [0] * len(_SHARES) + [1], strict=True)
-            cells = [_spanned(middle, least, most, digits=digits, sign="+") for middle, least, most, digits in spans]
-            rows.append([other, area, *cells[: len(heads) - 1]])
+            value = differences.value[way]
+            area = "-"
+            if value[0].isfinite():
+                area = plus_minus(float(value[0]), float(differences.error[way, 0]), 3, sign="+")
+            row = [other, area]
+            for column in range(1, len(heads)):
+                digits = 1 if heads[column] == "place right" else 0
+                row.append(_spanned(value[column], low[way, column], high[way, column], digits=digits, sign="+"))
+            rows.append(row)
         return table(rows)
 
 

@@ -139,7 +139,8 @@ class _Way(NamedTuple):
     verified: bool = False
 
 
-class _Scene(NamedTuple):
+@dataclass(frozen=True)
+class _Scene:
     """A scene, and what all searches in it share.
 
     Attributes:

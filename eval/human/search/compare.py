@@ -76,7 +76,9 @@ def _from_files(
     return searchers
 
 
-def _in_pictures(searchers: Mapping[str, Sequence[Fixations]], pictures: Collection[str]) -> dict[str, list[Fixations]]:
+def _in_pictures(
+    searchers: Mapping[str, Sequence[Fixations]], pictures: Collection[object]
+) -> dict[str, list[Fixations]]:
     """Select the searches in some pictures, and the searchers that have any."""
     selected = {}
     for name, searches in searchers.items():
