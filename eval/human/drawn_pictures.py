@@ -85,40 +85,61 @@ def web_page(rng: np.random.Generator) -> Picture:
     draw.rectangle((0, bar, width, banner), fill=_colour(rng, 150, 250))
     draw.text((width // 12, bar + (banner - bar) // 3), _words(rng, 3), _INK, _font(max(18, (banner - bar) // 6)))
     cards = int(rng.integers(2, 5))
-    side = width // cards
+    card_width = width // cards
     for number in range(cards):
-        box = (number * side + 12, banner + 15, (number + 1) * side - 12, height - 15)
-        draw.rounded_rectangle(box, 8, outline=(200, 200, 205), fill=(248, 248, 250))
-        draw.rectangle((box[0] + 8, box[1] + 8, box[2] - 8, box[1] + (box[3] - box[1]) // 3), fill=_colour(rng, 60))
-        text = (box[0] + 10, box[1] + (box[3] - box[1]) // 3 + 12, box[2] - 10, box[3] - 10)
-        _paragraph(draw, rng, text, int(rng.integers(9, 14)), "DejaVu Sans")
+        left = number * card_width
+        _card(draw, rng, (left + 12, banner + 15, left + card_width - 12, height - 15))
     return page
+
+
+def _card(draw: ImageDraw.ImageDraw, rng: np.random.Generator, box: tuple[int, int, int, int]) -> None:
+    """Draw a card with a coloured picture in its upper third, and text below."""
+    left, top, right, bottom = box
+    third = top + (bottom - top) // 3
+    draw.rounded_rectangle(box, 8, outline=(200, 200, 205), fill=(248, 248, 250))
+    draw.rectangle((left + 8, top + 8, right - 8, third), fill=_colour(rng, 60))
+    place = (left + 10, third + 12, right - 10, bottom - 10)
+    _paragraph(draw, rng, place, int(rng.integers(9, 14)), "DejaVu Sans")
 
 
 def interface(rng: np.random.Generator) -> Picture:
     """Draw a program's window: a side bar, a table, buttons and fields, light or dark."""
     width, height = _size(rng)
-    dark = rng.random() < 0.4
-    ground: _Colour = (32, 34, 40) if dark else (240, 241, 244)
-    ink: _Colour = (220, 220, 225) if dark else _INK
+    is_dark = rng.random() < 0.4
+    ground: _Colour = (32, 34, 40) if is_dark else (240, 241, 244)
+    ink: _Colour = (220, 220, 225) if is_dark else _INK
     window = Image.new("RGB", (width, height), ground)
     draw = ImageDraw.Draw(window)
     side = round(width * rng.uniform(0.15, 0.28))
     draw.rectangle((0, 0, side, height), fill=_colour(rng, 30, 110))
     for number in range(int(rng.integers(5, 12))):
         draw.text((14, 20 + number * 32), _words(rng, 1), (235, 235, 235), _font(13))
-    row = int(rng.integers(22, 34))
-    for y in range(90, height - 80, row):
-        draw.line((side + 15, y, width - 15, y), fill=(128, 130, 140))
-        for x in range(side + 20, width - 60, max(90, width // 7)):
-            draw.text((x, y + 5), _words(rng, 1)[:10], ink, _font(12))
-    accent = _colour(rng, 40, 220)
-    for number in range(3):
-        box = (side + 20 + number * 130, 25, side + 130 + number * 130, 60)
-        draw.rounded_rectangle(box, 6, fill=accent if number == 0 else None, outline=accent)
-        draw.text((box[0] + 14, 34), _words(rng, 1)[:9], _WHITE if number == 0 else ink, _font(13))
+    _cells_of_table(draw, rng, (side, 90, width, height - 80), ink)
+    _buttons(draw, rng, side + 20, ink)
     draw.rounded_rectangle((side + 20, height - 60, width - 30, height - 20), 5, outline=(150, 150, 160))
     return window
+
+
+def _cells_of_table(
+    draw: ImageDraw.ImageDraw, rng: np.random.Generator, box: tuple[int, int, int, int], ink: _Colour
+) -> None:
+    """Draw rows of words with lines between them, from the left of a box to the right border of the window."""
+    left, top, width, bottom = box
+    row_height = int(rng.integers(22, 34))
+    for y in range(top, bottom, row_height):
+        draw.line((left + 15, y, width - 15, y), fill=(128, 130, 140))
+        for x in range(left + 20, width - 60, max(90, width // 7)):
+            draw.text((x, y + 5), _words(rng, 1)[:10], ink, _font(12))
+
+
+def _buttons(draw: ImageDraw.ImageDraw, rng: np.random.Generator, left: int, ink: _Colour) -> None:
+    """Draw three buttons, the first of which is filled."""
+    accent = _colour(rng, 40, 220)
+    for number in range(3):
+        is_filled = number == 0
+        x = left + number * 130
+        draw.rounded_rectangle((x, 25, x + 110, 60), 6, fill=accent if is_filled else None, outline=accent)
+        draw.text((x + 14, 34), _words(rng, 1)[:9], _WHITE if is_filled else ink, _font(13))
 
 
 def chart(rng: np.random.Generator) -> Picture:
