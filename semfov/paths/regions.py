@@ -40,15 +40,15 @@ def named_regions(grid: Grid, probabilities: Tensor, classes: Sequence[str]) -> 
         The regions, the largest first.
     """
     probabilities = probabilities.detach().cpu()
-    background = probabilities[:, 0]  # (X·Y,), as the three below
-    highest, label = probabilities[:, 1:].max(-1)
-    least = min(0.5, 3 / len(classes))
-    named = torch.where(highest > background.clamp(min=least), label + 1, 0)  # 0 where no class stands out
+    background = probabilities[:, 0]  # (X·Y,), as the four below
+    highest, best = probabilities[:, 1:].max(-1)
+    threshold = background.clamp(min=min(0.5, 3 / len(classes)))
+    label = torch.where(highest > threshold, best + 1, 0)  # background where no class stands out
     regions = []
-    for cells in _regions(named.reshape(grid.rows, grid.columns)):
+    for cells in _regions(label.reshape(grid.rows, grid.columns)):
         peak = cells[int(highest[cells].argmax())]
         x, y = grid.centres[peak].tolist()
-        regions.append(Region(classes[int(named[peak])], cells, float(highest[peak]), (x, y)))
+        regions.append(Region(classes[int(label[peak])], cells, float(highest[peak]), (x, y)))
     return sorted(regions, key=lambda region: -len(region.cells))
 
 
@@ -86,5 +86,13 @@ def _regions(labels: Tensor) -> list[list[int]]:
 def _neighbours(cell: int, rows: int, columns: int) -> set[int]:
     """List the cells that share a side with a cell."""
     row, column = divmod(cell, columns)
-    places = ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1))
-    return {r * columns + c for r, c in places if 0 <= r < rows and 0 <= c < columns}
+    neighbours = set()
+    if row > 0:
+        neighbours.add(cell - columns)
+    if row < rows - 1:
+        neighbours.add(cell + columns)
+    if column > 0:
+        neighbours.add(cell - 1)
+    if column < columns - 1:
+        neighbours.add(cell + 1)
+    return neighbours
