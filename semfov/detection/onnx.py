@@ -40,6 +40,9 @@ from semfov.io.schema import excerpt
 _ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name. They have a fixed input, whose size can be changed all the same."""
 
+_AS_BYTES: dict[str, Any] = {"scale": 255.0, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
+"""Preprocessing of a model whose input are bytes."""
+
 _ROUNDING = 0.02  # how far beyond 0 and 1 the scores of networks of 8 and 16 bits may lie
 _MOST_BOXES = 2**20  # largest number of boxes of a canvas; YOLOv5 has 102,000 for 1280 px
 _MOST_LISTED = 300  # largest number of characters of the outputs that a message lists
@@ -76,7 +79,8 @@ class OnnxDetector(Detector):
     ) -> None:
         kind = HEADS[lookup(head, HEADS, "head")]
         names, places = named_outputs(classes)
-        preprocessing = kind.preprocessing if preprocessing is None else preprocessing
+        preprocessing = _usual_preprocessing(head, session) if preprocessing is None else preprocessing
+        _check_bytes_alone(session, preprocessing)
         super().__init__(
             name,
             names,
@@ -362,7 +366,7 @@ def load_onnx(
         count = _class_count(settings.get("classes"), published=published)
         settings["head"] = _recognised_head(session, outputs, size, count)
     head = lookup(settings["head"], HEADS, "head")
-    preprocessing = _merged_preprocessing(head, settings, preprocessing)
+    preprocessing = _merged_preprocessing(_usual_preprocessing(head, session), settings, preprocessing)
     names = _class_names(file, head, outputs, size, settings.get("classes"), published=published)
     detector = OnnxDetector(
         session,
@@ -414,13 +418,27 @@ def _recognised_head(session: OnnxSession, outputs: Mapping[str, Tensor], size: 
     return recognise(signature, lambda: session(grey))
 
 
+def _usual_preprocessing(head: str, session: OnnxSession) -> Preprocessing:
+    """Choose the preprocessing of a head; a model that takes bytes scales them itself."""
+    usual = HEADS[head].preprocessing
+    return replace(usual, **_AS_BYTES) if session.takes_bytes else usual
+
+
+def _check_bytes_alone(session: OnnxSession, preprocessing: Preprocessing) -> None:
+    """Raise `InputError` for a preprocessing of a model of bytes that makes other numbers of them."""
+    if session.takes_bytes:
+        are_bytes = all(getattr(preprocessing, name) == value for name, value in _AS_BYTES.items())
+        values = {name: getattr(preprocessing, name) for name in _AS_BYTES}
+        check(are_bytes, "preprocessing", f"{_AS_BYTES} for {session.path.name}, which takes bytes", values)
+
+
 def _merged_preprocessing(
-    head: str, settings: OnnxSettings, option: Preprocessing | Mapping[str, Any] | None
+    usual: Preprocessing, settings: OnnxSettings, option: Preprocessing | Mapping[str, Any] | None
 ) -> Preprocessing:
-    """Override the preprocessing of a head by the settings of the model, and these by an option."""
+    """Override the usual preprocessing by the settings of the model, and these by an option."""
     if isinstance(option, Preprocessing):
         return option
-    stored = HEADS[head].preprocessing.merged(settings.get("preprocessing", {}))
+    stored = usual.merged(settings.get("preprocessing", {}))
     return stored if option is None else stored.merged(option)
 
 

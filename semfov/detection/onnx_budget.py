@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
+from semfov.detection.onnx_input import layout_of, sizes_of_image
 from semfov.errors import check_data
 from semfov.io.schema import excerpt
 
@@ -249,10 +250,10 @@ class Budget:
 
 def _fix_input_sizes(graph: GraphProto, canvas: tuple[int, int]) -> None:
     """Give inputs the sizes of one image `(width, height)` where they are open."""
-    width, height = canvas
     for value in graph.input:
         sides = value.type.tensor_type.shape.dim
-        usual = (1, 3, height, width) if len(sides) == 4 else (1,) * len(sides)
+        layout = layout_of([side.dim_value for side in sides])
+        usual = (1,) * len(sides) if layout is None else sizes_of_image(layout, canvas)
         for side, size in zip(sides, usual, strict=True):
             side.dim_value = side.dim_value or size
 

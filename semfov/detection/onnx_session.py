@@ -21,6 +21,7 @@ from semfov.detection.onnx_apart import ModelApart
 from semfov.detection.onnx_budget import check_elements, dims, without_weights
 from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_check import check_file, stored_bytes
+from semfov.detection.onnx_input import FLOATS, ImageInput, Sizes, open_sizes, sizes_of_image
 from semfov.detection.onnx_program import Description, Opening, Port, describe, open_session, runtime
 from semfov.errors import DataError, check
 
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 _INTEGERS = "tensor(int64)", "tensor(int32)"  # of outputs that number classes and boxes
-_FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
 # Further inputs of some exported detectors, made from the canvas: sizes and scales for mapping boxes.
 _EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -46,22 +46,17 @@ _MOST_SECONDS = 10.0  # longest pass of such a model for one image, and longest 
 _MOST_REASON = 400  # largest number of characters of onnxruntime's reasons that a message has
 _MOST_BATCH = 1024  # largest fixed batch size of a model
 
-_PLANES_OF_FLOATS = "export it with such an input, as the option inputs-as-nchw of tf2onnx does"
+_IMAGES = "export it with such an input"
 _WITHOUT_SELECTION = "export it without non-maximum suppression, or with a first dimension for the images"
 
 Provider = str | tuple[str, Mapping[str, object]]
 """An execution provider of onnxruntime: its name, alone or with its options."""
 
-_Sizes = tuple[int | None, ...]
-"""A shape, with None for sizes that are open."""
-
 
 class _Inputs(NamedTuple):
-    """Inputs of a model: name, shape and dtype of the images, and the names of the others, all in `_EXTRA_INPUTS`."""
+    """Inputs of a model: the one for images, and the names of the others, all in `_EXTRA_INPUTS`."""
 
-    image: str
-    shape: _Sizes
-    dtype: torch.dtype
+    image: ImageInput
     extra: tuple[str, ...]
 
 
@@ -77,7 +72,8 @@ class OnnxSession:
         producer: the program that exported the model.
         outputs: name and shape of each output.
         image: name of the input for images.
-        shape: shape of the input for images, `(B, 3, H, W)`.
+        shape: shape of the input for images, in the order `(B, 3, H, W)`.
+        takes_bytes: whether the images are bytes, 255 for white.
 
     Private attributes: `_again` makes a session of the same model with the same settings, in another process, or with
     further outputs; `_further` names those of this session. `_session` runs the model, `_inputs` is what it takes.
@@ -129,8 +125,9 @@ class OnnxSession:
         self.producer = description["producer"]
         self.outputs = self._read_outputs(description["outputs"])
         self._inputs = self._read_inputs(description["inputs"])
-        self.image = self._inputs.image
-        self.shape = self._inputs.shape
+        self.image = self._inputs.image.name
+        self.shape = self._inputs.image.shape
+        self.takes_bytes = self._inputs.image.takes_bytes
         batch = self.shape[0]
         check(batch is None or batch <= _MOST_BATCH, "batch", f"at most {_MOST_BATCH} images at once", batch)
 
@@ -161,33 +158,31 @@ class OnnxSession:
         model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in self._further if name not in names)
         return model.SerializeToString()
 
-    def _read_outputs(self, outputs: Sequence[Port]) -> tuple[tuple[str, _Sizes], ...]:
+    def _read_outputs(self, outputs: Sequence[Port]) -> tuple[tuple[str, Sizes], ...]:
         """List name and shape of each output; raises `InputError` for one that holds no numbers."""
         for output in outputs:
             name = f"{self.path.name}: output {output['name']!r}"
-            check(output["type"] in (*_FLOATS, *_INTEGERS), name, "numbers", output["type"])
-        return tuple((output["name"], _sizes(output["shape"])) for output in outputs)
+            check(output["type"] in (*FLOATS, *_INTEGERS), name, "numbers", output["type"])
+        return tuple((output["name"], open_sizes(output["shape"])) for output in outputs)
 
     def _read_inputs(self, inputs: Sequence[Port]) -> _Inputs:
         """Find the input for images, and the others; raises `InputError` for others than detectors have."""
         descriptions = [f"{port['name']} {port['shape']} {port['type']}" for port in inputs]
         got = ", ".join(descriptions)
-        images = list(filter(_takes_images, inputs))
-        expected = "one floating-point input (B, 3, H, W)"
-        check(len(images) == 1, self.path.name, expected, f"{got}; {_PLANES_OF_FLOATS}")
+        images = [image for port in inputs if (image := ImageInput.of(port)) is not None]
+        expected = "one input of floats or bytes, (B, 3, H, W) or (B, H, W, 3)"
+        check(len(images) == 1, self.path.name, expected, f"{got}; {_IMAGES}")
         image = images[0]
-        shape = _sizes(image["shape"])
-        check(shape[1] in (3, None), self.path.name, expected, f"{got}; {_PLANES_OF_FLOATS}")
-        others = tuple(port["name"] for port in inputs if port is not image)
+        others = tuple(port["name"] for port in inputs if port["name"] != image.name)
         are_known = set(others) <= set(_EXTRA_INPUTS)
         check(are_known, self.path.name, f"no inputs but an image and {', '.join(_EXTRA_INPUTS)}", got)
-        return _Inputs(image["name"], shape, _FLOATS[image["type"]], others)
+        return _Inputs(image, others)
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model on images, without gradients, in parts where its batch size is fixed.
 
         Args:
-            image: `(B, 3, H, W)`, as the network takes them.
+            image: `(B, 3, H, W)`, with the values that the network takes; bytes are rounded.
 
         Returns:
             The outputs by name, each with a row for each image, in the dtype and on the device of the images.
@@ -197,12 +192,12 @@ class OnnxSession:
         """
         batch = image.shape[0]
         check(batch > 0, "image", "at least one image", batch)
-        source = image.detach().to(device="cpu", dtype=self._inputs.dtype)
+        source = image.detach().to(device="cpu", dtype=self._inputs.image.dtype)
         size = self._images_a_run(batch)
         missing = -batch % size
         if missing:  # a fixed batch is filled up with the last image
             source = torch.cat([source, source[-1:].expand(missing, -1, -1, -1)])
-        runs = [self._run(part.contiguous()) for part in source.split(size)]
+        runs = [self._run(part) for part in source.split(size)]
         outputs = {}
         for name, _ in self.outputs:
             rows = _joined([run[name] for run in runs])
@@ -219,7 +214,7 @@ class OnnxSession:
     def _run(self, image: Tensor) -> dict[str, Tensor]:
         """Run the model once, on images `(B, 3, H, W)` on the CPU in the dtype of its input."""
         names = [name for name, _ in self.outputs]
-        feed = {self.image: image.numpy()}
+        feed = {self.image: self._inputs.image.arranged(image)}
         for name in self._inputs.extra:
             feed[name] = _EXTRA_INPUTS[name](image).numpy()
         try:
@@ -302,8 +297,8 @@ class OnnxSession:
 
         model = without_weights(onnx.load(self.path, load_external_data=False))
         image = next(value for value in model.graph.input if value.name == self.image)
-        width, height = canvas
-        for side, size in zip(image.type.tensor_type.shape.dim, (1, 3, height, width), strict=True):
+        sizes = sizes_of_image(self._inputs.image.layout, canvas)
+        for side, size in zip(image.type.tensor_type.shape.dim, sizes, strict=True):
             side.dim_value = size
         return onnx.shape_inference.infer_shapes(model, data_prop=True).graph
 
@@ -317,11 +312,6 @@ def _stride(shape: Sequence[int], canvas: Canvas) -> int | None:
     """Find the stride of a map `(1, C, rows, columns)`; None for a tensor of another shape."""
     is_map = len(shape) == 4 and min(shape[2:]) > 1
     return stride_of(canvas[0], shape[3]) if is_map else None
-
-
-def _takes_images(port: Port) -> bool:
-    """Tell whether an input has the form of images."""
-    return len(port["shape"]) == 4 and port["type"] in _FLOATS
 
 
 def _reason(error: Exception) -> str:
@@ -351,8 +341,3 @@ def _check_providers(providers: Sequence[Provider], available: Sequence[str]) ->
     missing = [name for name in names if name not in available]
     got = ", ".join(missing) or "none"
     check(bool(names) and not missing, "providers", f"some of {', '.join(available)}", got)
-
-
-def _sizes(shape: Sequence[int | str | None]) -> _Sizes:
-    """Take the sizes of a shape that are numbers; onnxruntime has names for the others."""
-    return tuple(size if isinstance(size, int) and size > 0 else None for size in shape)

@@ -391,7 +391,62 @@ def test_rows_of_all_images_together_are_refused_with_a_remedy(tmp_path):
     refused(r"'rows': expected a row for each of 1 images, got .*; export it without non-maximum", load_onnx, path)
 
 
-@pytest.mark.parametrize(("kind", "shape"), [(TensorProto.FLOAT, [1, 32, 32, 3]), (TensorProto.UINT8, [1, 3, 32, 32])])
+def colour_network(path, shape, kind=TensorProto.FLOAT, order=(0, 1, 2, 3)):
+    """Write a network that shows the pixels of 8 × 8 cells of 32 × 24 px as scores of three classes, at every level.
+
+    `order` brings its input into (B, C, H, W); bytes are divided by 255.
+    """
+    steps = [
+        helper.make_node("Cast", ["image"], ["numbers"], to=TensorProto.FLOAT),
+        helper.make_node("Div", ["numbers", "white"], ["fractions"]),
+        helper.make_node("Transpose", ["fractions"], ["planes"], perm=list(order)),
+        helper.make_node("AveragePool", ["planes"], ["cells"], kernel_shape=[8, 8], strides=[8, 8]),
+        helper.make_node("Reshape", ["cells", "columns"], ["scores"]),
+        helper.make_node("Concat", ["boxes", "scores"], ["output0"], axis=1),
+    ]
+    boxes = np.tile(np.array([16, 12, 8, 8], np.float32)[:, None], (1, 1, 12))
+    white = 255 if kind == TensorProto.UINT8 else 1
+    stored = {"boxes": boxes, "columns": np.array([1, 3, 12]), "white": np.float32(white)}
+    return write_network(path, steps, {"image": (kind, shape)}, {"output0": [1, 7, 12]}, stored)
+
+
+LAST = [0, 3, 1, 2]  # from channels in the last place
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "order"),
+    [
+        ([1, 24, 32, 3], TensorProto.FLOAT, LAST),
+        ([1, 3, 24, 32], TensorProto.UINT8, [0, 1, 2, 3]),
+        ([1, 24, 32, 3], TensorProto.UINT8, LAST),
+        (["images", "rows", "columns", 3], TensorProto.UINT8, LAST),
+    ],
+)
+@pytest.mark.parametrize("colour", ["rgb", "bgr"])
+def test_channels_may_come_last_and_pixels_may_be_bytes(tmp_path, shape, kind, order, colour):
+    """Against the same network with planes of floats, and against the means of the pixels themselves."""
+    options = {"head": "yolov8", "classes": ["red", "green", "blue"], "preprocessing": {"channels": colour}}
+    usual = load_onnx(colour_network(tmp_path / "usual.onnx", [1, 3, 24, 32]), **options)
+    other = load_onnx(colour_network(tmp_path / "other.onnx", shape, kind, order), input_size=(32, 24), **options)
+    picture = torch.randint(256, (1, 3, 24, 32), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    means = F.avg_pool2d(picture / 255, 8).flatten(2).mT
+    expected = means if colour == "rgb" else means.flip(-1)
+    for canvas in (picture / 255, picture):
+        propose = other.propose_bytes if canvas.dtype == torch.uint8 else other.propose
+        torch.testing.assert_close(propose(canvas).classes, expected)
+    assert usual.input_size == other.input_size
+    torch.testing.assert_close(usual.propose(picture / 255).classes, other.propose(picture / 255).classes)
+    torch.testing.assert_close(pickle.loads(pickle.dumps(other)).propose(picture / 255).classes, expected)
+
+
+def test_a_network_of_bytes_takes_no_other_numbers(tmp_path):
+    path = colour_network(tmp_path / "bytes.onnx", [1, 3, 24, 32], TensorProto.UINT8)
+    options = {"head": "yolov8", "classes": ["red", "green", "blue"]}
+    message = r"preprocessing: expected .*'scale': 255.* for bytes.onnx, which takes bytes, got .*'scale': 1.0"
+    refused(message, load_onnx, path, preprocessing={"scale": 1.0}, **options)
+
+
+@pytest.mark.parametrize(("kind", "shape"), [(TensorProto.INT32, [1, 32, 32, 3]), (TensorProto.UINT8, [1, 1, 32, 32])])
 def test_images_in_other_forms_are_refused_with_a_remedy(tmp_path, kind, shape):
     image = helper.make_tensor_value_info("image", kind, shape)
     cast = helper.make_node("Cast", ["image"], ["out"], to=TensorProto.FLOAT)
@@ -399,7 +454,7 @@ def test_images_in_other_forms_are_refused_with_a_remedy(tmp_path, kind, shape):
     opset = helper.make_opsetid("", 17)
     path = tmp_path / "other.onnx"
     path.write_bytes(helper.make_model(graph, opset_imports=[opset], ir_version=8).SerializeToString())
-    refused(r"one floating-point input \(B, 3, H, W\), got .*; export it with such an input", load_onnx, path)
+    refused(r"one input of floats or bytes, .*, got .*; export it with such an input", load_onnx, path)
 
 
 @pytest.mark.parametrize("side", [100_000, 2**40])
