@@ -176,6 +176,9 @@ AGENT = _by_word(
         "agent.live(target), whose step takes frames": "stream update video watch webcam",
         "agent.classes[1:]": "class_names names",
         "agent.eye.detector": "detector model",
+        "semfov.fit_detector, which writes a folder of models, and semfov.ActivePerception.from_pretrained(folder)": (
+            "export save save_model save_pretrained"
+        ),
     }
 )
 

@@ -17,7 +17,7 @@ from semfov.data.classes import known_class
 from semfov.decision import CloseUp, Decision
 from semfov.detection.detections import Detections
 from semfov.detection.objects import NO_TRACK, SCORE_THRESHOLD, Objects
-from semfov.errors import InputError, check, check_whole
+from semfov.errors import InputError, check_whole
 from semfov.kinds import LookKind
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.paths.files import Ending
@@ -35,6 +35,17 @@ class NumberByClass(dict[str, float]):
         """Return the number of the class that a name means."""
         names = list(self)
         return self[known_class(name, names, "expected")]
+
+    def __contains__(self, name: object) -> bool:
+        """Tell whether there is a number of the class that a name means."""
+        return self.get(name) is not None
+
+    def get(self, name: object, default: Any = None) -> Any:
+        """Return the number of the class that a name means, or the default where there is none."""
+        try:
+            return self[str(name)]
+        except InputError:
+            return default
 
     if not TYPE_CHECKING:  # to which any name would be an attribute
 
@@ -114,9 +125,16 @@ class Outcome(ABC):
 
     def __getitem__(self, index: int) -> RecordedLook:
         """Return a look by its place, from 0; -1 is the last one."""
-        remedy = f"; its objects of a class are record.objects.of({index!r})"
-        check(not isinstance(index, str), "record", "the place of a look, from 0", f"{index!r}{remedy}")
-        return self.looks[index]
+        if isinstance(index, slice) or hasattr(index, "__index__"):
+            return self.looks[index]
+        remedy = ""
+        if isinstance(index, str):
+            is_attribute = hasattr(type(self), index) or index in vars(self)
+            named = (
+                f"it is record.{index}" if is_attribute else f"its objects of a class are record.objects.of({index!r})"
+            )
+            remedy = f"; {named}"
+        raise InputError(f"record: expected the place of a look, from 0, got {index!r}{remedy}")
 
     def _place(self, index: int, argument: str = "index") -> int:
         """Count a look from the start; refuse one that the record has not."""

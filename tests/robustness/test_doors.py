@@ -1,6 +1,7 @@
 """Public entry points with right and wrong arguments: the right result, or an error with argument and remedy."""
 
 import io
+import math
 import re
 
 import cv2
@@ -30,6 +31,7 @@ from semfov.errors import SemfovError
 from semfov.gaze.saliency import VOCUS2, IttiKoch
 from semfov.live import LivePerception
 from semfov.paths import GazePrediction, Scanpath, WindowMoment
+from semfov.paths.outcome import NumberByClass
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence
 from tests import small
@@ -409,6 +411,10 @@ def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
         (lambda agent: agent.find_all(PIXELS).objects["cup"], r"index: .*; objects.of\('cup'\) are those of a class"),
         (lambda agent: agent.find_all(PIXELS).objects.of("qqq"), "class: unknown class 'qqq'"),
         (lambda agent: agent.find_all(PIXELS)["person"], r"record: .* its objects .* record.objects.of\('person'\)"),
+        (lambda agent: agent.find_all(PIXELS)["objects"], r"record: .* got 'objects'; it is record.objects$"),
+        (lambda agent: agent.find_all(PIXELS)["target"], r"record: .* got 'target'; it is record.target$"),
+        (lambda agent: agent.find_all(PIXELS)["cup", 0], r"record: expected the place of a look.* got \('cup', 0\)$"),
+        (lambda agent: agent.save, r"an agent has .* 'save'; use semfov.fit_detector, which writes a folder"),
         (lambda agent: agent.find_all(PIXELS).objects.cups, r"Objects has .* 'cups'; use objects.of\('cup'\)$"),
         (lambda agent: agent.find_all(PIXELS).wine_glass, r".* 'wine_glass'; use record.objects.of\('wine glass'\)$"),
         (lambda agent: agent.search(PIXELS, "cup").decision.is_found, "Decision .*; use decision.outcome == 'found'$"),
@@ -442,6 +448,16 @@ def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
 def test_what_others_call_it_and_other_forms_of_a_call_are_refused_with_ours(call, said, agent):
     with pytest.raises((SemfovError, AttributeError), match=f"^{said}"):
         call(agent)
+
+
+def test_numbers_by_class_are_asked_for_in_every_way_of_a_dict_by_the_same_names():
+    numbers = NumberByClass({"cup": 2.5, "wine glass": math.nan})
+    for name in ("cup", "cups", "Cup", "wine_glasses"):
+        assert name in numbers
+        assert numbers.get(name, -1) is numbers[name]
+    assert "fork" not in numbers
+    assert numbers.get("fork", -1) == -1
+    assert 3 not in numbers
 
 
 def test_an_error_in_a_property_of_a_record_is_told():
