@@ -14,10 +14,11 @@ from PIL import Image
 import semfov
 from semfov import load_detector
 from semfov.cli.commands import SUBCOMMANDS
-from semfov.cli.main import _in_command_words, _message_options, main
+from semfov.cli.main import _in_command_words, _message_options, _option_names, main
 from semfov.cli.options import DetectorOptions
 from semfov.detection.load import loader_options
 from semfov.detection.onnx_file import names_beside
+from semfov.words import dashed
 from tests.refusals import refused
 from tests.small import write_network
 
@@ -213,11 +214,16 @@ PRINTED_BY = {
     "cli/detectors.py": ["search", "find", "explore", "live", "app"],  # the commands that its list names
     "cli/agent.py": ["search", "find", "explore", "live"],
     "cli/search.py": ["search", "find", "explore"],
+    "cli/jobs.py": ["search", "find", "explore"],
+    "cli/formats.py": ["find"],
+    "cli/compare.py": ["compare"],
     "cli/outcome.py": ["search", "find", "explore"],
     "cli/live.py": ["live"],
     "human/check.py": ["check"],
     "cli/sources.py": ["search", "find", "explore", "gaze"],
     "model_folder.py": ["search", "find", "explore", "live", "app"],
+    "paths/cautions.py": ["gaze"],
+    "runs/workers.py": ["search", "find", "explore", "fit"],
 }
 """Commands that can print the messages of a file, or of the files of a folder."""
 
@@ -227,6 +233,9 @@ CONDITIONAL = {
     "a class is given by --target": ["search", "find"],
 }
 """Messages that only some of these commands print."""
+
+HELP = ("cli/commands.py", "cli/app.py")
+"""Files with texts of help, which `test_words` reads, and with style sheets, which have variables of their own."""
 
 OTHER_PROGRAMS = {
     "detection/export.py": "a command of its own",
@@ -253,7 +262,7 @@ def remedies() -> Iterator[tuple[str, str, str]]:
 def test_every_remedy_of_a_message_exists_in_the_command_that_prints_it():
     options, wrong, seen = "|".join({*loader_options(), "detector"}), [], 0
     for name, command, text in remedies():
-        known = {option.replace("_", "-") for option in (*_message_options(command), "try")}
+        known = {dashed(option) for option in (*_message_options(command), "try")}
         for option in re.findall(r"(?<![\w-])--([a-z][a-z._-]*[a-z])", text):
             seen += 1
             if option not in known:
@@ -262,3 +271,19 @@ def test_every_remedy_of_a_message_exists_in_the_command_that_prints_it():
         wrong += [(name, command, left, text[:90]) for left in re.findall(rf"(?<![\w.])(?:{options})=", text)]
     assert wrong == []
     assert seen > 50
+
+
+def test_every_option_that_any_message_names_is_one_of_some_command():
+    known = {dashed(option) for command in SUBCOMMANDS for option in _option_names(command)}
+    # Those of a fit are dotted, and `test_words` checks the ones of its help.
+    known |= set(re.findall(r"--([a-z][a-z._]*)", SUBCOMMANDS["fit"].help))
+    known |= {"config", "help", "help-all", "help_all", "version"}
+    unknown = []
+    for file in sorted(HERE.rglob("*.py")):
+        name = file.relative_to(HERE).as_posix()
+        if name in OTHER_PROGRAMS or name in HELP:
+            continue
+        for text in messages(file):
+            options = re.findall(r"(?<![\w-])--([a-z][a-z._-]*[a-z])", text)
+            unknown += [(name, option, text[:90]) for option in options if option not in known]
+    assert unknown == []

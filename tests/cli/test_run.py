@@ -268,6 +268,27 @@ def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_p
         semfov.run(again, "red", agent=agent, labels=tmp_path / "labels")
 
 
+@pytest.mark.filterwarnings("always:.* left out")
+def test_a_folder_is_looked_at_again_without_what_was_written_into_it(run, flight):
+    """Figures, a film, crops and a page of earlier commands are no photographs of a later one."""
+    (flight / "c.png").unlink()
+    code, _ = run("search", flight / "low" / "west" / "a.png", "--target", "red", "--out", flight / "figures")
+    assert code == 0
+    assert {"scanpath.png", "animation.gif"} <= {path.name for path in (flight / "figures").iterdir()}
+    tables = []
+    for number in range(2):
+        table = flight / f"found {number}.csv"
+        outputs = ["--crops", flight / "crops", "--report", flight / "page.html", "--out", table]
+        code, printed = run("find", flight, "--target", "red", "--recursive", "--passes", 1, *outputs)
+        assert code == 0
+        assert "that semfov has written" in printed.err
+        tables.append(table.read_text())
+    assert list((flight / "crops").rglob("*.jpg"))
+    assert tables[0] == tables[1]
+    looked_at = {row["picture"] for row in csv.DictReader(tables[1].splitlines())}
+    assert looked_at == {str(flight / "low" / name) for name in ("b.png", "west/a.png")}
+
+
 def test_crops_show_the_bands_and_the_white_of_the_look(agent, tmp_path):
     pixels = np.full((4, 120, 160), 1000, np.float32)
     pixels[1:, 8:28, 8:28] = np.array([2300, 200, 200])[:, None, None]

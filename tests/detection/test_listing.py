@@ -1,15 +1,18 @@
 """What a detector shows is listed with the score that it shows, with every head and by every kind of look."""
 
 import math
+import re
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torchvision.ops import nms
 
 from semfov import ActivePerception, load_detector
 from semfov.agents.windows import ZoomAgent
+from semfov.cli.trial import try_detector
 from semfov.detection import Detections, Detector
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_heads import HEADS
@@ -185,6 +188,18 @@ def test_a_head_is_listed_with_its_own_scores(constant, how):
     assert listed(record) == EXPECTED
     seen = record.detections[0]
     assert sorted(seen.confidence[0].tolist(), reverse=True)[:3] == pytest.approx([0.9, 0.6, 0.35], abs=0.01)
+
+
+@pytest.mark.filterwarnings("ignore:.* selects boxes itself")
+def test_a_trial_has_the_scores_of_the_head_in_both_columns(constant, tmp_path, capsys):
+    path = tmp_path / "picture.png"
+    Image.new("RGB", (SIDE, SIDE), "grey").save(path)
+    try_detector(ActivePerception.raw(constant), path)
+    printed = capsys.readouterr().out
+    shown = [score for score in SHOWN.values() if score >= 0.3]
+    assert f"the bare detector shows {len(shown)} from 0.3 on, and semfov lists {len(shown)} of them" in printed
+    rows = re.findall(r"^(class \d+) +(\S+) +(\S+) +", printed, re.M)
+    assert rows == [(name, f"{score.expected:.2f}", f"{score.expected:.2f}") for name, score in EXPECTED]
 
 
 @pytest.mark.filterwarnings("ignore:.* selects boxes itself")
