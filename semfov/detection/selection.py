@@ -21,7 +21,7 @@ With fitted models probabilities decide a search (`semfov.decision`).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -75,7 +75,8 @@ def select(
         placement: placement of the images on the canvas; None leaves boxes in canvas pixels.
         selection: threshold, non-maximum suppression and limit.
         policy: background policy of the score vectors.
-        faint: confidence from which on candidates count for `Detections.highest`; None: the detections alone do.
+        faint: confidence from which on candidates count for `Detections.highest`, in addition to those from the
+            threshold on; None: the detections alone do.
 
     Returns:
         The boxes, those with the largest score of a class in their vectors first.
@@ -88,12 +89,7 @@ def select(
     # On a GPU each step would wait for the number of boxes that the step before has left.
     if values_known(candidates.boxes):
         candidates = candidates.to(torch.device("cpu"))
-    images = [_select_of_image(candidates, image, placement, selection, policy) for image in range(count)]
-    if faint is not None:
-        images = [
-            replace(detections, highest=_highest_of_candidates(candidates, image, faint, policy)[None])
-            for image, detections in enumerate(images)
-        ]
+    images = [_select_of_image(candidates, image, placement, selection, policy, faint) for image in range(count)]
     detections = images[0] if count == 1 else Detections.stack(images)
     return detections if detections.boxes.device == device else detections.to(device)
 
@@ -128,54 +124,52 @@ def _lie_within(numbers: Tensor, low: float, high: float) -> bool:
 
 
 def _select_of_image(
-    candidates: Candidates, image: int, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
+    candidates: Candidates,
+    image: int,
+    placement: Placement | None,
+    selection: Selection,
+    policy: BackgroundPolicy,
+    faint: float | None,
 ) -> Detections:
     """Select the best boxes of one image; the arguments are those of `select`, and the image's number."""
-    confidence = candidates.confidence[image]
-    index = (confidence >= selection.threshold).nonzero()[:, 0]
-    boxes = candidates.boxes[image].index_select(0, index)
+    least = selection.threshold if faint is None else min(faint, selection.threshold)
+    confidence_of_all = candidates.confidence[image]
+    index = (confidence_of_all >= least).nonzero()[:, 0]
+    rows = candidates.take(image, index)
+    confident = (rows.confidence >= selection.threshold).nonzero()[:, 0]
+    confidence = rows.confidence.index_select(0, confident)
+    boxes = rows.boxes.index_select(0, confident)
     if not candidates.are_checked:
-        check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
+        check_numbers(image, -math.inf, math.inf, confidence=confidence_of_all, boxes=boxes)
+        check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
     if placement is not None:
         boxes = placement.boxes_to_image(boxes)
-    labels = index  # any numbers do where they are not read
+    labels = confident  # any numbers do where they are not read
     if selection.per_class:
-        labels = candidates.classes[image, index].argmax(-1)
-    remaining = suppress(boxes, confidence.index_select(0, index), labels, selection)
+        labels = rows.classes.index_select(0, confident).argmax(-1)
+    remaining = suppress(boxes, confidence, labels, selection)
 
-    # The scores of a few boxes are read after suppression, not those of all cells before.
-    rows = candidates.take(image, index[remaining])
-    if not candidates.are_checked:
-        check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
-    scores = score_vectors(rows, policy)
+    survivors = confident[remaining]
+    if faint is None:  # the vectors of few boxes are read, so no others are computed
+        scores = score_vectors(candidates.take(image, index[survivors]), policy)
+        highest = _highest(scores)
+    else:
+        vectors = score_vectors(rows, policy)
+        highest = _highest(vectors)
+        scores = vectors.index_select(0, survivors)
     # Suppression ranks by confidence; the shares of a vector can rank otherwise.
     best_score = scores[:, 1:].detach().amax(-1)
     order = best_score.argsort(descending=True, stable=True)
     boxes = boxes.index_select(0, remaining[order])
     scores = scores.index_select(0, order)
-    confidence = rows.confidence.index_select(0, order)
+    confidence = confidence.index_select(0, remaining[order])
     mask = torch.ones_like(order, dtype=torch.bool)
-    return Detections(boxes[None], scores[None], mask[None], confidence[None])
+    return Detections(boxes[None], scores[None], mask[None], confidence[None], highest[None])
 
 
-def _highest_of_candidates(candidates: Candidates, image: int, faint: float, policy: BackgroundPolicy) -> Tensor:
-    """Find the highest score of each class in the vectors of all candidates of an image that are not too faint.
-
-    Args:
-        candidates: all boxes of a head.
-        image: number of the image.
-        faint: smallest confidence of a candidate that counts.
-        policy: background policy of the score vectors.
-
-    Returns:
-        `(K+1,)`; 0 without candidates.
-    """
-    index = (candidates.confidence[image] >= faint).nonzero()[:, 0]
-    rows = candidates.take(image, index)
-    if not candidates.are_checked:
-        check_numbers(image, 0, 1, class_scores=rows.classes, objectness=rows.objectness)
-    scores = score_vectors(rows, policy)
-    return scores.amax(0) if len(scores) else scores.sum(0)
+def _highest(vectors: Tensor) -> Tensor:
+    """Find the highest score of each class in vectors `(N, K+1)`, `(K+1,)`; 0 without any."""
+    return vectors.amax(0) if len(vectors) else vectors.sum(0)
 
 
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
