@@ -13,6 +13,7 @@ from semfov.detection import Candidates, Detector, Objects, score_vectors
 from semfov.detection.objects import SCORE_THRESHOLD, box_text
 from semfov.detection.onnx import OnnxDetector
 from semfov.detection.selection import suppress
+from semfov.io.compatibility import NETWORKS
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import Window
@@ -158,9 +159,9 @@ def _about_low_scores(confidence: Tensor) -> str:
 
 
 def _about_colours(bare: Trial, eye: WindowEye, photo: Path) -> list[str]:
-    """Whether an ONNX file shows more with the other order of the channels."""
+    """Say whether an ONNX file shows more with the other order of the channels; that of a known network is right."""
     detector = eye.detector
-    if not isinstance(detector, OnnxDetector):
+    if not isinstance(detector, OnnxDetector) or detector.digest in NETWORKS:
         return []
     usual = detector.preprocessing
     other: Literal["rgb", "bgr"] = "bgr" if usual.channels == "rgb" else "rgb"

@@ -301,7 +301,7 @@ class Detector(StatedModule, ABC):
             converted.dtype not in HALVES or has_parameters,
             "half",
             "a detector of PyTorch",
-            f"{self.name}, which has no parameters",
+            f"{self.name}, which has no parameters; an ONNX file keeps the precision of its export",
         )
 
     def settings(self) -> dict[str, object]:

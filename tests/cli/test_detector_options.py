@@ -18,6 +18,7 @@ from semfov.cli.main import _in_command_words, _message_options, _option_names, 
 from semfov.cli.options import DetectorOptions
 from semfov.detection.load import loader_options
 from semfov.detection.onnx_file import names_beside
+from semfov.io.compatibility import NETWORKS
 from semfov.words import dashed
 from tests.refusals import refused
 from tests.small import write_network
@@ -192,6 +193,15 @@ def test_a_trial_says_what_is_lost(network, tmp_path, capsys):
     many = network(columns(80, (0.9, *[0.05] * 79)), name="many.onnx")
     assert main(["detectors", str(many), *words]) == 0
     assert "the best class has 0.17 of 0.90" in capsys.readouterr().out
+
+
+def test_the_colours_of_a_known_network_are_not_doubted(network, tmp_path, capsys, monkeypatch):
+    path = network(columns(), red=0.6)
+    words = ["detectors", str(path), "--classes", "vehicle,car,taxi", "--head", "yolov8"]
+    words += ["--try", str(photo(tmp_path, (0, 0, 255)))]
+    monkeypatch.setitem(NETWORKS, load_detector(path, head="yolov8", classes=NAMES).digest, "mine")
+    assert main(words) == 0
+    assert "note" not in capsys.readouterr().out
 
 
 def messages(path: Path) -> Iterator[str]:
