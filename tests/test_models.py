@@ -309,6 +309,26 @@ def test_the_file_of_one_model_takes_the_place_of_the_shipped_one(part, one_of_e
             assert parts[other].digest() == shipped[other].digest()
 
 
+@pytest.mark.shared
+def test_one_file_of_a_detector_whose_weights_are_given_takes_the_place_of_the_shipped_one(shared, tmp_path):
+    """By its weights, and as a detector of one's own under another name."""
+    weights = tmp_path / "mine.onnx"
+    weights.write_bytes((shared / "weights" / "nanodet_plus_m_1.5x_416.onnx").read_bytes())
+    search = FovealObservationModel.from_pretrained("nanodet-plus-m-1.5x-search")
+    search.presence.thresholds = Thresholds(0.9375, 0.125, 0.0625)
+    file = tmp_path / "search.safetensors"
+    search.save(file)
+    agents = [
+        ActivePerception.from_pretrained(file, weights=weights),
+        ActivePerception.from_pretrained(file, detector=weights),
+        make_agent(SearchOptions(models=file, weights=weights)),
+        make_agent(SearchOptions(models=file, detector=str(weights))),
+    ]
+    for agent in agents:
+        assert _parts(agent)["search"].digest() == search.digest()
+        assert agent.verification.digest() == Verification.from_pretrained("nanodet-plus-m-1.5x").digest()
+
+
 @pytest.mark.parametrize("name", DETECTORS)
 def test_a_shipped_verification_was_fitted_to_the_cells_of_the_shipped_search(name):
     search = FovealObservationModel.from_pretrained(f"{name}-search")
