@@ -14,7 +14,7 @@ from eval.bootstrap import Bootstrap
 from eval.comparison.summary import announce, write_summary
 from eval.stream.identity import IdentityCounts
 from eval.stream.run import FILM, StreamConfig, StreamOutcome, StreamRun
-from eval.stream.ways import CANDIDATES
+from eval.stream.ways import CANDIDATES, SLICES
 from eval.zoom.objects import average_precision
 from semfov.agents.window_episode import LIKELY
 from semfov.errors import check_data
@@ -67,14 +67,17 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
     by = by_way([record for outcome in outcomes for record in outcome.records])
     frames = sorted(next(iter(by.values())))
     heads = [*map(str, frames), f"all after {config.after}"]
-    precisions = [["", *heads, "passes a frame", "ms a frame"]]
+    precisions = [["", *heads, "of all slices", "passes a frame", "ms a frame"]]
     listed = [["", *heads]]
     figures = Bootstrap.of(precision_figures(by, config.after), range(len(outcomes)))
+    values = dict(zip(by, figures.value.tolist(), strict=True))
     errors = (figures.error if len(outcomes) > 1 else torch.full_like(figures.value, torch.nan)).tolist()
-    for number, (way, records) in enumerate(by.items()):
+    of_slices = sum(value for way, value in values.items() if way.startswith(SLICES))
+    for error, (way, records) in zip(errors, by.items(), strict=True):
         chosen = [*records.values(), [each for frame in frames if frame > config.after for each in records[frame]]]
         cells = [f"{precision_of(group):.2f}" for group in chosen[:-1]]
-        cells.append(plus_minus(float(figures.value[number]), errors[number], 3))
+        cells.append(plus_minus(values[way], error, 3))
+        cells.append(f"{values[way] / of_slices:.2f}" if of_slices else "-")
         milliseconds = sum(outcome.costs[way].milliseconds for outcome in outcomes) / len(outcomes)
         precisions.append([way, *cells, str(outcomes[0].costs[way].passes), f"{milliseconds:.0f}"])
         listed.append([way, *map(listed_cell, chosen)])

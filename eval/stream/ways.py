@@ -25,6 +25,8 @@ from semfov.zoom.looks import LiveWindowLooks, Window, half_steps
 from semfov.zoom.slices import slices
 
 LIVE, CANDIDATES = "live", "live, all candidates"
+SLICES = "whole frame and "
+"""Beginning of the row of all slices, whose number depends on the frame."""
 _SAME = 0.5  # intersection over union from which on a box fits an object
 _FADING = 24.0  # frames after which an oracle looks at a place again
 
@@ -71,7 +73,7 @@ class AllSlices(Way):
         windows = whole_and_slices(source.lattice)
         self.passes = len(windows)
         looks = [look for window in windows for look in source.see([window], hints=False)]
-        return {f"whole frame and {self.passes - 1} slices": suppressed(looks, self.target).objects}
+        return {f"{SLICES}{self.passes - 1} slices": suppressed(looks, self.target).objects}
 
 
 class TrackedSlices(AllSlices):

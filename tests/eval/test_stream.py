@@ -13,13 +13,14 @@ from eval.stream.flights import COURSES, Course, Frame, flight, mot_film, poses
 from eval.stream.plain import PlainRule
 from eval.stream.report import (
     by_way,
+    course_tables,
     listed_cell,
     plot_passes,
     precision_figures,
     precision_over_passes,
     reliability_cells,
 )
-from eval.stream.run import FILM, Cost, StreamOutcome, judged_objects
+from eval.stream.run import FILM, Cost, StreamConfig, StreamOutcome, judged_objects
 from eval.stream.ways import AllSlices, Oracle, RoundRobin, WholeFrame, whole_and_slices
 from semfov import WindowEye
 from semfov.data.scene import Annotation, Scene
@@ -196,10 +197,12 @@ def test_average_precision_of_all_frames_leaves_out_the_first_ones():
 
 def outcome(course, right, ways):
     """A stream with one object, in frame 16; some ways are right. The passes of each are given."""
-    records = [
-        {"way": way, "frame": 16, "objects": 1, "scores": [0.9 if way in right else 0.4], "right": [way in right]}
-        for way in ways
-    ]
+    records = []
+    for way in ways:
+        is_right = way in right
+        listed = {"listed": int(is_right), "listed right": int(is_right)}
+        judged = {"objects": 1, "scores": [0.9 if is_right else 0.4], "right": [is_right], **listed}
+        records.append({"way": way, "frame": 16, **judged})
     return StreamOutcome(course, records, {way: Cost(passes, 1.0) for way, passes in ways.items()}, Drift(), {})
 
 
@@ -219,6 +222,20 @@ def test_precision_is_told_by_way_in_the_order_of_passes():
     drawn = figure.axes[0].containers[0].lines[0]
     assert [*drawn.get_xdata()] == [1, 2]
     assert [*drawn.get_ydata()] == pytest.approx([0.5, 1], abs=0.01)
+
+
+def test_precision_is_told_as_a_share_of_that_of_all_slices():
+    """The agent has the object of each of two streams, the slices that of the first one; by hand 1 and 51 / 101."""
+    ways = {"whole frame and 18 slices": 19, "live": 1, "whole frame": 1}
+    streams = [outcome("still", {"whole frame and 18 slices", "live"}, ways), outcome("still", {"live"}, ways)]
+    shares = {}
+    for line in course_tables("still", streams, StreamConfig())[2:]:
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) > 7 and cells[1] in ways:
+            shares[cells[1]] = cells[4]
+    assert shares == {"whole frame and 18 slices": "1.00", "live": "1.98", "whole frame": "0.00"}
+    alone = course_tables("still", [outcome("still", {"live"}, {"live": 1})], StreamConfig())
+    assert any(" - " in line for line in alone if line.startswith("| live"))
 
 
 def test_a_course_is_told_by_what_the_camera_does():
