@@ -9,6 +9,7 @@ of the rules without pictures (`semfov.data.fixations.suspicions`). A model that
 test honest.
 """
 
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -73,12 +74,14 @@ class _Fault:
             the file.
         frame: size of the frame that the file states; None for that of the picture.
         renamed: maps the names of the pictures to those in the file; None for the same.
+        offset: `(x, y)` in pixels that the line should name; None where it names no such offset.
     """
 
     words: tuple[str, ...]
     change: Callable[[_Points, _Points, int, int], _Points]
     frame: tuple[int, int] | None = None
     renamed: Callable[[list[str], np.random.Generator], list[str]] | None = None
+    offset: tuple[int, int] | None = None
 
 
 def _same(points: _Points, size: _Points, person: int, order: int) -> _Points:
@@ -98,9 +101,9 @@ _FAULTS = {
     ),
     "stretched over a screen": _Fault(("stretched",), lambda p, size, *_: p * np.array(_SCREEN) / size, frame=_SCREEN),
     "pixels of a larger frame": _Fault(("another size",), lambda p, *_: p * 1.6),
-    "shifted by (60, 60)": _Fault(("all fixations lie about",), lambda p, *_: p + 60),
+    "shifted by (60, 60)": _Fault(("all fixations lie about",), lambda p, *_: p + 60, offset=(60, 60)),
     "one person shifted by (70, -50)": _Fault(
-        ("of person",), lambda p, size, person, _: p + np.array([70, -50]) * (person == 3)
+        ("of person",), lambda p, size, person, _: p + np.array([70, -50]) * (person == 3), offset=(70, -50)
     ),
     "drift by (5, -3) from picture to picture": _Fault(
         ("second half", "all fixations lie about", "of person"),
@@ -115,6 +118,8 @@ _FAULTS = {
 }
 
 _SOUND = "none"
+_CLOSE_OFFSET = 10  # pixels, along both axes
+_OFFSET = re.compile(r"\((-?\d+), (-?\d+)\) px")
 
 
 def _deranged(count: int, rng: np.random.Generator) -> list[int]:
@@ -141,6 +146,7 @@ def measure(config: ContentConfig) -> str:
     rng = np.random.default_rng(config.seed)
     named = dict.fromkeys([*_FAULTS, _SOUND], 0)
     by_rules = dict(named)
+    errors: dict[str, list[float]] = {fault: [] for fault, planted in _FAULTS.items() if planted.offset is not None}
     for _ in track(range(config.sets), "sets", "set"):
         chosen = sorted(rng.choice(names, config.size, replace=False).tolist())
         for fault, planted in [*_FAULTS.items(), (_SOUND, _Fault((), _same))]:
@@ -150,11 +156,24 @@ def measure(config: ContentConfig) -> str:
             if fault == _SOUND:
                 named[fault] += bool(lines)
             else:
-                named[fault] += any(words in line for line in lines for words in planted.words)
+                lines_of_fault = [line for line in lines if any(words in line for words in planted.words)]
+                named[fault] += bool(lines_of_fault)
+                if planted.offset is not None and lines_of_fault:
+                    errors[fault].append(_offset_error(lines_of_fault[0], planted.offset))
             by_rules[fault] += bool(rules)
-    rows = [["fault", "named by content", "anything suspicious by rules"]]
-    rows += [[fault, f"{named[fault] / config.sets:.2f}", f"{by_rules[fault] / config.sets:.2f}"] for fault in named]
+    rows = [["fault", "named by content", "offset right within 10 px", "anything suspicious by rules"]]
+    for fault, count in named.items():
+        close = [error <= _CLOSE_OFFSET for error in errors.get(fault, [])]
+        within = f"{sum(close) / len(close):.2f}" if close else ""
+        rows.append([fault, f"{count / config.sets:.2f}", within, f"{by_rules[fault] / config.sets:.2f}"])
     return "\n".join(table(rows))
+
+
+def _offset_error(line: str, offset: tuple[int, int]) -> float:
+    """Compute how far the offset `(x, y)` that a line names is from the planted one, in pixels, in x or in y."""
+    found = _OFFSET.search(line)
+    assert found is not None, line
+    return max(abs(int(value) - planted) for value, planted in zip(found.groups(), offset, strict=True))
 
 
 def _densities(config: ContentConfig, names: list[str]) -> tuple[dict[str, Tensor], dict[str, tuple[int, int]]]:
