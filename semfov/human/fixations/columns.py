@@ -35,6 +35,9 @@ _REMEDIES = {
 _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF")
 """First bytes of pictures, whatever the names of their files say."""
 
+_SPREADSHEETS = (b"\xd0\xcf\x11\xe0", b"PK\x03\x04")
+"""First bytes of spreadsheets, which a file `.xls` may be; EyeLink Data Viewer saves texts under that end."""
+
 LOST = ("", ".", "-", "nan", "none", "null", "na", "undefined", "undefinednull")
 """Fields that hold nothing, in lower case."""
 
@@ -237,8 +240,10 @@ def _check_text_file(path: Path) -> None:
     """Raise `DataError` for a file that is no table of text, with what to do with it."""
     kind = path.suffix.lower()
     with reading(path), path.open("rb") as file:
-        is_picture = kind in PHOTOGRAPHS or file.read(4).startswith(_PICTURES)
-    check_data(kind not in _REMEDIES, path, "a table of text, such as .csv", f"{kind}; {_REMEDIES.get(kind)}")
+        beginning = file.read(4)
+    is_picture = kind in PHOTOGRAPHS or beginning.startswith(_PICTURES)
+    is_text = kind not in _REMEDIES or (kind == ".xls" and beginning not in _SPREADSHEETS)
+    check_data(is_text, path, "a table of text, such as .csv", f"{kind}; {_REMEDIES.get(kind)}")
     expected = "a table of fixations (.csv, .tsv, .json, .asc, …)"
     check_data(kind not in VIDEOS, path, expected, "a video")
     check_data(not is_picture, path, expected, "a picture")

@@ -308,7 +308,7 @@ PROGRAMS = (
         picture=("sourcestimuliname", "stimulusname"),
         subject=("respondentname", "respondent"),
         number=("fixationindex", "fixationindexbystimulus"),
-        needs=("sourcestimuliname", "fixationduration"),
+        needs=("fixationduration",),
     ),
     Program(
         "EyeLink Data Viewer",

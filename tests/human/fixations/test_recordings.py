@@ -96,6 +96,33 @@ TABLES = {
         ),
         {"size": (1024, 768)},
     ),
+    "EyeLink Data Viewer, decimal commas": (
+        lines(f"{VIEWER}\tCURRENT_FIX_DURATION\timagefile", "ann\t1\t{n}\tLEFT\t{x},5\t{y},25\t{time}\t{picture}"),
+        {"size": (1024, 768)},
+    ),
+    "iMotions, fixations and saccades": (
+        lines(
+            "Fixation Index by Stimulus,Fixation X,Fixation Y,Fixation Duration,Saccade Index by Stimulus,"
+            "Saccade Duration",
+            "{n},{x}.5,{y}.5,{time}.0,,",
+        )
+        + ",,,,1,33.3\n",
+        {"size": (1920, 1080), "picture": "a.png"},
+    ),
+    "Gazepoint, fixations alone": (
+        lines("USER,MEDIA_ID,MEDIA_NAME,CNT,FPOGX,FPOGY,FPOGS,FPOGD,FPOGID,GSR_US,GSRV,",
+              "U1,1,{picture},{n},0.5,0.25,0,.{time},{n},2.4,1,"),
+        {"size": (1920, 1080)},
+    ),
+    "Tobii Pro Lab, pixels of the screen and fractions of the picture": (
+        lines(
+            f"{LAB}\t{SCREEN}\tPresented Stimulus name\tPresented Media width [px]\tPresented Media height [px]\t"
+            "Gaze event duration [ms]\tFixation point X [DACS px]\tFixation point Y [DACS px]\t"
+            "Fixation point X [MCS norm]\tFixation point Y [MCS norm]",
+            "p\tr\tFixation\t{n}\t1920\t1080\t{picture}\t800\t600\t{time}\t960\t540\t0.5\t0.5",
+        ),
+        {},
+    ),
     "SMI BeGaze": (
         lines(
             f"{SMI}\tEvent Start Trial Time [ms]\tEvent End Trial Time [ms]\tEvent Duration [ms]\t"
@@ -244,3 +271,12 @@ def test_columns_that_are_known_but_not_read_are_named(tmp_path):
     path.write_text(text.replace("DACS px", "DACS mm"))
     with pytest.raises(DataError, match=r"points of Tobii Pro Lab in px or norm, got .*'Fixation point X \[DACS"):
         read_fixations(path, **arguments)
+
+
+def test_a_report_that_data_viewer_saves_as_xls_is_text(tmp_path):
+    text, arguments = TABLES["EyeLink Data Viewer"]
+    path = tmp_path / "report.xls"
+    path.write_text(text.replace("b.png", "UNDEFINEDnull", 2), encoding="utf-16")
+    with pytest.warns(UserWarning, match="2 of 10 fixations are left out, as 'image' names no picture"):
+        records = read_fixations(path, **arguments)
+    assert [(record.picture, len(record)) for record in records] == [("a.png", 5), ("b.png", 3)]

@@ -286,7 +286,7 @@ def test_names_in_the_encoding_of_windows_are_read_and_said(tmp_path):
     assert {record.picture for record in read_fixations(path)} == {"a.jpg"}
 
 
-@pytest.mark.parametrize("kind", ["xlsx", "parquet", "mat", "csv.gz", "edf"])
+@pytest.mark.parametrize("kind", ["xlsx", "xls", "parquet", "mat", "csv.gz", "edf"])
 def test_files_that_are_no_text_are_refused_with_their_reader(tmp_path, kind):
     (tmp_path / f"a.{kind}").write_bytes(b"PK\3\4")
     with pytest.raises(DataError, match=rf"a table of text, such as .csv, got .{kind.rpartition('.')[2]}; \w+ "):
