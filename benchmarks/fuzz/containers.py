@@ -88,7 +88,7 @@ def _mosaic(container: str, claim: int, name: str) -> bytes:
     return mosaic(name, claim).encode()
 
 
-def _page(container: str, claim: int, name: str) -> bytes:
+def _vectors(container: str, claim: int, name: str) -> bytes:
     """Write a page of PostScript or a drawing in SVG."""
     if container == "eps":
         return b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 48\nshowpage\n"
@@ -318,7 +318,7 @@ CONTAINERS: dict[str, _Writer] = {
     "png with a text": _with_text,
     **dict.fromkeys(("png of 16 bits", "png with a palette", "png with an alpha"), _png),
     "vrt": _mosaic,
-    **dict.fromkeys(("eps", "svg"), _page),
+    **dict.fromkeys(("eps", "svg"), _vectors),
     **dict.fromkeys(("animation", "avi", "mp4"), _film),
     **dict.fromkeys(RECORDINGS, _recording),
 }
