@@ -190,7 +190,8 @@ def content_suspicions(
     if findings:
         # A shift and another size of the frame look alike where few fixations lie at the borders.
         return [max(findings, key=lambda finding: finding.fit).line]
-    return _wrong_names(evidence) or _shifts_of_some(evidence)
+    # A drift may be so large that the later fixations do not fit their pictures.
+    return _wrong_names(evidence) or _misfit(evidence) or _shifts_of_some(evidence)
 
 
 @dataclass(frozen=True)
@@ -367,6 +368,17 @@ def _wrong_names(evidence: _Evidence) -> list[str]:
             return [
                 f"fixations fit the pictures that come {abs(steps)} {side} theirs in alphabetical order: check names"
             ]
+    return []
+
+
+def _misfit(evidence: _Evidence) -> list[str]:
+    """Tell whether fixations do not fit their pictures, by a drift or for another reason."""
+    own_fits = evidence.fits(_PRESENT_READING)
+    if _is_clear(own_fits, 0.0):
+        return []
+    drift = _drift(evidence)
+    if drift is not None:
+        return [drift.line]
     return [
         f"fixations do not fit the pictures that they are named for ({own_fits.mean():.2f} bits above those of the "
         "other pictures): are these their pictures, and is the frame right?"
@@ -406,13 +418,21 @@ def _shifts_of_some(evidence: _Evidence) -> list[str]:
             for person, records in by_person.items()
         ]
     if not any(findings):
-        # A tracker drifts while a person looks at one picture after the other.
-        second_halves: list[Fixations] = []
-        for records in by_person.values():
-            second_halves += records[len(records) // 2 :]
-        label = "fixations in the second half of each person's pictures"
-        findings = [_shift_of(evidence, second_halves, label, _LEAST_SHIFT_OF_SOME)]
+        findings = [_drift(evidence)]
     return [finding.line for finding in findings if finding is not None]
+
+
+def _drift(evidence: _Evidence) -> _Finding | None:
+    """Find a shift of later fixations: a tracker drifts while a person looks at one picture after the other."""
+    by_person: dict[str, list[Fixations]] = defaultdict(list)
+    for record in evidence.records:
+        by_person[record.subject].append(record)
+    second_halves: list[Fixations] = []
+    for records in by_person.values():
+        second_halves += records[len(records) // 2 :]
+    return _shift_of(
+        evidence, second_halves, "fixations in the second half of each person's pictures", _LEAST_SHIFT_OF_SOME
+    )
 
 
 def _shift_of(evidence: _Evidence, records: Sequence[Fixations], label: str, least_shift: float) -> _Finding | None:
