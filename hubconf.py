@@ -1,4 +1,4 @@
-"""Entry points of `torch.hub`: `torch.hub.load("OWNER/semfov", "eye")`."""
+"""Entry points of `torch.hub`: `torch.hub.load("CHECKOUT", "eye", source="local")`."""
 
 from typing import Any
 
