@@ -253,6 +253,8 @@ GAZE_PREDICTION = _by_word(
         "gaze.density": "heatmap map probability saliency saliency_map",
         "gaze.density.log()": "log_density log_probability logits",
         "gaze.scanpaths(people)": "fixations sample sample_scanpaths scanpath",
+        "gaze.visits(areas)": "noticed seen_by time_to_first_fixation ttff",
+        "gaze.share(areas)": "aoi area attention dwell shares",
         "`from semfov.metrics.scanpath import nss, auc, correlation`": "auc cc evaluate nss score",
     }
 )

@@ -170,7 +170,7 @@ usage: semfov gaze [PICTURE ...] [options]
   --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
   --out FOLDER         scanpaths, and a heat map of each picture; with scanpaths comes a table of the pictures
   --report PAGE.html   a page with heat map, areas and scanpaths, in which to step through the fixations
-  --areas NAME:L,T,R,B share of all fixations in areas: left, top, right and bottom edge in pixels; or a file .json with
+  --areas NAME:L,T,R,B areas, with what they get: left, top, right and bottom edge in pixels; or a file .json with
                        {"logo": [10, 20, 200, 80]}, or with these by picture, {"before.png": {"logo": …}, …}
   --compare            two pictures side by side: both maps on one scale, and what differs (default: a page,
                        semfov-compare.html)

@@ -24,9 +24,10 @@ from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.files import check_apart, check_writable, plain_name, write_text
 from semfov.io.tables import csv_text, digits
-from semfov.paths.areas import boxes_of, percent
+from semfov.paths.areas import AreasLike, boxes_of, percent
 from semfov.paths.drafts import Drafts
 from semfov.paths.gaze import GazePrediction
+from semfov.paths.viewers import AreaVisits
 from semfov.report.drafts import drafts_section
 from semfov.report.episode import Data
 from semfov.report.gaze import gaze_page_html, gaze_part
@@ -167,13 +168,13 @@ class _GazeJob:
             panorama=options.panorama,
         )  # fmt: skip
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
-        shares = {} if self.areas is None else prediction.share(self.areas)
+        areas = {} if self.areas is None else _area_facts(prediction, self.areas, options.seconds)
         outcome: _Outcome = {
-            "text": _text(source.name, prediction, paths, shares),
+            "text": _text(source.name, prediction, paths, areas),
             "size": prediction.size,
             "viewers": [_viewer(path) for path in paths],
-            "facts": _facts(prediction, shares),
-            "part": None if self.report is None else gaze_part(prediction, paths, self.areas),
+            "facts": _facts(prediction, areas),
+            "part": None if self.report is None else gaze_part(prediction, paths, self.areas, options.seconds),
         }
         density = self._density_path(number)
         if density is not None:
@@ -282,12 +283,19 @@ def _load(options: GazeOptions) -> tuple[Detector, FixationDensity]:
     return detector, FixationDensity.for_detector(detector) if stated_model is None else stated_model
 
 
-def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], shares: Mapping[str, float]) -> str:
+def _area_facts(prediction: GazePrediction, areas: AreasLike, seconds: float) -> dict[str, tuple[float, AreaVisits]]:
+    """Compute the share of all fixations in each area, and how many viewers see it when."""
+    visits = prediction.visits(areas, seconds=seconds)
+    return {name: (share, visits[name]) for name, share in prediction.share(areas).items()}
+
+
+def _text(
+    name: str, prediction: GazePrediction, paths: Sequence[Fixations], areas: Mapping[str, tuple[float, AreaVisits]]
+) -> str:
     """Say what is known of a prediction and the viewers that are drawn from it."""
     lines = [f"{name}: {prediction.describe()}"]
-    if shares:
-        said = ", ".join(f"{area} {percent(share)}" for area, share in shares.items())
-        lines.append(f"  share of all fixations: {said}")
+    for area, (share, visits) in areas.items():
+        lines.append(f"  {area}: {percent(share)} of all fixations, {visits}")
     places = []
     for number, peak in enumerate(prediction.peaks(), 1):
         places.append(f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %")
@@ -299,7 +307,7 @@ def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], sha
     return "\n".join(lines)
 
 
-def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> dict[str, object]:
+def _facts(prediction: GazePrediction, areas: Mapping[str, tuple[float, AreaVisits]]) -> dict[str, object]:
     """List what the table of pictures says of a prediction."""
     width, height = prediction.size
     facts: dict[str, object] = {
@@ -313,8 +321,10 @@ def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> dict[str,
         facts[f"x {number}"] = place["x"]
         facts[f"y {number}"] = place["y"]
         facts[f"viewers {number}"] = place["share"]
-    for area, share in shares.items():
+    for area, (share, visits) in areas.items():
         facts[f"share of {area}"] = digits(share)
+        facts[f"viewers of {area}"] = visits.viewers
+        facts[f"seconds to {area}"] = visits.seconds
     return facts
 
 

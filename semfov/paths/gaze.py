@@ -34,15 +34,14 @@ from semfov.paths.cautions import Cautions
 from semfov.paths.places import Place, are_apart, places_of
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.viewed import ScanpathLike, fixations_of
+from semfov.paths.viewers import AreaVisits, drawn_durations, drawn_starts, visits_of
 from semfov.words import GAZE_PREDICTION, OtherWords
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MOST_FIXATIONS = 100  # of a drawn scanpath
-_SHORTEST = 60  # milliseconds of a fixation, by which the number of fixations in a time is bounded
-_VIEWERS = 100  # whose first fixations are counted
+_VIEWERS = 100  # whose first fixations, and first visits of areas, are counted
 _MOST_FIRST = 10  # first fixations that can be asked for
 _BLANK = 2  # largest difference of bytes in a picture of one colour
 _ROUND = 1.5  # least width over height of a panorama
@@ -256,7 +255,7 @@ class GazePrediction(OtherWords):
     def _viewers(self, fixations: int) -> list[Fixations]:
         """Draw viewers whose first fixations stand for those of all people; the same ones at each call."""
         generator = torch.Generator().manual_seed(0)
-        start = self._starts(_VIEWERS, generator)
+        start = drawn_starts(self.model, self.size, _VIEWERS, generator)
         paths = self.model.sample(self.terms, self.size[::-1], start, fixations, generator)
         return [Fixations(self.name, f"viewer {n}", path.double().numpy(), self.size) for n, path in enumerate(paths)]
 
@@ -280,6 +279,36 @@ class GazePrediction(OtherWords):
             agent.gaze("poster.jpg").share({"logo": (10, 20, 200, 80)})  # {'logo': 0.07}
         """
         return {name: share_in(self.density, area) for name, area in self.areas(areas).items()}
+
+    def visits(self, areas: AreasLike, *, seconds: float = 3.0) -> dict[str, AreaVisits]:
+        """Compute how many of 100 drawn viewers see each area of interest at least once, and after which time.
+
+        Args:
+            areas: as for `share`.
+            seconds: time for which each views the picture.
+
+        Returns:
+            The share of viewers and the median time to their first fixation, by the name of the area.
+
+        Raises:
+            InputError: an area has another form or reaches out of the picture, or `seconds` is out of range.
+            DataError: the file cannot be read.
+
+        Example::
+
+            agent.gaze("poster.jpg").visits({"logo": (10, 20, 200, 80)})["logo"].viewers  # 0.36
+        """
+        boxes = self.areas(areas)
+        if seconds not in self._viewing:
+            self._viewing[seconds] = self.scanpaths(_VIEWERS, seconds=seconds)
+        viewers = self._viewing[seconds]
+        pause = float(self.model.pause)
+        return {name: visits_of(viewers, area, pause) for name, area in boxes.items()}
+
+    @cached_property
+    def _viewing(self) -> dict[float, list[Fixations]]:
+        """The viewers whose visits of areas are counted, by the seconds for which they view the picture."""
+        return {}
 
     def areas(self, areas: AreasLike) -> dict[str, Area]:
         """Read areas of interest in this picture, and check that they lie in it.
@@ -312,8 +341,8 @@ class GazePrediction(OtherWords):
         check_whole(people, "people", 1, 10_000)
         check_number(seconds, "seconds", 0.1, 60.0)
         generator = torch.Generator().manual_seed(seed)
-        start = self._starts(people, generator)
-        durations, lengths = self._drawn_durations(people, seconds, generator)
+        start = drawn_starts(self.model, self.size, people, generator)
+        durations, lengths = drawn_durations(self.model, people, seconds, generator)
         paths = self.model.sample(self.terms, self.size[::-1], start, int(lengths.max()), generator)
         viewers = []
         for number, (path, length, times) in enumerate(zip(paths, lengths.tolist(), durations, strict=True), 1):
@@ -323,37 +352,6 @@ class GazePrediction(OtherWords):
             spent = times[:length].double().round().numpy()
             viewers.append(Fixations(self.name, f"viewer {number}", points, self.size, spent))
         return viewers
-
-    def _starts(self, people: int, generator: torch.Generator) -> Tensor:
-        """Draw the first fixation of each viewer, `(people, 2)`, within two standard deviations and the picture."""
-        side = torch.tensor(self.size)  # (2,)
-        drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
-        mean, spread = self.model.start.cpu().float()  # (2,) both, shares of the sides
-        start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
-        return torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
-
-    def _drawn_durations(self, people: int, seconds: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw durations of fixations in milliseconds, and count those that begin in the time.
-
-        Durations are log-normal; the last distribution of the model stands for all later fixations, too.
-
-        Args:
-            people: number of viewers.
-            seconds: time for which each views the picture.
-            generator: of the draws.
-
-        Returns:
-            `(people, n)`, and the number of each viewer's fixations, `(people,)`.
-        """
-        milliseconds = seconds * 1000
-        count = min(_MOST_FIXATIONS, math.ceil(milliseconds / _SHORTEST) + 1)
-        distributions = self.model.duration.cpu().float()  # (fixations, 2), mean and spread of the logarithm
-        later = distributions[-1:].expand(max(count - len(distributions), 0), -1)
-        mean, spread = torch.cat([distributions, later])[:count].unbind(1)  # (count,) both
-        durations = (mean + spread * torch.randn(people, count, generator=generator)).exp()  # (people, count)
-        ends = (durations + self.model.pause.cpu().float()).cumsum(1)
-        ended_in_time = (ends < milliseconds).sum(1)  # (people,)
-        return durations, (ended_in_time + 1).clamp(max=count)  # the last one begins in the time and ends after it
 
     @property
     def name(self) -> str:

@@ -13,6 +13,7 @@ from semfov.data.classes import counted
 from semfov.data.fixations import Fixations
 from semfov.paths.areas import AreasLike, border_of, percent, shares_around
 from semfov.paths.gaze import GazePrediction
+from semfov.paths.viewers import AreaVisits
 from semfov.report.episode import Data, jpeg_uri
 from semfov.report.overview import OverviewColumn, OverviewRow, overview_section, small_picture
 from semfov.report.template import colour_steps, filled
@@ -25,13 +26,19 @@ _MOST_STEPS = 12  # largest number of fixations of the slider
 _RADII = (0.09, 0.06, 0.04)  # of the first fixations over a small picture, in shares of its longer side
 
 
-def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas: AreasLike | None = None) -> Data:
+def gaze_part(
+    prediction: GazePrediction,
+    scanpaths: Sequence[Fixations],
+    areas: AreasLike | None = None,
+    seconds: float = 3.0,
+) -> Data:
     """Collect what the page has of a prediction, as JSON values.
 
     Args:
         prediction: the prediction.
         scanpaths: drawn scanpaths of viewers.
         areas: areas of interest, as for `GazePrediction.share`.
+        seconds: time for which each viewer views the picture, for `GazePrediction.visits`.
 
     Returns:
         `picture`, for the script: its result in words, shares of the fixations as bytes, borders and scanpaths;
@@ -57,7 +64,7 @@ def gaze_part(prediction: GazePrediction, scanpaths: Sequence[Fixations], areas:
     }
     return {
         "picture": picture,
-        "facts": _facts(prediction, shares),
+        "facts": _facts(prediction, shares, {} if areas is None else prediction.visits(areas, seconds=seconds)),
         "shares": {name: percent(share) for name, share in shares.items()},
         "caution": prediction.caution,
     }
@@ -180,7 +187,7 @@ def _lead(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
     return said if prediction.caution is None else f"{said} Caution: {prediction.caution}."
 
 
-def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
+def _facts(prediction: GazePrediction, shares: Mapping[str, float], visits: Mapping[str, AreaVisits]) -> str:
     """Tell what is known of a picture without the script: first fixations, areas, places, and details in bits."""
     first = _place_rows(prediction.first_fixations())
     places = _place_rows(prediction.peaks())
@@ -189,8 +196,11 @@ def _facts(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
         _table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations"), places),
     ]
     if shares:
-        areas = [(name, percent(share)) for name, share in shares.items()]
-        tables.insert(0, _table("Share of all fixations in each area", ("Area", "Fixations"), areas))
+        rows = [
+            (name, percent(share), percent(visits[name].viewers), visits[name].when) for name, share in shares.items()
+        ]
+        head = ("Area", "Of all fixations", "Seen by viewers", "First seen")
+        tables.insert(0, _table("What the areas get; half of those who see one see it by this time", head, rows))
     return f'<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
 
 

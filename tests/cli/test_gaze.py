@@ -196,9 +196,14 @@ def test_areas_are_told_drawn_and_in_the_table(run, photos, tmp_path):
     density = np.load(tmp_path / "density.npy")
     assert float(rows[0]["share of top"]) == pytest.approx(float(density[:45, :80].sum()), abs=1e-4)
     assert float(rows[0]["share of left"]) == pytest.approx(float(density[:, :40].sum()), abs=1e-4)
-    share = f"left {100 * float(rows[0]['share of left']):.0f} %"
-    assert share in out
-    assert share in page.read_text(encoding="utf-8")
+    percent = f"{100 * float(rows[0]['share of left']):.0f} %"
+    share = f"left: {percent} of all fixations, seen by "
+    assert out.count(share) == 1
+    assert f"left {percent}" in page.read_text(encoding="utf-8")
+    seen = f"{100 * float(rows[0]['viewers of left']):.0f} %"
+    assert f"{share}{seen} of viewers, first " in out
+    assert f"<td>left</td><td>{percent}</td><td>{seen}</td>" in page.read_text(encoding="utf-8")
+    assert 0 <= float(rows[0]["seconds to left"]) < 3
     (tmp_path / "areas.json").write_text('{"top": [0, 0, 80, 45], "left": [0, 0, 40, 90]}')
     assert run(photos, "--areas", tmp_path / "areas.json", "--people", 2)[1].count(share) == 1
     assert run(photos, "--areas", " ".join(areas), "--people", 2)[1].count(share) == 1

@@ -107,6 +107,31 @@ def test_shares_of_areas_are_sums_of_the_density(gaze):
     refused(r"areas\['logo'\]", gaze.share, {"logo": (0, 0, 105, 10)})
 
 
+def test_visits_of_areas_are_those_of_drawn_viewers(gaze):
+    """Counted one viewer and one fixation after another, with the pause of 50 ms of this model."""
+    areas = {"left": (0, 0, 52, 78), "corner": (3, 4, 40, 39), "sliver": (103, 77, 104, 78)}
+    visits = gaze.visits(areas, seconds=2.0)
+    viewers = gaze.scanpaths(100, seconds=2.0)
+    for name, (left, top, right, bottom) in areas.items():
+        times = []
+        for viewer in viewers:
+            now = 0.0
+            for (x, y), duration in zip(viewer.points, viewer.durations, strict=True):
+                if left <= x + 0.5 < right and top <= y + 0.5 < bottom:
+                    times.append(now / 1000)
+                    break
+                now += duration + 50
+        assert visits[name].viewers == len(times) / 100
+        if times:
+            assert visits[name].seconds == pytest.approx(np.median(times), rel=1e-3)
+    assert visits["left"].viewers > visits["corner"].viewers > 0
+    assert visits["sliver"] == (0, None)
+    assert str(visits["sliver"]) == "seen by no viewer"
+    with pytest.raises(AttributeError, match=r"use gaze\.visits\(areas\)"):
+        _ = gaze.ttff
+    refused("seconds", gaze.visits, areas, seconds=0)
+
+
 def test_a_picture_unlike_those_of_the_fit_has_a_caution():
     torch.manual_seed(0)
     detector = Shown("colours", ("none",), (80, 60), stride=4).eval()

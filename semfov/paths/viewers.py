@@ -1,0 +1,120 @@
+"""Viewers that are drawn from a prediction of gaze: where they begin, how long they look, and what they see when."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from semfov.data.fixations import Fixations
+from semfov.gaze.saliency.fixation_density import FixationDensity
+from semfov.io.tables import digits
+from semfov.paths.areas import Area, percent
+
+_MOST_FIXATIONS = 100  # of a drawn scanpath
+_AT_ONCE = 0.05  # seconds, below which a time rounds to nothing
+_SHORTEST = 60  # milliseconds of a fixation, by which the number of fixations in a time is bounded
+
+
+class AreaVisits(NamedTuple):
+    """How many viewers see an area, and when.
+
+    Attributes:
+        viewers: share of the viewers with at least one fixation in the area.
+        seconds: median of the time at which their first fixation in it begins (time to first fixation); None where
+            nobody sees it. The eyes are in the middle when the picture appears, so an area there is seen at 0.
+
+    >>> str(AreaVisits(0.36, 0.84))
+    'seen by 36 % of viewers, first after 0.8 s'
+    >>> str(AreaVisits(1.0, 0.0))
+    'seen by 100 % of viewers, first at once'
+    """
+
+    viewers: float
+    seconds: float | None
+
+    def __str__(self) -> str:
+        """Say both in a few words."""
+        if self.seconds is None:
+            return "seen by no viewer"
+        return f"seen by {percent(self.viewers)} of viewers, first {self.when}"
+
+    @property
+    def when(self) -> str:
+        """The time in words; empty where nobody sees the area."""
+        if self.seconds is None:
+            return ""
+        return "at once" if self.seconds < _AT_ONCE else f"after {self.seconds:.1f} s"
+
+
+def visits_of(viewers: Sequence[Fixations], area: Area, pause: float) -> AreaVisits:
+    """Count the viewers with a fixation in an area, and take the median time of their first one.
+
+    Args:
+        viewers: their fixations, with durations.
+        area: left, top, right and bottom edge, in pixels.
+        pause: milliseconds between two fixations.
+
+    Returns:
+        The share of viewers, and the time.
+    """
+    left, top, right, bottom = area
+    first: list[float] = []
+    for viewer in viewers:
+        x, y = viewer.points.T + 0.5  # centres of pixels are at integers, edges at halves
+        is_inside = (left <= x) & (x < right) & (top <= y) & (y < bottom)  # (n,)
+        if is_inside.any():
+            number = int(is_inside.argmax())
+            durations = np.asarray(viewer.durations)[:number]
+            first.append(float((durations + pause).sum()) / 1000)
+    return AreaVisits(len(first) / len(viewers), digits(float(np.median(first))) if first else None)
+
+
+def drawn_starts(model: FixationDensity, size: tuple[int, int], people: int, generator: torch.Generator) -> Tensor:
+    """Draw the first fixation of each viewer, within two standard deviations and the picture.
+
+    Args:
+        model: has the distribution.
+        size: `(width, height)` of the picture in pixels.
+        people: number of viewers.
+        generator: of the draws.
+
+    Returns:
+        `(people, 2)`, in pixels.
+    """
+    side = torch.tensor(size)  # (2,)
+    drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
+    mean, spread = model.start.cpu().float()  # (2,) both, shares of the sides
+    start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
+    return torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
+
+
+def drawn_durations(
+    model: FixationDensity, people: int, seconds: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Draw durations of fixations in milliseconds, and count those that begin in the time.
+
+    Durations are log-normal; the last distribution of the model stands for all later fixations, too.
+
+    Args:
+        model: has the distributions, and the pause between two fixations.
+        people: number of viewers.
+        seconds: time for which each views the picture.
+        generator: of the draws.
+
+    Returns:
+        `(people, n)`, and the number of each viewer's fixations, `(people,)`.
+    """
+    milliseconds = seconds * 1000
+    count = min(_MOST_FIXATIONS, math.ceil(milliseconds / _SHORTEST) + 1)
+    distributions = model.duration.cpu().float()  # (fixations, 2), mean and spread of the logarithm
+    later = distributions[-1:].expand(max(count - len(distributions), 0), -1)
+    mean, spread = torch.cat([distributions, later])[:count].unbind(1)  # (count,) both
+    durations = (mean + spread * torch.randn(people, count, generator=generator)).exp()  # (people, count)
+    ends = (durations + model.pause.cpu().float()).cumsum(1)
+    ended_in_time = (ends < milliseconds).sum(1)  # (people,)
+    return durations, (ended_in_time + 1).clamp(max=count)  # the last one begins in the time and ends after it
