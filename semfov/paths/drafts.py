@@ -112,7 +112,7 @@ class Drafts:
         return first, second
 
     def describe(self, areas: AreasLike | None = None) -> str:
-        """Describe what differs, in a line for each area.
+        """Describe what differs, in a line for each area, and say so if all areas are at the same place in both drafts.
 
         Args:
             areas: as for `shares`.
@@ -122,10 +122,27 @@ class Drafts:
         """
         first, second = self.names
         lines = [f"{first} and {second}: {self._moved()}"]
-        shares_of = {} if areas is None else self.shares(areas)
-        for name, shares in shares_of.items():
+        if areas is None:
+            return lines[0]
+        for name, shares in self.shares(areas).items():
             lines.append(f"  {name}: {percent(shares.first)} and {percent(shares.second)} of all fixations")
-        return "\n".join(lines)
+        place = self.same_place(areas)
+        return "\n".join(lines if place is None else [*lines, f"  {place}"])
+
+    def same_place(self, areas: AreasLike) -> str | None:
+        """Say that all areas are at the same place in both drafts; None if they are not.
+
+        Args:
+            areas: as for `shares`.
+
+        Returns:
+            A sentence or None.
+        """
+        in_first, in_second = self.areas(areas)
+        if in_first != in_second:
+            return None
+        first, second = self.names
+        return f"Areas are at the same place in both drafts. What moves needs boxes for {first} and for {second}."
 
     def _moved(self) -> str:
         """Say how many fixations move."""

@@ -32,7 +32,8 @@ def drafts_section(drafts: Drafts, areas: AreasLike | None = None) -> str:
         panels.append(figure_html(caption, plot_difference(drafts, title=False)))
     return (
         f'<section aria-labelledby="drafts-title"><h2 id="drafts-title">{escape(_headline(drafts))}</h2>'
-        f'{_table(drafts, areas)}<p class="hint">In both pictures, {BORDERS}. 1 to 3 are the first fixations.</p>'
+        f"{_table(drafts, areas)}{_same_place(drafts, areas)}"
+        f'<p class="hint">In both pictures, {BORDERS}. 1 to 3 are the first fixations.</p>'
         f'<div class="pictures">{"".join(panels)}</div></section>'
     )
 
@@ -42,6 +43,12 @@ def _headline(drafts: Drafts) -> str:
     if drafts.moved is None:
         return "The two drafts"
     return f"{percent(drafts.moved)} of the fixations move between the drafts"
+
+
+def _same_place(drafts: Drafts, areas: AreasLike | None) -> str:
+    """Say in a line that the areas are at the same place in both drafts, if they are."""
+    place = None if areas is None else drafts.same_place(areas)
+    return "" if place is None else f'<p class="hint">{escape(place)}</p>'
 
 
 def _table(drafts: Drafts, areas: AreasLike | None) -> str:

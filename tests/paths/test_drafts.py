@@ -46,7 +46,8 @@ def test_shares_of_areas_are_those_of_each_draft(drafts):
     words = drafts.describe({"right": RIGHT})
     assert words == (
         "before.png and after.png: 35 % of the fixations are elsewhere in the second\n"
-        f"  right: {100 * shares.first:.0f} % and {100 * shares.second:.0f} % of all fixations"
+        f"  right: {100 * shares.first:.0f} % and {100 * shares.second:.0f} % of all fixations\n"
+        "  Areas are at the same place in both drafts. What moves needs boxes for before.png and for after.png."
     )
     assert drafts.describe().count("\n") == 0
 
@@ -55,6 +56,9 @@ def test_an_area_that_moves_has_its_box_in_each_draft(drafts):
     moved = drafts.shares({"before.png": {"button": LEFT}, "after.png": {"button": RIGHT}})["button"]
     assert moved.first == drafts.first.share({"button": LEFT})["button"]
     assert moved.second == drafts.second.share({"button": RIGHT})["button"]
+    moving = {"before.png": {"button": LEFT}, "after.png": {"button": RIGHT}}
+    assert "same place" not in drafts.describe(moving) + drafts_section(drafts, moving)
+    assert "same place" in drafts_section(drafts, {"button": LEFT})
     twins = Drafts(draft("a/x.png", 0.4), draft("b/x.png", 0.5))
     assert [*twins.shares({"a/x.png": {"button": LEFT}, "b/x.png": {"button": RIGHT}})] == ["button"]
     other = {"before.png": {"button": LEFT}, "after.png": {"logo": RIGHT}}
