@@ -16,28 +16,37 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
 
 OPTIONS = _by_word(
     {
-        "score_threshold confirm threshold": "conf conf_thres confidence min_score score threshold",
-        "iou per_class": "iou iou_thres iou_threshold nms nms_threshold",
-        "limit": "max_det max_detections topk",
-        "input_size": "image_size img_size imgsz",
+        "score_threshold confirm threshold": (
+            "conf conf_thres conf_threshold confidence min_conf min_score score threshold"
+        ),
+        "iou per_class": "iou iou_thres iou_threshold nms nms_iou nms_threshold",
+        "limit": "max_det max_detections max_objects topk",
+        "input_size": "image_size img_size imgsz resolution",
         "min_gain": "expected_gain gain min_improvement tol tolerance",
         "stop_below": "stop stop_threshold stopping_threshold",
-        "target": "class class_name classes cls label labels name query targets",
+        "target": "class class_name classes cls filter label labels name only query targets",
         "picture": "file image img path photo source",
         "grid": "cells columns rows",
         "detector name": "model yolo",
         "model": "models",
         "device": "gpu cuda",
         "half": "fp16 float16",
-        "out": "csv figure format heatmap json output pdf plot png project save show svg",
+        "out": (
+            "csv excel export figure format geojson heatmap json output output_dir overlay pdf plot png project save "
+            "save_img show svg visualise visualize"
+        ),
         "report": "html page",
         "crops": "crop save_crop save_crops",
         "labels": "label_dir save_txt txt yolo_labels",
         "passes": "budget iterations looks max_passes max_steps n_looks steps",
+        "areas": "aoi aois box boxes region regions roi rois",
+        "compare": "ab ab_test before_after diff difference",
+        "camera": "webcam",
+        "rate": "fps",
         "people": "n n_scanpaths num_observers observers subjects viewers",
         "shifts passes": "fixations max_fixations max_shifts n_fixations saccades",
         "seconds": "duration max_seconds time time_budget time_limit timeout",
-        "workers": "jobs num_workers processes threads",
+        "workers": "jobs num_workers parallel processes threads",
         "on_look": "callback on_step",
         "looks quiet": "verbose",
         "quiet": "silent",
@@ -65,11 +74,11 @@ def note_of_former(former: str, present: str) -> str:
 
 COMMANDS = _by_word(
     {
-        "find": "annotate count detect infer label predict segment",
-        "gaze": "attention eye-tracking heatmap saliency scanpath",
+        "find": "analyse analyze annotate batch count detect infer label predict run segment",
+        "gaze": "aoi attention eye-tracking fixations heat-map heatmap saliency scanpath scanpaths",
         "live": "camera stream track video watch webcam",
         "fit": "calibrate finetune learn train",
-        "compare": "bench benchmark sahi slice val validate",
+        "compare": "bench benchmark eval evaluate sahi slice tile val validate",
         "detectors": "list model models weights",
         "explore": "map scan",
         "app": "gradio gui serve ui web",
@@ -168,13 +177,22 @@ PACKAGE = _by_word(
 AGENT = _by_word(
     {
         "search, find_all, explore, gaze and live, or semfov.run for many pictures": (
-            "detect find find_objects infer locate predict run track"
+            "analyse analyze batch detect detect_all find find_everything find_objects infer locate look predict run "
+            "track"
         ),
-        "len(agent.find_all(picture, target).objects), and record.expected with what was not seen": "count count_all",
+        "len(agent.find_all(picture, target).objects), and record.expected with what was not seen": (
+            "count count_all count_objects"
+        ),
         "the target of search or find_all: a class, or several": "set_classes set_target",
-        "agent.gaze(picture)": "heatmap predict_gaze predict_saliency saliency saliency_map",
+        "agent.gaze(picture)": (
+            "attention fixations heat_map heatmap predict_gaze predict_saliency saliency saliency_map scanpath "
+            "scanpaths where_people_look"
+        ),
+        "agent.gaze(picture), which has share(areas) and visits(areas)": "aoi aois areas regions roi rois",
+        "semfov.ActivePerception.from_pretrained(folder)": "load",
+        "semfov.fit_detector(model, photographs, annotations)": "finetune fit",
         "agent.live(target), whose step takes frames": "stream update video watch webcam",
-        "agent.classes[1:]": "class_names names",
+        "agent.classes[1:]": "class_names labels names",
         "agent.eye.detector": "detector model",
         "semfov.fit_detector, which writes a folder of models, and semfov.ActivePerception.from_pretrained(folder)": (
             "export save save_model save_pretrained"
@@ -221,9 +239,11 @@ RECORD = _by_word(
         "its objects, such as record.objects.boxes": "boxes labels scores xyxy",
         "record.decision.box, or its objects, record.objects.boxes": "box",
         "record.decision.probability": "confidence prob probability score",
-        "record.decision.outcome": "outcome result",
-        "len(record.objects), or record.expected with what was not seen": "count counts number",
-        "record.to_frame()": "dataframe df to_dataframe to_df to_pandas",
+        "record.decision.outcome": "answer outcome result",
+        "len(record.objects), or record.expected with what was not seen": "count counts n num_objects number total",
+        "record.to_frame()": "dataframe df to_dataframe to_df to_excel to_pandas",
+        "record.why_it_ended()": "reason stop_reason stopped why",
+        "record.looks": "history n_looks num_looks steps windows",
         "record.plot()": "draw show visualize",
         "record.classes": "names",
         "record.objects, or the detections of a look, record[0].detections": (
@@ -239,22 +259,27 @@ RECORD = _by_word(
         "record.object_rows()": "objects_table to_json_list tolist",
         "record.save(path), record.to_csv(path), record.to_json(path) or record.report(path)": "export write",
         "semfov.run(picture, target, crops=FOLDER)": "crop save_crop save_crops",
-        "record.rows(), which has the seconds of each look": "speed times timing",
+        "record.rows(), which has the seconds of each look": "duration elapsed seconds speed time times timing",
         "record.objects.track_ids, of a stream": "id ids track_id tracker_id",
-        "[look.fixation for look in record]": "fixations gaze path saccades scanpath",
-        "record.belief_map(-1), of looks by a fovea or a head": "belief heatmap map posterior probabilities",
+        "[look.fixation for look in record]": "fixations gaze path saccades scanpath sequence",
+        "record.belief_map(-1), of looks by a fovea or a head": "belief heat_map heatmap map posterior probabilities",
     }
 )
 
 GAZE_PREDICTION = _by_word(
     {
-        "gaze.plot()": "draw show visualize",
-        "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)": "save to_png",
-        "gaze.density": "heatmap map probability saliency saliency_map",
+        "gaze.plot()": "draw overlay show visualize",
+        "gaze.plot().savefig(path)": "save_plot savefig",
+        "gaze.first_fixations()": "first first_fixation order sequence top",
+        "gaze.peaks()": "hotspots peak places",
+        "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)": (
+            "export save to_frame to_json to_pandas to_png"
+        ),
+        "gaze.density": "fixation_map heat_map heatmap map probability saliency saliency_map",
         "gaze.density.log()": "log_density log_probability logits",
         "gaze.scanpaths(people)": "fixations sample sample_scanpaths scanpath",
-        "gaze.visits(areas)": "noticed seen_by time_to_first_fixation ttff",
-        "gaze.share(areas)": "aoi area attention dwell shares",
+        "gaze.visits(areas)": "noticed seen_by time_to_first_fixation ttff viewers",
+        "gaze.share(areas)": "aoi aois area attention dwell dwell_time region regions roi rois shares",
         "`from semfov.metrics.scanpath import nss, auc, correlation`": "auc cc evaluate nss score",
     }
 )

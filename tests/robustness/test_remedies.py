@@ -95,6 +95,22 @@ def test_what_a_remedy_names_is_there(remedy, things):
     assert {*re.findall(r"`semfov (\w+)", remedy)} <= {*SUBCOMMANDS}
 
 
+@pytest.mark.parametrize(
+    ("thing", "word", "remedy"),
+    [
+        ("agent", "heat_map", "agent.gaze(picture)"),
+        ("agent", "analyze", "search, find_all, explore"),
+        ("record", "stop_reason", "record.why_it_ended()"),
+        ("record", "num_looks", "record.looks"),
+        ("gaze", "hotspots", "gaze.peaks()"),
+        ("gaze", "aois", "gaze.share(areas)"),
+    ],
+)
+def test_words_of_others_are_answered_with_ours(thing, word, remedy, things):
+    with pytest.raises(AttributeError, match=re.escape(remedy)):
+        getattr(things[thing], word)
+
+
 def test_remedies_are_read():
     """So that the test above cannot pass because nothing is found in them."""
     roots = ("semfov", "agent", "record", "objects", "decision", "look", "live", "gaze")
