@@ -8,7 +8,7 @@ from semfov.agent import ActivePerception
 from semfov.belief import Verification
 from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import DetectorsOptions
-from semfov.cli.outcome import table_lines
+from semfov.cli.outcome import padded, table_lines, terminal_columns
 from semfov.cli.trial import try_detector
 from semfov.detection.load import check_detector, load_detector
 from semfov.detection.weights import WEIGHTS, weights_path
@@ -62,13 +62,13 @@ def _classes_of(name: str, options: DetectorsOptions) -> Sequence[str]:
 
 def _in_columns(names: Sequence[str]) -> list[str]:
     """Write names in columns, in order down each of them, in lines of at most `_WIDTH` characters."""
-    width = max(map(len, names)) + 2  # with two blanks between columns
+    width = max(map(terminal_columns, names)) + 2  # with two blanks between columns
     columns = max(1, _WIDTH // width)
     rows = -(-len(names) // columns)  # rounded up
     lines = []
     for row in range(rows):
-        padded = [name.ljust(width) for name in names[row::rows]]
-        lines.append("".join(padded).rstrip())
+        cells = [padded(name, width) for name in names[row::rows]]
+        lines.append("".join(cells).rstrip())
     return lines
 
 

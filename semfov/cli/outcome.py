@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -162,12 +163,30 @@ def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     Returns:
         The lines.
     """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    widths = [max(map(terminal_columns, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
-        cells = [text.ljust(width) for text, width in zip(row, widths, strict=True)]
+        cells = [padded(text, width) for text, width in zip(row, widths, strict=True)]
         lines.append("  ".join(cells).rstrip())
     return lines
+
+
+def padded(text: str, width: int) -> str:
+    """Fill a text with blanks to a number of columns of a terminal."""
+    return text + " " * (width - terminal_columns(text))
+
+
+def terminal_columns(text: str) -> int:
+    """Count the columns of a terminal that a text takes: two for a wide letter, none for a combining one.
+
+    >>> terminal_columns("dog"), terminal_columns("\N{CJK UNIFIED IDEOGRAPH-72AC}"), terminal_columns("e\u0301")
+    (3, 2, 1)
+    """
+    columns = 0
+    for letter in text:
+        if not unicodedata.combining(letter):
+            columns += 2 if unicodedata.east_asian_width(letter) in "WF" else 1
+    return columns
 
 
 @dataclass(frozen=True)

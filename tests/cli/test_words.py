@@ -275,6 +275,8 @@ def test_texts_of_options_are_read(tmp_path):
     assert shown == {"white": (300.0, 3000.0), "bands": (4, 3, 2)}
     assert [kind_of(Path(name)) for name in ("a.json", "a.coco.json", "runs/one")] == [".json", ".coco.json", None]
     assert table_lines([["name", "size"], ["a", "12"]]) == ["name  size", "a     12"]
+    wide = "\N{CJK UNIFIED IDEOGRAPH-72AC}" * 3  # two columns of a terminal each
+    assert table_lines([[wide, "1"], ["cafe\u0301", "2"]]) == [f"{wide}  1", "cafe\u0301    2"]
     assert [search._worth_starting(2, tasks, 0.5, 4.0) for tasks in (7, 99)] == [1, 2]
 
 
