@@ -16,6 +16,7 @@ from semfov.cli.results import (
     unfinished,
 )
 from semfov.cli.totals import found_in_all
+from semfov.data.classes import amount
 from semfov.errors import SemfovError
 from semfov.io.files import check_apart, plain_name, write_bytes
 from semfov.paths.conversion import Values
@@ -157,7 +158,11 @@ class PictureFiles:
         written += self._written
         if options.report is not None and self._episodes:
             episodes = [self._episodes[number] for number in sorted(self._episodes)]
-            total = found_in_all(self.job, self.rows.values())
+            totals = [found_in_all(self.job, self.rows.values())]
+            skipped = sum("error" in row for row in self.rows.values())
+            if skipped:
+                totals.append(f"{amount(skipped, 'picture')} skipped")
+            total = "; ".join(filter(None, totals))
             written.append(write_page(options.report, f"semfov: {self.job.title}", episodes, total=total))
         written += [folder for folder in (options.crops, options.labels) if folder is not None]
         part = None if complete else f"{len(self.rows)} of {len(self.job.sources)}"

@@ -422,7 +422,7 @@ def test_any_fault_of_one_picture_is_a_skip_with_its_reason(run, photo, tmp_path
     total = re.search(r"7 pictures: 4 looked at; (\d+ \w+ found); 3 skipped", printed.out)
     assert total
     overview = page.read_text(encoding="utf-8").partition('id="overview"')[2].partition("</section>")[0]
-    assert f"<p>In all: {total[1]}.</p>" in overview
+    assert f"<p>In all: {total[1]}; 3 pictures skipped.</p>" in overview
     for said in (
         r"e\.png: \S+e\.png: cannot be looked at \(ZeroDivisionError: an unknown",
         r"f\.png: .*no such file",
