@@ -199,8 +199,8 @@ def _facts(prediction: GazePrediction, shares: Mapping[str, float], visits: Mapp
         rows = [
             (name, percent(share), percent(visits[name].viewers), visits[name].when) for name, share in shares.items()
         ]
-        head = ("Area", "Of all fixations", "Seen by viewers", "First seen")
-        tables.insert(0, _table("What the areas get; half of those who see one see it by this time", head, rows))
+        head = ("Area", "Fixations", "Viewers", "First seen")
+        tables.insert(0, _table("Fixations in each area, viewers who see it, and when half of them have", head, rows))
     return f'<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
 
 
