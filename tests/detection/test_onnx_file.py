@@ -137,6 +137,21 @@ def test_nanodet_plus_is_recognised_by_content_and_takes_other_sizes(shared, tmp
     torch.testing.assert_close(detector(picture).scores, named(picture).scores)
 
 
+def test_the_head_of_a_published_network_is_known_without_a_pass(tmp_path, monkeypatch):
+    """It is the one that is found out for the same network in another file."""
+    passes = []
+    run = OnnxSession.__call__
+    monkeypatch.setattr(OnnxSession, "__call__", lambda self, image: passes.append(image) or run(self, image))
+    published = load_detector("yolox-nano")
+    assert not passes
+    graph = onnx.load(published.session.path)
+    graph.producer_name = "another"
+    onnx.save(graph, tmp_path / "copy.onnx")
+    copied = load_detector(tmp_path / "copy.onnx", classes=published.classes)
+    assert len(passes) == 1
+    assert copied.head == published.head == "yolox"
+
+
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("name", "file"), [("nanodet-plus-m-1.5x", "nanodet_plus_m_1.5x_416.onnx"), ("yolox-nano", "yolox_nano_416.onnx")]
