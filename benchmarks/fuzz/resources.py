@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import warnings
 from collections.abc import Callable
 from functools import cache
 from itertools import islice
@@ -104,10 +105,11 @@ def _tools(path: Path) -> None:
 
 
 def _run(*words: str) -> None:
-    """Run the command; raises `DataError` with its last line where it fails."""
+    """Run the command; raises `DataError` with its last line where it fails. Its warnings may name the sidecar."""
     told = io.StringIO()
     try:
-        with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+        with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             main([*words])
     except SystemExit as end:
         text = told.getvalue()
