@@ -12,6 +12,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.detection.detector import Detector
 from semfov.detection.placement import resize
+from semfov.errors import lookup
 from semfov.gaze.saliency import VOCUS2, FixationDensity, IttiKoch, cell_saliency
 from semfov.gaze.saliency.cells import Reduction
 from semfov.io.code import modules_digest
@@ -73,9 +74,21 @@ class SaliencyStore(SceneStore):
 
 
 def saliency_map(name: str, detector: Detector) -> _SaliencyMap:
-    """Return what gives the saliency of pictures `(B, 3, H, W)` → `(B, H, W)`."""
+    """Return what gives the saliency of pictures `(B, 3, H, W)` → `(B, H, W)`.
+
+    Args:
+        name: a model of `SALIENCY_CLASSES`, or `people` for the density of fixations.
+        detector: its features give the density.
+
+    Returns:
+        The map of pictures.
+
+    Raises:
+        InputError: the name is unknown.
+    """
     if name in SALIENCY_CLASSES:
         return SALIENCY_CLASSES[name]()
+    lookup(name, [*SALIENCY_CLASSES, "people"], "saliency model")
     density = FixationDensity.for_detector(detector).requires_grad_(False)
     return lambda image: density(detector.features(image, [*density.layers])).exp()
 

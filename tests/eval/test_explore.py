@@ -15,6 +15,7 @@ from semfov import Grid, observers
 from semfov.gaze.saliency import VOCUS2, FixationDensity
 from semfov.io.code import _closure
 from semfov.runs.config import DetectorConfig
+from tests.refusals import refused
 from tests.small import run_settings
 
 
@@ -124,6 +125,15 @@ def test_saliency_is_computed_from_the_foveated_image(finished):
     density = FixationDensity.for_detector(detector)
     log = density(detector.features(image[None], [*density.layers]))
     torch.testing.assert_close(people, log.exp().unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1))
+
+
+def test_a_model_of_saliency_without_a_class_is_refused(finished):
+    refused(
+        "unknown saliency model 'vocus'; did you mean 'vocus2'",
+        saliency_map,
+        "vocus",
+        ExploreRun(finished).eye.detector,
+    )
 
 
 def test_stored_saliency_depends_neither_on_the_detector_nor_on_the_code_of_beliefs_and_policies(finished, tmp_path):
