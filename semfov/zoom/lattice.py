@@ -77,8 +77,7 @@ class Lattice:
         columns = lattice.columns
         rows = lattice.rows
         expected = f"at most {MOST_CELLS:,} cells of a belief, {MOST_IN_LINE:,} along a side"
-        remedy = f"divide the picture, or look less closely, finest={finest / 2:g}"
-        got = f"{columns:,} × {rows:,} in {width} × {height} px; {remedy}"
+        got = f"{columns:,} × {rows:,} in {width} × {height} px; divide the picture, or reduce it"
         check(columns * rows <= MOST_CELLS and max(columns, rows) <= MOST_IN_LINE, "picture", expected, got)
         return lattice
 
