@@ -2,7 +2,8 @@
 
 A rule is a function here, which `_rule` registers under its name. `semfov.belief.observers.Semantic` takes it by that
 name, and studies by `BeliefConfig.fusion` (`semfov.runs.config`), whose type lists the names. `SemanticSearch` and
-`SemanticMap` always fuse by Kaplan's rule.
+`SemanticMap` always fuse by Kaplan's rule. Policies that simulate looks (`semfov.gaze.acquisition.lookahead`, and
+`PredictedTargetPosterior`) do so by Kaplan's rule, too, whatever rule fuses the looks that are made.
 """
 
 import math

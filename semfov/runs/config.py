@@ -165,7 +165,7 @@ class BeliefConfig(Settings):
         rows: number of rows of the grid.
         prior: Dirichlet parameter of every class before the first look.
         fusion: rule that updates the belief with a detection: `kaplan` (published), `product`, `sum`, or `semba`, the
-            form in the code of SemBA.
+            form in the code of SemBA. Looks that a policy simulates are fused by Kaplan's rule, whatever is given here.
         footprint: which cells a detection updates: `overlap` (published), `centre`, `box_centre` or `soft`.
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
