@@ -82,7 +82,8 @@ def compare_scanpath(scanpath: Record | Fixations, people: _People) -> ScanpathC
     - `NSS` (`nss`) and `AUC` (`auc`): of the fixations in the density of all fixations of the others, blurred by a
       Gaussian of 3 % of the longer side. A person is compared with the density of the other people.
 
-    Fixations outside the picture are left out of the sequences and densities.
+    Fixations outside the picture are left out of the sequences and densities. Durations count in none of these
+    measures; `multimatch` and `scanmatch` take them.
 
     Args:
         scanpath: a record of an agent, or fixations.
