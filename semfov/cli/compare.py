@@ -108,7 +108,7 @@ def _look(source: PictureSource, eye: WindowEye, ways: dict[str, Way], scores: S
     """Look at a picture in all ways; what fails at one picture of several is raised as an error of that picture."""
     try:
         picture = open_large(source.picture())
-        image = scores.image_of(source.name, picture.size)
+        image = scores.image_of(source.name, picture.size, source.file)
         warm_up(eye, picture)
         scores.add(image, picture.size, {name: way(picture) for name, way in ways.items()})
     except Exception as error:

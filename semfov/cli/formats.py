@@ -251,7 +251,7 @@ class Coco(ResultsFormat):
 class CocoResults(ResultsFormat):
     """Format of a list of COCO results with the ids of an annotation file, by which they are judged.
 
-    It stands in place of `Coco` where annotations are given.
+    It stands in place of `Coco` where annotations are given. Boxes are in the frame of the annotations (`Truth`).
     """
 
     def __init__(self, truth: Truth) -> None:
@@ -261,16 +261,17 @@ class CocoResults(ResultsFormat):
     def added(self, record: Record, name: str, file: Path | None) -> Values:
         """Make the results of a picture; objects of classes that the annotations lack cannot be judged."""
         from semfov.data.classes import canonical_name
+        from semfov.data.images import stored_boxes
+        from semfov.detection.exchange import coco_results
 
-        image_id = self.truth.image_id(name, record.size)
+        image_id = self.truth.image_id(name)
         sought = [record.classes[label] for label in record.sought] or record.classes[1:]
         categories = self.truth.categories(sought)
         names = [canonical_name(name) for name in record.classes]
-        results = []
-        for result in record.to_coco(image_id, range(1, len(names))):
-            class_name = names[int(result["category_id"])]
-            if class_name in categories:
-                results.append({**result, "category_id": categories[class_name]})
+        ids = {label: categories[class_name] for label, class_name in enumerate(names) if class_name in categories}
+        objects = record.objects.of([*ids])
+        boxes = stored_boxes(objects.boxes, record.size, self.truth.orientation(image_id, name, record.size, file))
+        results = coco_results(image_id, boxes, objects.labels, objects.scores, ids)
         return {"image_id": image_id, "classes": list(categories), "parts": results}
 
     def text(self, rows: Sequence[Row]) -> str:

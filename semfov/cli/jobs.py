@@ -167,7 +167,8 @@ class PictureJob(ABC, Generic[_Options_co]):
                 picture = source.opened(self.options.how)
                 if self.truth is not None:
                     # Its size is checked before it is looked at: boxes in another frame could not be judged.
-                    self.truth.image_id(source.name, picture_size(source.picture()))
+                    image = self.truth.image_id(source.name)
+                    self.truth.orientation(image, source.name, picture_size(source.picture()), source.file)
                 settings = {setting.name: getattr(self.options, setting.name) for setting in fields(self.task)}
                 if isinstance(picture, World):  # a scene is looked at by a head, whatever it was opened as
                     settings["how"] = "auto"

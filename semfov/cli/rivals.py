@@ -4,17 +4,20 @@ import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
+from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from semfov.agent import ActivePerception
 from semfov.cli.truth import Truth
 from semfov.data.annotations import Annotations, Entry, Id, annotation_of
 from semfov.data.classes import canonical_name
+from semfov.data.images import stored_boxes
 from semfov.data.scene import Annotation
 from semfov.data.windowed import LargePicture
 from semfov.detection.exchange import coco_results
@@ -233,13 +236,18 @@ class Reference(ABC):
         self.pictures: dict[Id, Annotation] = {}
 
     @abstractmethod
-    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+    def image_of(self, name: str, size: tuple[int, int], file: Path | None) -> Id:
         """Find the id of a picture.
 
         Args:
             name: path of the picture.
             size: `(width, height)` in pixels.
+            file: its file, if it has one.
         """
+
+    def placed(self, image: Id, boxes: Tensor) -> Tensor:
+        """Move boxes `(N, 4)` that were found in a picture to the frame in which this has its objects."""
+        return boxes
 
     @abstractmethod
     def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
@@ -264,7 +272,7 @@ class Reference(ABC):
 class SlicesReference(Reference):
     """The objects that all slices list; pictures are counted."""
 
-    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+    def image_of(self, name: str, size: tuple[int, int], file: Path | None) -> Id:
         return len(self.pictures) + 1
 
     def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
@@ -299,12 +307,18 @@ class AnnotatedReference(Reference):
         sought = {canonical_name(classes[label - 1]): label for label in labels}
         categories = truth.categories([classes[label - 1] for label in labels])
         self.ids = {sought[name]: id_ for name, id_ in categories.items()}
+        self._frames: dict[Id, tuple[tuple[int, int], int]] = {}  # sizes of upright pictures, and orientations of boxes
 
-    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+    def image_of(self, name: str, size: tuple[int, int], file: Path | None) -> Id:
         """Find the id of a picture; raises `DataError` where the file lacks it, or has it twice or in another size."""
-        image = self.truth.image_id(name, size)
+        image = self.truth.image_id(name)
         check_data(image not in self.pictures, name, "a picture that was not named before", "it again")
+        self._frames[image] = (size, self.truth.orientation(image, name, size, file))
         return image
+
+    def placed(self, image: Id, boxes: Tensor) -> Tensor:
+        size, orientation = self._frames[image]
+        return stored_boxes(boxes, size, orientation)
 
     def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
         """Add the entries of the file, those of the classes that are sought, without boxes that have no area."""
@@ -314,7 +328,7 @@ class AnnotatedReference(Reference):
             has_area = min(entry["bbox"][2:]) > 0
             if has_area and entry["category_id"] in label_of_category:
                 sought.append(entry)
-        self.pictures[image] = annotation_of(sought, label_of_category, size)
+        self.pictures[image] = annotation_of(sought, label_of_category, self.truth.annotations.size(image) or size)
 
     def annotations(self) -> Annotations:
         return self.truth.annotations
@@ -345,12 +359,13 @@ class Scores:
         """Number of pictures so far."""
         return len(self._reference.pictures)
 
-    def image_of(self, name: str, size: tuple[int, int]) -> Id:
+    def image_of(self, name: str, size: tuple[int, int], file: Path | None) -> Id:
         """Find the id of a picture in the annotations; without these they are counted.
 
         Args:
             name: path of the picture.
             size: `(width, height)` in pixels.
+            file: its file, if it has one.
 
         Returns:
             The id.
@@ -358,7 +373,7 @@ class Scores:
         Raises:
             DataError: the annotations lack it, or have it twice or in another size.
         """
-        return self._reference.image_of(name, size)
+        return self._reference.image_of(name, size, file)
 
     def add(self, image: Id, size: tuple[int, int], findings: Mapping[str, list[Finding]]) -> None:
         """Add a picture.
@@ -394,7 +409,8 @@ class Scores:
         listed = 0
         right = 0
         for image, finding in found.items():
-            objects = _of_classes(finding.objects, ids)
+            sought = _of_classes(finding.objects, ids)
+            objects = replace(sought, boxes=self._reference.placed(image, sought.boxes))
             rows = coco_results(image, objects.boxes, objects.labels, objects.scores, ids)
             results += [dict(row) for row in rows]
             # For each object 1 is right, 0 is wrong, and -1 is not judged.

@@ -13,13 +13,20 @@ import torch
 
 from semfov.data.annotations import Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name
+from semfov.data.images import SWAPPED, file_orientation
 from semfov.errors import DataError, check, check_data
 from semfov.metrics.average_precision import average_precision
 from semfov.paths.conversion import Values
 
 
 class Truth:
-    """An annotation file in COCO's format: pictures by the ends of their paths, and categories by their names."""
+    """An annotation file in COCO's format: pictures by the ends of their paths, and categories by their names.
+
+    Boxes are in the frame whose size the file states, as in `semfov.data.CocoScenes`: that of the upright picture, as
+    viewers and programs for annotation show it, or where only the stored pixels have that size, that of these. Where
+    the size does not tell (none is stated, or the stored picture is square, upside down or mirrored), boxes are those
+    of the upright picture.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -51,7 +58,7 @@ class Truth:
         if empty:
             warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
 
-    def image_id(self, name: str, size: tuple[int, int] | None = None) -> Id:
+    def image_id(self, name: str) -> Id:
         """Find the id of a picture by its name; of several of one name that whose folders agree best.
 
         Where no image is named as the picture is, names agree in any letter case, and as other systems and addresses
@@ -60,13 +67,12 @@ class Truth:
 
         Args:
             name: path of the picture.
-            size: `(width, height)` that the annotations must have; None checks nothing.
 
         Returns:
             The id of the image in the annotations.
 
         Raises:
-            DataError: no image, or several, have this name, or its size is another one.
+            DataError: no image, or several, have this name.
         """
         for agree in (eq, _agree_plainly, _agree_after_upload, _agree_after_export):
             images = self._named(name, agree)
@@ -76,20 +82,34 @@ class Truth:
         names = [entry["file_name"] for entry in self.annotations.images.values()]
         got = f"{len(images)} of {len(names)}, which are named as {names[0]!r:.100}" if names else "no images"
         check_data(len(images) == 1, f"annotations {self.path}", expected, got)
-        (image,) = images
-        if size is not None:
-            self._check_size(image, name, size)
-        return image
+        return images[0]
 
-    def _check_size(self, image: Id, name: str, size: tuple[int, int]) -> None:
-        """Raise `DataError` for a picture of another size than the one that the file says, if it says one."""
+    def orientation(self, image: Id, name: str, size: tuple[int, int], file: Path | None) -> int:
+        """Tell in which EXIF orientation the boxes of a picture are: 1 for upright, else that of its file.
+
+        Args:
+            image: id of the image.
+            name: of the picture, for messages.
+            size: `(width, height)` of the upright picture.
+            file: the picture's file; None for one that has none.
+
+        Returns:
+            The orientation, for `semfov.data.images.stored_boxes`.
+
+        Raises:
+            DataError: neither the upright picture nor its stored pixels have the size that the file states.
+        """
         stated = self.annotations.size(image)
-        if stated is not None and stated != size:
-            width, height = stated
-            raise DataError(
-                f"annotations {self.path}: expected {name} to have {width} × {height} px, got {size[0]} × {size[1]}; "
-                "its boxes are in another frame"
-            )
+        if stated is None or stated == size:
+            return 1
+        width, height = size
+        orientation = 1 if file is None else file_orientation(file)
+        if stated == (height, width) and orientation >= SWAPPED:
+            return orientation
+        raise DataError(
+            f"annotations {self.path}: expected {name} to have {stated[0]} × {stated[1]} px, got {width} × {height}; "
+            "its boxes are in another frame"
+        )
 
     def _named(self, name: str, agree: Callable[[str, str], bool]) -> list[Id]:
         """List the images of a picture's name, those whose folders agree best.

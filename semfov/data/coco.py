@@ -35,6 +35,10 @@ class CocoScenes(Scenes):
     are not in `classes` and, with `crowd="drop"`, boxes of crowds. `repairs` counts the boxes of the whole file that
     were cut or dropped, and a warning of the logger `semfov.data.coco` lists them. Any other error in the file raises.
 
+    Photographs are turned upright by their EXIF orientation, as viewers and programs for annotation show them, and left
+    as they are stored where only the stored pixels have the size that the file states. Where the size does not tell
+    (the stored photograph is square, upside down or mirrored), boxes are those of the upright one.
+
     Args:
         root: folder of the images.
         annotations: COCO instances file.

@@ -71,6 +71,9 @@ _MOVES = {
 }
 """Moves that turn a picture upright, by its orientation; from 5 on they swap its sides."""
 
+SWAPPED = 5  # the first orientation whose sides are swapped
+_MIRRORED_ACROSS = (2, 3, 6, 7)  # orientations whose stored pixels are mirrored so, before sides are swapped
+_MIRRORED_DOWN = (3, 4, 7, 8)
 _INVERSE = {6: 8, 8: 6}  # orientations whose moves undo each other; other moves undo themselves
 SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
 """Pillow's modes of grey pictures with 16 bits."""
@@ -503,11 +506,39 @@ class PhotographPicture(LargePicture):
 def upright_size(image: "Image") -> tuple[int, int]:
     """Tell `(width, height)` of a Pillow image after it is turned upright."""
     width, height = image.size
-    if _orientation(image) < 5:
+    if _orientation(image) < SWAPPED:
         return width, height
     # Pillow swaps the sides of TIFFs itself before it turns them.
     tags = TiffTags.of_image(image).values
     return tags.get(HEIGHT, height), tags.get(WIDTH, width)
+
+
+def file_orientation(path: Path) -> int:
+    """Read the EXIF orientation of an image file, 1 to 8; 1 where it has none, or Pillow cannot open it."""
+    with suppress(DataError), opening(path, "opened"), open_pillow(path) as image:
+        return _orientation(image)
+    return _UPRIGHT
+
+
+def stored_boxes(boxes: Tensor, size: tuple[int, int], orientation: int) -> Tensor:
+    """Move boxes in an upright picture to where its file stores their pixels.
+
+    Args:
+        boxes: `(N, 4)`, `(x1, y1, x2, y2)` in pixels.
+        size: `(width, height)` of the upright picture.
+        orientation: EXIF orientation of the file, 1 to 8.
+
+    Returns:
+        `(N, 4)`, in pixels of the stored picture.
+    """
+    width, height = size
+    x1, y1, x2, y2 = boxes.unbind(-1)
+    if orientation in _MIRRORED_ACROSS:
+        x1, x2 = width - x2, width - x1
+    if orientation in _MIRRORED_DOWN:
+        y1, y2 = height - y2, height - y1
+    edges = (x1, y1, x2, y2) if orientation < SWAPPED else (y1, x1, y2, x2)
+    return torch.stack(edges, -1)
 
 
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:

@@ -267,20 +267,31 @@ def test_a_missing_image_is_an_error_only_if_it_is_used(photographs, make_coco, 
     assert only.ids == [10, 20]  # an image that is not used may be missing
 
 
-@pytest.mark.parametrize("frame", ["upright", "stored"])
-def test_pixels_of_a_rotated_photograph_fit_the_annotated_size(tmp_path, make_coco, coco_dict, frame):
+@pytest.mark.parametrize(
+    ("orientation", "turns", "height", "frame"),  # quarter turns to the left that make the stored pixels upright
+    [
+        (1, 0, 30, "upright"),
+        (3, 2, 30, "upright"),
+        (6, -1, 30, "upright"),
+        (6, -1, 30, "stored"),
+        (6, -1, 40, "upright"),  # the size of a square does not tell the frame
+        (8, 1, 30, "upright"),
+        (8, 1, 30, "stored"),
+    ],
+)
+def test_pixels_of_a_rotated_photograph_fit_the_annotations(
+    tmp_path, make_coco, coco_dict, orientation, turns, height, frame
+):
     exif = Image.Exif()
-    exif[0x0112] = 6
-    pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    exif[0x0112] = orientation
+    pixels = np.random.default_rng(0).integers(0, 256, (height, 40, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "10.png", exif=exif)
-    data = coco_dict([(10, "cat", (0, 0, 3, 4))])
-    data["images"] = [
-        {"id": 10, "file_name": "10.png"}
-        | ({"width": 30, "height": 40} if frame == "upright" else {"width": 40, "height": 30})
-    ]
-    image = CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL)[0].image
-    expected = np.rot90(pixels, -1) if frame == "upright" else pixels
-    assert np.array_equal((image * 255).round().byte().permute(1, 2, 0).numpy(), expected)
+    data = coco_dict([(10, "cat", (2, 1, 7, 9))])
+    expected = np.rot90(pixels, turns) if frame == "upright" else pixels
+    data["images"] = [{"id": 10, "file_name": "10.png", "width": expected.shape[1], "height": expected.shape[0]}]
+    scene = CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL)[0]
+    assert np.array_equal((scene.image * 255).round().byte().permute(1, 2, 0).numpy(), expected)
+    assert scene.boxes.tolist() == [[2, 1, 9, 10]]
 
 
 def test_annotations_of_another_detector_or_image_size_are_refused(photographs, make_coco, coco_dict):

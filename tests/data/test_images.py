@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from semfov import DataError, read_image
-from semfov.data.images import MAX_PIXELS
+from semfov.data.images import MAX_PIXELS, file_orientation, stored_boxes
 from tests.refusals import unusable
 
 # Four colours, one per quadrant, so that every rotation or mirroring is visible.
@@ -49,6 +49,19 @@ def test_photographs_are_rotated_by_exif_orientation(tmp_path, orientation, kind
     assert abs(shown - expected).max() <= 12
     if kind != "tif":  # Pillow rotates TIFF files itself
         assert abs(bits(read_image(path, oriented=False)).astype(int) - PICTURE).max() <= 12
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_boxes_of_an_upright_photograph_are_found_in_the_stored_one(tmp_path, orientation):
+    stored = np.zeros((16, 24, 3), np.uint8)
+    stored[2:5, 9:20] = 255
+    Image.fromarray(stored).save(tmp_path / "a.png", exif=oriented(orientation))
+    assert file_orientation(tmp_path / "a.png") == orientation
+    shown = SHOWN[orientation](stored)[..., 0]
+    rows = shown.any(1).nonzero()[0]
+    columns = shown.any(0).nonzero()[0]
+    box = torch.tensor([[columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]])
+    assert stored_boxes(box, (shown.shape[1], shown.shape[0]), orientation).tolist() == [[9, 2, 20, 5]]
 
 
 def oriented(number):
