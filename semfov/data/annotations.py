@@ -1,7 +1,7 @@
 """Annotation files in COCO's format; every entry is checked before it is used."""
 
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
@@ -83,8 +83,9 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
     """Read and check a COCO instances file.
 
     Ids of images and categories are integers or strings. Objects need no id and no area, which nothing depends on.
-    Where `iscrowd` is missing or null it is 0. The name of an image may be the end of its `coco_url`, as in LVIS, and
-    numbers may be written as texts.
+    Where `iscrowd` is missing or null it is 0, and where `bbox` is missing, null or empty it is around the polygons of
+    `segmentation`. The name of an image may be the end of its `coco_url`, as in LVIS, and numbers may be written as
+    texts.
 
     Args:
         path: the file.
@@ -109,18 +110,39 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
     categories = _by_id(data, "categories", name, {"name": _NAME})
     _check_one_kind(images, f"{name}: images")
     _check_one_kind(categories, f"{name}: categories")
+    image_ids = _by_text(images)
+    category_ids = _by_text(categories)
     fields = {
-        "image_id": _Field(lambda value: _is_id(value) and value in images, "the id of one of the images"),
-        "category_id": _Field(lambda value: _is_id(value) and value in categories, "the id of one of the categories"),
+        "image_id": _reference(image_ids, "the id of one of the images"),
+        "category_id": _reference(category_ids, "the id of one of the categories"),
         "bbox": _BOX,
         "iscrowd": _CROWD,
     }
     objects: dict[Id, list[Entry]] = {image: [] for image in images}
+    _box_polygons(data)
     for entry in _checked(data, "annotations", name, fields):
+        category = category_ids[_id_text(entry["category_id"])]
         crowd = int(entry.get("iscrowd") or 0)
-        box = {"category_id": _plain_id(entry["category_id"]), "bbox": entry["bbox"], "iscrowd": crowd}
-        objects[entry["image_id"]].append(box)
+        box = {"category_id": category, "bbox": entry["bbox"], "iscrowd": crowd}
+        objects[image_ids[_id_text(entry["image_id"])]].append(box)
     return Annotations(images, categories, objects, sha256(path))
+
+
+def _box_polygons(data: Entry) -> None:
+    """Give the objects without `bbox` the box around their polygons, where they have some."""
+    entries = data.get("annotations")
+    for entry in entries if isinstance(entries, list) else []:
+        if isinstance(entry, dict) and not entry.get("bbox") and _are_polygons(entry.get("segmentation")):
+            xs = [x for polygon in entry["segmentation"] for x in polygon[::2]]
+            ys = [y for polygon in entry["segmentation"] for y in polygon[1::2]]
+            entry["bbox"] = [min(xs), min(ys), max(xs) - min(xs), max(ys) - min(ys)]
+
+
+def _are_polygons(value: object) -> bool:
+    """Tell whether a segmentation is a list of polygons, each as `[x, y, x, y, …]`; it may be run lengths, too."""
+    if not isinstance(value, list) or not value:
+        return False
+    return all(isinstance(polygon, list) and len(polygon) > 1 and all(map(is_number, polygon)) for polygon in value)
 
 
 def _is_of_yolo(path: Path) -> bool:
@@ -153,6 +175,21 @@ def _is_id(value: object) -> bool:
 
 def _are_ids(value: object) -> bool:
     return value is None or (isinstance(value, list) and all(map(_is_id, value)))
+
+
+def _id_text(value: float | str) -> str:
+    """Write an id as a text, so that 7, 7.0 and "7" are the same."""
+    return str(_plain_id(value))
+
+
+def _by_text(ids: Iterable[Id]) -> dict[str, Id]:
+    """Index ids, which are of one kind, by their texts: some files have them as numbers in one place alone."""
+    return {str(number): number for number in ids}
+
+
+def _reference(ids: Mapping[str, Id], expected: str) -> _Field:
+    """Return what a field has to be that names one of some ids."""
+    return _Field(lambda value: _is_id(value) and _id_text(cast(float | str, value)) in ids, expected)
 
 
 def _is_name(value: object) -> bool:
