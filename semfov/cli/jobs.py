@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -25,7 +25,7 @@ from semfov.cli.results import STDOUT, kind_of
 from semfov.cli.sources import PictureSource, example_source, picture_sources
 from semfov.cli.truth import Truth
 from semfov.data import WordVectors, spread
-from semfov.data.classes import known_class
+from semfov.data.classes import known_class, several_known
 from semfov.data.examples import example_with
 from semfov.data.large import picture_size
 from semfov.errors import InputError, SemfovError, check
@@ -353,16 +353,13 @@ def meant_classes(options: SearchOptions, classes: Sequence[str]) -> dict[str, f
 
 def _any_of_classes(options: SearchOptions, classes: Sequence[str], error: InputError) -> dict[str, float]:
     """Read a target that is no class as several classes for a fovea; else raise the error with what it can be."""
-    names: list[str] = []
-    with suppress(InputError):
-        names = [known_class(name.strip(), classes) for name in (options.target or "").split(",")]
-    has_several = len(names) > 1
+    names = several_known(options.target or "", classes)
     is_foveal = options.how == "fovea" or options.is_for_fovea
-    if has_several and is_foveal:
+    if names and is_foveal:
         return dict.fromkeys(names, 1.0)
     remedy = "a description needs --embeddings, a file of word vectors"
-    if has_several:
-        remedy = "a search is for one class: for any of several add --how fovea, for all use `semfov find`"
+    if names:
+        remedy = "--how fovea searches for any of them, and `semfov find` finds all"
     elif "did you mean" in str(error):
         raise error
     raise InputError(f"{error}; {remedy}") from None

@@ -15,7 +15,7 @@ import torch
 from semfov.cli.agent import detector_classes, make_agent, several_classes
 from semfov.cli.options import LiveOptions, white_of
 from semfov.cli.results import held_outputs
-from semfov.data.classes import amount, counted, known_class
+from semfov.data.classes import amount, counted, known_class, several_known
 from semfov.data.sources import Picture, Stream, open_stream
 from semfov.detection import Detections
 from semfov.errors import InputError, check
@@ -106,10 +106,9 @@ def _sought(options: LiveOptions, classes: Sequence[str] | None) -> str | list[s
     try:
         return known_class(options.target, classes, "target")
     except InputError as error:
-        if "," not in options.target:
+        if not several_known(options.target, classes):
             raise
-        remedy = f"a search is for one class, and --find {quote(options.target)} takes several"
-        raise InputError(f"{error}; {remedy}") from None
+        raise InputError(f"{error}; --find {quote(options.target)} takes several") from None
 
 
 def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path | None) -> None:

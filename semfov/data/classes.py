@@ -185,7 +185,8 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         The index, from 1.
 
     Raises:
-        InputError: there is no such class; the message suggests classes with this synonym or a similar name.
+        InputError: there is no such class, and the message suggests classes with this synonym or a similar name; or the
+            name is of several classes, with commas between them.
 
     >>> class_index("couch", ("person", "sofa")), class_index("Wine_Glasses", ("cup", "wine glass"))
     (2, 2)
@@ -197,8 +198,40 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
     matches = _matches(name, classes)
     if len(matches) == 1:
         return matches[0] + 1
+    words = _between_commas(name)
+    if len(words) > 1:
+        # An unknown one of them is told alone.
+        known = [known_class(word, classes, argument) for word in words]
+        raise InputError(f"{argument}: expected one class, got {' and '.join(known)}")
     suggestions = [classes[place] for place in matches] or _similar_classes(name, classes)
     raise InputError(_unknown(argument, name, suggestions, classes))
+
+
+def several_known(text: str, classes: Sequence[str]) -> list[str]:
+    """Find the classes that a text names with commas between them.
+
+    Args:
+        text: the names.
+        classes: names of the K classes.
+
+    Returns:
+        Two classes or more, as the detector spells them; none where the text is no list, or one of them is unknown.
+
+    >>> several_known("Cups, wine_glass", ("cup", "wine glass"))
+    ['cup', 'wine glass']
+    """
+    words = _between_commas(text)
+    if len(words) < 2:
+        return []
+    try:
+        return [known_class(word, classes) for word in words]
+    except InputError:
+        return []
+
+
+def _between_commas(text: str) -> list[str]:
+    """List what stands between the commas of a text."""
+    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def known_class(name: str, classes: Sequence[str], argument: str = "class") -> str:
@@ -298,14 +331,14 @@ def class_numbers(
 
 
 def _index_of_one(name: str | int, classes: Sequence[str], argument: str) -> int:
-    """Look up the index of one class; a text with commas is often meant as several, which the error then says."""
+    """Look up the index of one class; the error for a text with several of them says that they are a list."""
     try:
         return class_index(name, classes, argument)
     except InputError as error:
-        words = [word.strip() for word in str(name).split(",")]
-        if len(words) == 1:
+        names = several_known(str(name), classes)
+        if not names:
             raise
-        raise InputError(f"{error}; several classes are a list: {words}") from None
+        raise InputError(f"{error}; several classes are a list: {names}") from None
 
 
 def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> str:

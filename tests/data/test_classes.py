@@ -20,6 +20,8 @@ def test_every_class_name_matches_only_its_own_class():
     assert COCO_CLASSES[class_index("sofa", COCO_CLASSES) - 1] == "couch"
     refused("unknown class 'spaceship'", class_index, "spaceship", COCO_CLASSES)
     refused("expected 2 different names", class_indices, ("sofa", "couch"))
-    refused(r"; several classes are a list: \['cup', 'sofa'\]$", class_numbers, "cup, sofa", ("cup", "couch"))
+    message = r"^class: expected one class, got cup and couch; several classes are a list: \['cup', 'couch'\]$"
+    refused(message, class_numbers, "cup, sofa,", ("cup", "couch"))
+    refused(r"^class: unknown class 'cupp'; did you mean 'cup'\?$", class_numbers, "sofa,cupp", ("cup", "couch"))
     assert class_numbers({"sofa", "cup"}, ("couch", "cup")) == (2, 1)  # sorted as they are written
     assert class_numbers(np.array(["cup", "sofa"]), ("couch", "cup")) == (2, 1)
