@@ -253,7 +253,10 @@ def _assumed_in_all(files: PictureFiles) -> str:
     if share is None:
         return ""
     how_many = "half" if share == 0.5 else f"{100 * share:.3g} %"
-    return f"The probabilities assume that {how_many} of the pictures hold it. If you know better, give a prior.\n"
+    options = files.job.options
+    is_given = isinstance(options, SearchOptions) and options.prior is not None
+    hint = "" if is_given else " If you know better, give a prior."
+    return f"The probabilities assume that {how_many} of the pictures hold it.{hint}\n"
 
 
 def _skip(job: PictureJob[PictureOptions], files: PictureFiles, number: int, fault: SemfovError) -> None:

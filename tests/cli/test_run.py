@@ -19,7 +19,7 @@ import semfov
 from semfov import DataError, InputError, read_image
 from semfov.cli import outcome, written
 from semfov.cli.jobs import FindJob
-from semfov.cli.options import FindOptions
+from semfov.cli.options import FindOptions, SearchOptions
 from semfov.cli.search import _assumed_in_all
 from semfov.cli.totals import expected_in_all, found_in_all
 from semfov.gaze.policies import Policy
@@ -116,17 +116,28 @@ def test_a_fault_at_one_picture_is_a_row_with_its_reason(
 
 
 @pytest.mark.parametrize(
-    ("shares", "told"),
+    ("prior", "shares", "told"),
     [
-        ((0.5, 0.5), "The probabilities assume that half of the pictures hold it. If you know better, give a prior.\n"),
-        ((0.05,), "The probabilities assume that 5 % of the pictures hold it. If you know better, give a prior.\n"),
-        ((0.5, 0.1), ""),
-        ((None,), ""),
+        (
+            None,
+            (0.5, 0.5),
+            "The probabilities assume that half of the pictures hold it. If you know better, give a prior.\n",
+        ),
+        (
+            None,
+            (0.05,),
+            "The probabilities assume that 5 % of the pictures hold it. If you know better, give a prior.\n",
+        ),
+        (0.15, (0.15,), "The probabilities assume that 15 % of the pictures hold it.\n"),
+        (None, (0.5, 0.1), ""),
+        (None, (None,), ""),
     ],
 )
-def test_a_search_of_many_pictures_tells_what_its_probabilities_assume(shares, told):
+def test_a_search_of_many_pictures_tells_what_its_probabilities_assume(prior, shares, told):
     rows = {number: {"assumed": share} for number, share in enumerate(shares)}
-    assert _assumed_in_all(SimpleNamespace(rows={**rows, 9: {"error": "unreadable"}})) == told
+    job = SimpleNamespace(options=SearchOptions(prior=prior))
+    files = SimpleNamespace(rows={**rows, 9: {"error": "unreadable"}}, job=job)
+    assert _assumed_in_all(files) == told
 
 
 def test_pictures_with_long_names_end_no_command(run, photo, tmp_path):
