@@ -24,7 +24,7 @@ OPTIONS = _by_word(
         "input_size": "image_size img_size imgsz resolution",
         "min_gain": "expected_gain gain min_improvement tol tolerance",
         "stop_below": "stop stop_threshold stopping_threshold",
-        "target": "class class_name classes cls filter label labels name only query targets",
+        "target": "class class_name classes cls filter find label labels name only query targets",
         "picture": "file image img path photo source",
         "grid": "cells columns rows",
         "detector name": "model yolo",
@@ -203,9 +203,9 @@ AGENT = _by_word(
 DECISION = _by_word(
     {
         "decision.outcome == 'found'": "found is_found is_present present result success",
-        "decision.probability": "conf confidence p prob score",
+        "decision.probability": "conf confidence p presence prob score",
         "decision.box": "bbox boxes xyxy",
-        "record.found_at": "at location point x y",
+        "record.found_at": "at location point position x y",
     }
 )
 
