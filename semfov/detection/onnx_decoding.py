@@ -8,12 +8,16 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from semfov.detection.class_names import NAMING
 from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_signature import selected_outputs
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError, check, check_shape, values_known
+
+COLUMNS = 7
+"""Numbers in a row of `rows_of_images`."""
 
 _FEW = 64  # cells
 
@@ -137,6 +141,32 @@ def decode_end_to_end(rows: Tensor, classes: int | None) -> Candidates:
     nothing = scores.new_zeros(*scores.shape, classes)  # (B, N, K)
     vectors = nothing.scatter(-1, index[..., None], scores[..., None])
     return Candidates(rows[..., :4], vectors)
+
+
+def rows_of_images(flat: Tensor, images: int) -> Tensor:
+    """Divide the rows that a network has selected in all images of a pass by their images, as YOLOv7 exports them.
+
+    Args:
+        flat: `(N, 7)`: number of the image from 0, corners of the box, number of the class, score.
+        images: number of images B.
+
+    Returns:
+        `(B, L, 6)`, rows of `decode_end_to_end`; after the last row of an image follow zeros.
+
+    Raises:
+        InputError: a row is of no image.
+
+    >>> rows_of_images(torch.tensor([[1.0, 2, 3, 8, 9, 5, 0.5]]), images=2)[1].tolist()
+    [[2.0, 3.0, 8.0, 9.0, 0.5, 5.0]]
+    """
+    number = flat[:, 0]
+    is_of_image = number == torch.arange(images).to(flat)[:, None]  # (B, N)
+    are_known = bool(is_of_image.any(0).all())
+    check(
+        are_known, "rows", f"the number of an image, from 0 to {images - 1}, in the first column", number[:3].tolist()
+    )
+    rows = flat[:, [1, 2, 3, 4, 6, 5]]
+    return pad_sequence([rows[of_image] for of_image in is_of_image], batch_first=True)
 
 
 def _check_numbers_of_classes(numbers: Tensor, classes: int) -> None:

@@ -288,7 +288,8 @@ class _Yolov8(_CellsHead, _RowsHead):
 class _EndToEnd(_RowsHead):
     """A network of Ultralytics that selects boxes itself: one output `(B, N, 6)`.
 
-    A row is `x1 y1 x2 y2` in canvas pixels, score, number of the class; the boxes have no other scores.
+    A row is `x1 y1 x2 y2` in canvas pixels, score, number of the class; the boxes have no other scores. Rows of all
+    images together, `(N, 7)`, are divided before (`rows_of_images`).
     """
 
     name = "end2end"

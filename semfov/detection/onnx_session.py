@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from semfov.detection.feature_maps import NetworkStep, stride_of
 from semfov.detection.onnx_apart import ModelApart
 from semfov.detection.onnx_budget import check_elements, dims, without_weights
 from semfov.detection.onnx_cells import Canvas
 from semfov.detection.onnx_check import check_file, stored_bytes
+from semfov.detection.onnx_decoding import COLUMNS, rows_of_images
 from semfov.detection.onnx_input import FLOATS, ImageInput, Sizes, open_sizes, sizes_of_image
 from semfov.detection.onnx_program import Description, Opening, Port, describe, open_session, runtime
 from semfov.errors import DataError, check
@@ -225,7 +227,10 @@ class OnnxSession:
                 reason = f"its tensors need more than {_MOST_MEMORY >> 20} MiB, as with too many boxes; {reason}"
             raise DataError(f"{self.path.name}: fails on images of shape {tuple(image.shape)}: {reason}") from error
         outputs = {}
-        for name, array in zip(names, arrays, strict=True):
+        for (name, sizes), array in zip(self.outputs, arrays, strict=True):
+            if _is_flat(sizes):
+                outputs[name] = rows_of_images(torch.from_numpy(array), len(image))
+                continue
             has_rows = array.shape[:1] == (len(image),)
             expected = f"a row for each of {len(image)} images"
             got = f"shape {array.shape}; {_WITHOUT_SELECTION}"
@@ -263,7 +268,7 @@ class OnnxSession:
             stated = [size for size in sizes if size is not None]
             check_elements(f"{self.path.name}: output {name!r}", stated)
             stated_shapes[name] = stated
-            are_open |= not shape or None in sizes
+            are_open |= not shape or None in sizes or _is_flat(shape)
         if are_open:
             width, height = size
             return self(torch.zeros(1, 3, height, width))
@@ -303,9 +308,23 @@ class OnnxSession:
         return onnx.shape_inference.infer_shapes(model, data_prop=True).graph
 
 
+def _is_flat(sizes: Sizes) -> bool:
+    """Tell whether an output has the rows of all images together (`rows_of_images`)."""
+    return len(sizes) == 2 and sizes[1] == COLUMNS
+
+
 def _joined(parts: list[Tensor]) -> Tensor:
-    """Join the rows of several runs; those of one run need no copy."""
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
+    """Join the rows of several runs, which may have other numbers of boxes: zeros follow the fewer ones."""
+    if len(parts) == 1:
+        return parts[0]  # needs no copy
+    longest = max(part.shape[1:2] for part in parts)
+    if all(part.shape[1:2] == longest for part in parts):
+        return torch.cat(parts)
+    padded = []
+    for part in parts:
+        missing = longest[0] - part.shape[1]
+        padded.append(pad(part, (*[0, 0] * (part.ndim - 2), 0, missing)))
+    return torch.cat(padded)
 
 
 def _stride(shape: Sequence[int], canvas: Canvas) -> int | None:

@@ -22,6 +22,7 @@ from semfov.detection import onnx_session
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import _parse_cfg, read_cfg
 from semfov.detection.onnx import load_onnx
+from semfov.detection.onnx_decoding import rows_of_images
 from semfov.detection.onnx_file import read_settings, with_input_size
 from semfov.detection.onnx_session import OnnxSession
 from semfov.errors import DataError, SemfovError
@@ -289,6 +290,58 @@ def test_the_number_of_boxes_may_depend_on_values_up_to_a_limit(tmp_path, monkey
         assert load_detector(path).propose(torch.zeros(2, 3, 64, 64)).boxes.shape == (2, 9, 4)
     else:
         unusable(rf"model.*{reason}", lambda: load_detector(path).propose(torch.zeros(2, 3, 64, 64)))
+
+
+ROWS = np.array([[4, 4, 20, 20, 0.9, 1], [30, 30, 50, 60, 0.8, 0], [2, 30, 10, 60, 0.7, 2]], np.float32)
+
+
+def selecting(path, stored, shape, axis):
+    """A model that returns as many of the stored rows as its brightest pixel says."""
+    nodes = [
+        helper.make_node("ReduceMax", ["images"], ["brightest"], keepdims=0),
+        helper.make_node("Cast", ["brightest"], ["whole"], to=TensorProto.INT64),
+        helper.make_node("Unsqueeze", ["whole", "first"], ["count"]),
+        helper.make_node("Slice", ["stored", "first", "count", "axis"], ["output"]),
+    ]
+    numbers = {"stored": stored, "first": np.array([0]), "axis": np.array([axis])}
+    names = {"names": "{0: 'cat', 1: 'dog', 2: 'cup'}"}
+    return write_network(path, nodes, {"images": [1, 3, 64, 64]}, {"output": shape}, numbers, metadata=names)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.filterwarnings("ignore:.*selects boxes itself")
+def test_each_image_of_a_batch_may_have_other_numbers_of_boxes(tmp_path, flat):
+    """As rows of each image, or of all images together with the number of the image before the class and the score."""
+    if flat:
+        rows = np.insert(ROWS[:, [0, 1, 2, 3, 5, 4]], 0, 0, axis=1)
+        path = selecting(tmp_path / "model.onnx", rows, [None, 7], 0)
+    else:
+        path = selecting(tmp_path / "model.onnx", ROWS[None], [1, None, 6], 1)
+    detector = load_detector(path, head="end2end")
+    counts = 2, 0, 3
+    batch = torch.stack([torch.full((3, 64, 64), float(count)) for count in counts])
+    found = detector.propose(batch)
+    for image, count in enumerate(counts):
+        assert found.boxes[image, :count].tolist() == ROWS[:count, :4].tolist()
+        labels = found.classes[image].argmax(-1)[:count]
+        assert labels.tolist() == ROWS[:count, 5].tolist()
+        torch.testing.assert_close(found.classes[image].amax(-1)[:count], torch.from_numpy(ROWS[:count, 4]))
+        assert found.classes[image, count:].sum() == 0
+    alone = detector.propose(batch[2:])
+    assert torch.equal(alone.boxes[0], found.boxes[2])
+
+
+def test_rows_of_all_images_are_known_by_their_columns_and_name_their_image(tmp_path):
+    rows = np.insert(ROWS[:, [0, 1, 2, 3, 5, 4]], 0, 0, axis=1)
+    with pytest.warns(UserWarning, match="selects boxes itself"):
+        assert load_detector(selecting(tmp_path / "model.onnx", rows, [None, 7], 0)).head == "end2end"
+    of_both = torch.from_numpy(rows[[0, 1, 2, 0]])
+    of_both[:, 0] = torch.tensor([1, 0, 1, 1])
+    divided = rows_of_images(of_both, 3)
+    assert divided.shape == (3, 3, 6)
+    assert divided[1].tolist() == ROWS[[0, 2, 0]].tolist()
+    assert divided[0].tolist() == [ROWS[1].tolist(), [0] * 6, [0] * 6]
+    refused("rows: expected the number of an image, from 0 to 0, in the first column", rows_of_images, of_both, 1)
 
 
 @pytest.mark.parametrize("nested", [False, True])
