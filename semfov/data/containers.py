@@ -1,11 +1,12 @@
 """What the file of a video says of itself: its container by the first bytes, and how far its statements hold."""
 
+import re
 from pathlib import Path
 from typing import Literal
 
 from semfov.io.files import reading
 
-Container = Literal["animation", "avi", "matroska", "mp4", "playlist", "other"]
+Container = Literal["animation", "avi", "matroska", "mp4", "text", "other"]
 
 _MARKS: dict[tuple[int, bytes], Container] = {
     (0, b"GIF8"): "animation",
@@ -13,9 +14,11 @@ _MARKS: dict[tuple[int, bytes], Container] = {
     (8, b"AVI "): "avi",
     (0, b"\x1a\x45\xdf\xa3"): "matroska",
     (4, b"ftyp"): "mp4",
-    (0, b"#EXTM3U"): "playlist",
 }
 """Bytes that tell a container, with their place in the file. WebM is Matroska."""
+
+_TEXT = re.compile(rb"(?!YUV4MPEG2 )(\xef\xbb\xbf)?[\t\n\r -~]*")
+"""The first bytes of a text. FFmpeg would open the files and addresses that one names: a playlist, `ffconcat`, SDP."""
 
 _HEAD = 16  # bytes of a file, or of a box of MP4, that tell what it is
 _LEAST_FRAME = 8  # bytes of the smallest frame of an AVI file, those of its head
@@ -29,7 +32,7 @@ def container_of(path: Path) -> Container:
     for (place, mark), kind in _MARKS.items():
         if head.startswith(mark, place):
             return kind
-    return "other"
+    return "text" if _TEXT.fullmatch(head) else "other"
 
 
 def frames_stated(path: Path, container: Container, count: float) -> int:

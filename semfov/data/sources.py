@@ -202,7 +202,8 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
     if path.is_dir():
         return _open_folder(path, most, white)
     container = container_of(path)
-    check_data(container != "playlist", path.name, "a video", "a playlist, which names other files; give these")
+    got = "a text, such as a playlist, which names other files; give these"
+    check_data(container != "text", path.name, "a video", got)
     if container == "animation":
         return _open_animation(path, most, white)
     return _open_recorder(_Film(path, container), most, white)
@@ -385,7 +386,8 @@ class _Film(_Source):
         self.container = container
 
     def recorder(self, cv2: ModuleType) -> _Recorder:
-        return cv2.VideoCapture(str(self.path))
+        # FFmpeg would take the beginning of some names for a protocol.
+        return cv2.VideoCapture(str(self.path.absolute()))
 
     def reopen(self, cv2: ModuleType, recorder: _Recorder) -> bool:
         return False  # a file that has ended does not go on

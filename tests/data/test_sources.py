@@ -123,10 +123,28 @@ def test_the_pictures_of_a_folder_are_the_frames_of_a_stream(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".m3u8", ".avi", ".ts"])
-def test_a_playlist_is_no_video(video, tmp_path, suffix):
-    path = tmp_path / f"list{suffix}"
-    path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\n{video}\n#EXT-X-ENDLIST\n")
-    unusable("expected a video, got a playlist", open_stream, path)
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nvideo.avi\n#EXT-X-ENDLIST\n",
+        "\ufeff#EXTM3U\n#EXTINF:5,\nvideo.avi\n",
+        "ffconcat version 1.0\nfile video.avi\n",
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+        "# VobSub index file, v7 (do not modify this line!)\n",
+        "words, which FFmpeg would draw",
+    ],
+)
+def test_a_text_is_no_video(video, text, suffix):
+    path = video.with_name(f"list{suffix}")
+    path.write_text(text)
+    unusable("expected a video, got a text, such as a playlist", open_stream, path)
+
+
+def test_the_name_of_a_video_is_no_protocol(video, monkeypatch):
+    monkeypatch.chdir(video.parent)
+    path = video.with_name("subfile,,start,0,end,0,,:video.avi")
+    path.write_bytes(b"\0" * 100)
+    unusable("cannot be opened", open_stream, path.name)
 
 
 def test_streams_are_opened_by_their_address_and_refused_without_their_password(video, serve):
@@ -145,7 +163,7 @@ def test_unreadable_sources_are_errors(tmp_path, monkeypatch):
     unusable("got none", picture_files, tmp_path)
     unusable("source: expected frames .* got none", open_stream, tmp_path)
     broken = tmp_path / "broken.mp4"
-    broken.write_bytes(b"no video")
+    broken.write_bytes(b"\0no video")
     unusable(r"broken\.mp4: cannot be opened", open_stream, broken)
     unusable(r"source: .*none\.mp4: no such file", open_stream, tmp_path / "none.mp4")
     unusable("camera 99: cannot be opened; check that it is connected", open_stream, 99)
