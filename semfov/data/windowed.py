@@ -282,6 +282,8 @@ class LargePicture(ABC):
     def _runs(self, box: Box, reduction: int) -> list[tuple[int, int, bool]]:
         """Find runs of columns of a strip of the reduced picture, `(left, right, stored)`, by whether they are."""
         x1, top, x2, bottom = box
+        if not self.holds(self._around(box, reduction)):
+            return [(x1, x2, False)]
         step = max(1, _PIECE // reduction)
         pieces = []
         for left in range(x1, x2, step):

@@ -97,7 +97,7 @@ class ZoomBelief:
         self._rate = np.zeros((self.lattice.levels, *shape), np.float32)  # λ of each cell for looks of each level
         self._rated_level = np.full(shape, -1, np.int8)  # level of the look that the rates of a cell are from
         self._gists_rated = 0
-        self.closest_level = torch.full(shape, -1)
+        self.closest_level = torch.full(shape, -1, dtype=torch.int8)
         self.__dict__.pop("unexplored", None)
         self.gists: list[Gist] = []
         self._sums: dict[tuple[_CellQuantity, int], WindowSums] = {}
@@ -204,7 +204,10 @@ class ZoomBelief:
         for level, rate_of_level in enumerate(rate):
             # A look predicts the octaves above its own level; in the others it is expected to find nothing.
             octave = level - gist.level - 1
-            np.copyto(rate_of_level, by_cell[octave] if 0 <= octave < STEPS else 0, where=is_closer)
+            if 0 <= octave < STEPS:
+                np.copyto(rate_of_level, by_cell[octave], where=is_closer)
+            elif rate_of_level.any():  # memory that was never written to is not taken
+                np.copyto(rate_of_level, 0, where=is_closer)
         rated_level[is_closer] = gist.level
 
     def remaining(self) -> tuple[float, float]:

@@ -66,11 +66,11 @@ def _border_of_colour(
     first_columns = [first for first, _ in cell_columns]
     sample = pixels[:, first_rows][:, :, first_columns]
     has_colour = _of_colour(sample, colour, _single_pixels(len(cell_rows)), _single_pixels(len(cell_columns)))
-    candidates = _reaching_border(has_colour)
+    candidates = reaching_border(has_colour)
     for x1, x2 in _runs(candidates.any(0)):
         for y1, y2 in _runs(candidates[:, x1:x2].any(1)):
             candidates[y1:y2, x1:x2] &= _of_colour(pixels, colour, cell_rows[y1:y2], cell_columns[x1:x2])
-    return _reaching_border(candidates)
+    return reaching_border(candidates)
 
 
 def _single_pixels(count: int) -> _Spans:
@@ -133,14 +133,56 @@ def _runs(marked: NDArray[np.bool_] | np.bool_) -> _Spans:
     return [*zip(changes[::2], changes[1::2], strict=True)]
 
 
-def _reaching_border(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Keep the marked cells that reach the border over marked neighbours; `(rows, columns)`."""
-    reached = cells.copy()
-    reached[1:-1, 1:-1] = False
+def reaching_border(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keep the marked cells that reach the border over marked neighbours.
+
+    Runs of marked cells in a row are linked where they touch. To grow the border cell by cell would take as many steps
+    as the longest way is long, and a picture may hold a maze.
+
+    Args:
+        cells: `(rows, columns)`.
+
+    Returns:
+        `(rows, columns)`, the marked cells that are kept.
+    """
+    begins = _begin_of_runs(cells)
+    # 0 is all beyond the border, and the runs are numbered from 1.
+    runs = np.cumsum(begins, dtype=np.int32).reshape(cells.shape) * cells
+    touch = _begin_of_runs(cells[:-1] & cells[1:])
+    outer = np.concatenate([runs[0], runs[-1], runs[:, 0], runs[:, -1]])
+    outer = outer[outer > 0]
+    first = np.concatenate([runs[:-1][touch], outer])
+    second = np.concatenate([runs[1:][touch], np.zeros_like(outer)])
+    reaches = _least_linked(int(begins.sum()) + 1, first, second) == 0
+    return reaches[runs] & cells
+
+
+def _begin_of_runs(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keep the first of each run of marked cells in a row; `(rows, columns)`."""
+    begins = marked.copy()
+    begins[:, 1:] &= ~marked[:, :-1]
+    return begins
+
+
+def _least_linked(count: int, first: NDArray[np.int32], second: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Find for each of some numbers the least one to which links lead, over others as well.
+
+    Args:
+        count: how many numbers there are, from 0.
+        first: the numbers at one end of the links.
+        second: those at the other end.
+
+    Returns:
+        `(count,)`.
+    """
+    least = np.arange(count, dtype=np.int32)
     while True:
-        padded = np.pad(reached, 1)
-        neighbours = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
-        grown = cells & (reached | neighbours)
-        if (grown == reached).all():
-            return reached
-        reached = grown
+        ends = np.stack([least[first], least[second]])
+        differ = ends[0] != ends[1]
+        if not differ.any():
+            return least
+        first = first[differ]
+        second = second[differ]
+        np.minimum.at(least, ends.max(0)[differ], ends.min(0)[differ])
+        while not np.array_equal(further := least[least], least):
+            least = further

@@ -19,7 +19,7 @@ from torch import Tensor
 from semfov.errors import check
 
 CELLS = 8  # cells along a side of the closest window
-MOST_CELLS = 1 << 22  # cells of a picture, for each of which a belief keeps some numbers by level: a gigabyte in all
+MOST_CELLS = 1 << 22  # cells of a picture, for each of which a belief keeps some numbers by level: a gigabyte at most
 MOST_IN_LINE = 1 << 14  # cells along a side; sums over the windows of a strip take kilobytes for each
 
 

@@ -7,6 +7,7 @@ cells of the picture                        windows of 3 × 3 cells
 """
 
 from collections.abc import Callable, Iterator
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -80,12 +81,17 @@ class WindowSums:
         rows, columns = shape
         down = max(rows - self._span, 0) + 1
         across = max(columns - self._span, 0) + 1
+        self._weight = weight
         self._sums = np.zeros((down, across), np.float32)
-        # Column n holds the weights of a window that starts at cell n. One matrix serves both axes, in part.
-        starts = np.arange(min(max(down, across), _BLOCK))
-        self._band = np.zeros((len(starts) + self._span - 1, len(starts)), np.float32)
-        self._band[starts + np.arange(self._span)[:, None], starts] = weight[:, None]
         self.changed: CellBox | None = (0, 0, columns, rows)
+
+    @cached_property
+    def _band(self) -> Cells:
+        """The weights of a window that starts at cell n, in column n; one matrix serves both axes, in part."""
+        starts = np.arange(min(max(self._sums.shape), _BLOCK))
+        band = np.zeros((len(starts) + self._span - 1, len(starts)), np.float32)
+        band[starts + np.arange(self._span)[:, None], starts] = self._weight[:, None]
+        return band
 
     def mark(self, box: CellBox) -> None:
         """Note that the cells in a box may have changed.
@@ -111,13 +117,19 @@ class WindowSums:
         bottom = min(y2, self._sums.shape[0])
         right = min(x2, self._sums.shape[1])
         cells = self._read_cells((slice(top, bottom + reach), slice(left, right + reach)))
+        changed_sums = self._sums[top:bottom, left:right]
+        if not cells.any():
+            # Most levels of a very large picture stay empty, and memory that was never written to is not taken.
+            if changed_sums.any():
+                changed_sums[:] = 0
+            return self._sums
         # NumPy would start threads for large pictures, and they would wait at full load for the next product.
         row_sums = self._sums_of_rows(torch.from_numpy(cells), right - left)
         sums = [
             torch.from_numpy(self._band[: len(part), :count]).mT @ part
             for count, part in self._blocks(row_sums, bottom - top)
         ]
-        self._sums[top:bottom, left:right] = torch.cat(sums).numpy()
+        changed_sums[:] = torch.cat(sums).numpy()
         return self._sums
 
     def _sums_of_rows(self, cells: Tensor, across: int) -> Tensor:

@@ -22,7 +22,7 @@ from semfov.sensor.glimpse import glimpse, windows_at
 from semfov.settings import FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.blank import blank_cells
+from semfov.zoom.blank import blank_cells, reaching_border
 from semfov.zoom.eye import BORDER, _hints_of
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import CELLS
@@ -523,6 +523,32 @@ def test_one_colour_inside_a_picture_is_something_unless_it_is_no_data(tmp_path)
         assert torch.equal(cells[: int(250 / high)], only_border[: int(250 / high)])
         assert cells[int(300 / high + 1) : int(400 / high), int(300 / wide + 1) : int(500 / wide)].all()
         assert not cells[int(400 / high) + 1 :].any()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+def test_what_reaches_the_border_does_so_step_by_step(share):
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        cells = rng.random(rng.integers(1, 20, 2)) < share
+        ground = np.pad(cells, 1, constant_values=True)
+        reached = np.zeros_like(ground)
+        reached[[0, -1]] = True
+        reached[:, [0, -1]] = True
+        for _ in range(ground.size):
+            reached[1:-1] |= ground[1:-1] & (reached[:-2] | reached[2:])
+            reached[:, 1:-1] |= ground[:, 1:-1] & (reached[:, :-2] | reached[:, 2:])
+        np.testing.assert_array_equal(reaching_border(cells), reached[1:-1, 1:-1])
+
+
+def test_blank_ground_in_a_maze_is_found_at_once():
+    """Step by step it would take as many steps as the way is long, half a million."""
+    maze = np.ones((1025, 1024), bool)
+    maze[1::2] = False
+    maze[1::4, -1] = True
+    maze[3::4, 0] = True
+    inside = np.pad(maze, 2)
+    inside[:3, 2] = True  # the way in
+    np.testing.assert_array_equal(reaching_border(inside), inside)
 
 
 def test_slices_of_blank_ground_are_left_out():

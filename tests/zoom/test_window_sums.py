@@ -42,3 +42,18 @@ def test_a_long_strip_takes_memory_in_proportion_to_its_cells():
     assert tracemalloc.get_traced_memory()[1] < 16 * cells.nbytes
     tracemalloc.stop()
     assert (sums.update() == 64).all()
+
+
+def test_empty_cells_take_no_memory_and_sums_that_become_empty_are_0():
+    cells = np.zeros((900, 900), np.float32)
+    tracemalloc.start()
+    sums = WindowSums(np.ones(400, np.float32), cells.shape, lambda slices: cells[slices])
+    assert not sums.update().any()
+    assert tracemalloc.get_traced_memory()[1] < 2 * 501**2 * 4
+    tracemalloc.stop()
+    cells[450, 450] = 1
+    sums.mark((450, 450, 451, 451))
+    assert sums.update().sum() == 400**2
+    cells[450, 450] = 0
+    sums.mark((450, 450, 451, 451))
+    assert not sums.update().any()
