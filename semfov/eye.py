@@ -1,5 +1,6 @@
 """The eye: a sensor and a detector together, which give the detections for a fixation in an image."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.data.inputs import ImageLike, PointLike, as_image, as_points, as_positions
+from semfov.data.windowed import reduction_for, resized
 from semfov.detection.crops import merge_crops
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector, check_images
@@ -19,6 +21,9 @@ from semfov.io.state import StatedModule
 from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.glimpse import glimpse, window_around
+
+MOST_FLOATS = 1 << 25  # pixels of a picture all of whose floats are made
+_LONGEST = 1024  # longer side in pixels of the copy of a picture of bytes, at least, which is fitted into the canvas
 
 
 class View(NamedTuple):
@@ -75,7 +80,7 @@ class Eye(StatedModule):
             InputError: it is no picture.
             DataError: the file of the image cannot be read.
         """
-        if not (isinstance(image, Tensor) and image.ndim == 4 and image.is_floating_point()):
+        if not (isinstance(image, Tensor) and image.ndim == 4 and _is_taken(image)):
             image = as_image(image, like=self.sensor.like)[None]
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.fit(image)
@@ -88,16 +93,27 @@ class Eye(StatedModule):
         """Fit an image into the canvas of the sensor, which is the detector's input unless the sensor says otherwise.
 
         Args:
-            image: `(1, 3, H, W)`, RGB in [0, 1].
+            image: `(1, 3, H, W)`, RGB in [0, 1], or bytes.
 
         Returns:
             The canvas `(1, 3, h, w)`, and the placement of the image on it.
         """
+        if image.dtype == torch.uint8:
+            return self._fit_bytes(image)
         size = self.sensor.canvas_size((image.shape[-1], image.shape[-2]), self.reference)
         if size is None:
             return self.detector.fit(image)
         check_images(image)
         return letterbox(image, size, stretch=True)
+
+    def _fit_bytes(self, image: Tensor) -> tuple[Tensor, Placement]:
+        """Fit the bytes of a large picture into the canvas, by way of a smaller copy, without floats of all pixels."""
+        size = image.shape[-1], image.shape[-2]
+        copy = _floats(image, max(size) / _LONGEST, self.sensor.like)
+        canvas, placement = self.fit(copy)
+        across = placement.scale[0] * copy.shape[-1] / size[0]
+        down = placement.scale[1] * copy.shape[-2] / size[1]
+        return canvas, replace(placement, size=size, scale=(across, down))
 
     def foveated(self, view: View, fixations: PointLike) -> Tensor:
         """Apply the sensor at fixations.
@@ -204,7 +220,7 @@ class Eye(StatedModule):
         one pass of the detector.
 
         Args:
-            image: `(1, 3, H, W)`, RGB in [0, 1].
+            image: `(1, 3, H, W)`, RGB in [0, 1], or bytes.
             box: `(4,)`, the place as `(x1, y1, x2, y2)` in pixels of the image.
 
         Returns:
@@ -214,13 +230,30 @@ class Eye(StatedModule):
             InputError: a shape is wrong.
         """
         check_shape(image, "image", 1, 3, None, None)
-        window = window_around(box.to(image.dtype), (image.shape[-1], image.shape[-2]))
+        window = window_around(box.to(self.sensor.like.dtype), (image.shape[-1], image.shape[-2]))
         sides = window[2:] - window[:2]
         scale = (sides.new_tensor(self.detector.input_size) / sides).amin()
         width, height = (max(1, round(side)) for side in (sides * scale).tolist())
-        detections = self.detector(glimpse(image, window[None], (width, height)).clamp_(0, 1)).to(box.device)
+        canvas = self._closely(image, window, (width, height)).clamp_(0, 1)
+        detections = self.detector(canvas).to(box.device)
         unit = (sides / sides.new_tensor([width, height])).repeat(2)
         return replace(detections, boxes=detections.boxes * unit + window[:2].repeat(2))
+
+    def _closely(self, image: Tensor, window: Tensor, size: tuple[int, int]) -> Tensor:
+        """Resample a window of an image to a `(width, height)`; of bytes, floats are made around it alone."""
+        if image.dtype != torch.uint8:
+            return glimpse(image, window[None], size)
+        ratio = float((window[2:] - window[:2]).amax()) / max(size)
+        # The filter reaches a pixel of the canvas further than the window.
+        reach = math.ceil(max(ratio, 1.0)) + 1
+        x1, y1, x2, y2 = window.tolist()
+        left = max(math.floor(x1) - reach, 0)
+        top = max(math.floor(y1) - reach, 0)
+        part = image[:, :, top : math.ceil(y2) + reach, left : math.ceil(x2) + reach]
+        copy = _floats(part, ratio, self.sensor.like)
+        scale = window.new_tensor([copy.shape[-1] / part.shape[-1], copy.shape[-2] / part.shape[-2]])
+        on_copy = (window - window.new_tensor([left, top]).repeat(2)) * scale.repeat(2)
+        return glimpse(copy, on_copy[None], size)
 
     def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
         """Open an image and look from fixations.
@@ -242,6 +275,19 @@ class Eye(StatedModule):
         """
         sensor = self.sensor.settings() | {"reference": self.reference}
         return {"sensor": sensor, "detector": self.detector.settings()}
+
+
+def _is_taken(image: Tensor) -> bool:
+    """Tell whether pixels are taken as they are: floats, and the bytes of a picture whose floats take too much."""
+    are_many = image.shape[-1] * image.shape[-2] > MOST_FLOATS
+    return image.is_floating_point() or (image.dtype == torch.uint8 and are_many)
+
+
+def _floats(image: Tensor, ratio: float, like: Tensor) -> Tensor:
+    """Make floats in [0, 1] of bytes `(1, 3, h, w)`, reduced where they are to have far fewer pixels (`ratio`)."""
+    reduction = reduction_for(ratio)
+    height, width = image.shape[-2:]
+    return resized(image[0], (max(1, height // reduction), max(1, width // reduction))).to(like) / 255
 
 
 def _on_canvas(fixations: PointLike, view: View) -> Tensor:

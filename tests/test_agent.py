@@ -5,6 +5,8 @@ import pickle
 
 import pytest
 import torch
+from PIL import Image
+from torch.nn import functional as F
 
 from semfov import (
     ActivePerception,
@@ -17,7 +19,9 @@ from semfov import (
     load_detector,
     saliency,
 )
+from semfov.agents.picture import OpenedPicture
 from semfov.belief.observers import Semantic, SemanticSearch
+from semfov.data.examples import example_scene
 from semfov.decision import confirms
 from semfov.episode import STAGES
 from semfov.errors import InputError
@@ -491,3 +495,35 @@ def test_an_exploration_as_people_look_follows_the_density(agent, image, monkeyp
     refused("policy: expected 'people', or None, got cats", agent.explore, image, policy="cats")
     with pytest.raises(InputError, match=r"policy: expected none for .* by windows, got people"):
         agent.explore(image, how="windows", policy="people")
+
+
+def test_a_fovea_reads_the_bytes_of_a_large_picture(tmp_path, monkeypatch):
+    """Its floats would take gigabytes; looks, closer ones too, show what they show of floats, in its pixels."""
+    agent = ActivePerception.recommended()
+    photograph = example_scene("market", ["person"]).image
+    height, width = (7 * side for side in photograph.shape[-2:])  # large enough to be reduced
+    path = tmp_path / "large.png"
+    pixels = F.interpolate(photograph[None], (height, width), mode="bicubic")[0].clamp(0, 1)
+    Image.fromarray((255 * pixels.permute(1, 2, 0)).byte().numpy()).save(path)
+
+    def look(box):
+        eye = agent.eye
+        image = OpenedPicture.of(path).pixels(eye.sensor.like)
+        close = eye.close_up(image, torch.tensor(box))
+        return agent.explore(path, how="fovea", shifts=2), agent.search(path, "person", how="fovea", shifts=2), close
+
+    box = [0.1 * width, 0.7 * height, 0.25 * width, 0.85 * height]
+    expected, found, close = look(box)
+    for module in ("semfov.eye", "semfov.agents.picture"):
+        monkeypatch.setattr(f"{module}.MOST_FLOATS", 1000)
+    monkeypatch.setattr("semfov.agents.picture.as_image", lambda *_, **__: pytest.fail("floats of all pixels"))
+    explored, found_on_bytes, close_on_bytes = look(box)
+    assert explored.size == expected.size == (width, height)
+    assert torch.equal(explored.fixations, expected.fixations)
+    assert len(explored.objects) == len(expected.objects) >= 1
+    torch.testing.assert_close(explored.objects.boxes, expected.objects.boxes, atol=0.004 * width, rtol=0)
+    assert (explored.photograph.int() - expected.photograph.int()).abs().float().mean() < 1
+    assert found_on_bytes.decision.probability == pytest.approx(found.decision.probability, abs=0.02)
+    best, best_on_bytes = (detections.scores[0, :, 1:].max() for detections in (close, close_on_bytes))
+    assert best > 0.3
+    assert float(best_on_bytes) == pytest.approx(float(best), abs=0.05)

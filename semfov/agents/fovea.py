@@ -68,7 +68,7 @@ class FoveaAgent(GazeParts):
 
         def criterion(grid: Grid) -> StoppingCriterion:
             if boxes is not None:
-                return AtGoal(_goal_cells(boxes, grid, image))
+                return AtGoal(_goal_cells(boxes, grid, self.eye.sensor.like))
             score = _CONFIRM if settings.confirm is None else settings.confirm
             return AtDetection(grid, index, weights, score)
 

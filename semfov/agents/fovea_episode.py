@@ -251,7 +251,7 @@ class FoveaGaze:
         detections = self._eye.close_up(self.image, candidate.box)
         watch.lap("detect")
         size = self.image.shape[-1], self.image.shape[-2]
-        region = window_around(candidate.box.to(self.image.dtype), size).tolist()
+        region = window_around(candidate.box.to(self._eye.sensor.like.dtype), size).tolist()
         verdict = self.criterion.examine(detections)
         return _CloserLook(candidate.cell, region, detections, watch.seconds, candidate.probability, verdict)
 
@@ -263,7 +263,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
 
     Args:
         plan: how the gaze moves.
-        image: the photograph, `(1, 3, H, W)`.
+        image: the photograph, `(1, 3, H, W)`, floats or bytes.
         limits: where the episode ends, unless it decides before.
         criterion: makes another stopping criterion than the plan's from the cells; None takes that of the plan.
     """

@@ -102,16 +102,18 @@ class FoveaKind(KindOfLook):
 
     def search(self, picture: OpenedPicture, target: TargetLike, settings: SearchSettings) -> Record:
         fovea = self.parts.fovea
-        return picture.named(fovea.search(picture.image(fovea.eye.sensor.like), target, settings))
+        return picture.named(fovea.search(picture.pixels(fovea.eye.sensor.like), target, settings))
 
     def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
         fovea = self.parts.fovea
-        record = fovea.find_all(picture.image(fovea.eye.sensor.like), targets, settings)
+        record = fovea.find_all(picture.pixels(fovea.eye.sensor.like), targets, settings)
         return _counted_from(picture.named(record), settings.score_threshold)
 
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
         fovea = self.parts.fovea
-        record = fovea.explore(picture.image(fovea.eye.sensor.like), settings)
+        # Where people look is predicted from floats.
+        read = picture.pixels if settings.policy is None else picture.image
+        record = fovea.explore(read(fovea.eye.sensor.like), settings)
         return _counted_from(picture.named(record), settings.score_threshold)
 
     def stream(self, target: int | None, targets: tuple[int, ...], settings: StreamSettings) -> StreamEpisode[Moment]:

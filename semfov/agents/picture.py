@@ -18,6 +18,7 @@ from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
 from semfov.errors import InputError, SemfovError, check, lookup
+from semfov.eye import MOST_FLOATS
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import Panorama, World
@@ -134,6 +135,14 @@ class OpenedPicture:
         width, height = self.large.size
         self._check_area(width, height)
         return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
+
+    def pixels(self, like: Tensor) -> Tensor:
+        """Read the pixels for a fovea, as `image`; `(1, 3, H, W)` of bytes where floats of all would take too much."""
+        if self.scene or math.prod(self._size()) <= MOST_FLOATS:
+            return self.image(like)
+        width, height = self.large.size
+        self._check_area(width, height)
+        return self.large.read((0, 0, width, height))[None]
 
     @property
     def is_panorama(self) -> bool:

@@ -106,7 +106,7 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     """Reduce a picture to the bytes that a record keeps for its drawings.
 
     Args:
-        picture: the opened picture, or pixels `(3, H, W)` in [0, 1].
+        picture: the opened picture, or pixels `(3, H, W)` in [0, 1]; bytes of a larger one.
 
     Returns:
         `(3, h, w)`, with at most `LONGEST` pixels along the longer side.
@@ -121,6 +121,8 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
     if isinstance(picture, Tensor):
         if scale == 1:
             return in_bytes(picture)
+        if picture.dtype == torch.uint8:
+            return resized(picture, (reduced_height, reduced_width))[0].clone()
         return in_bytes(resize(picture[None], (reduced_width, reduced_height))[0])
     pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
     # Frames may share the memory of a camera; a copy in the order of memory is made ten times faster than another.
