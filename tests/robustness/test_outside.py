@@ -2,6 +2,7 @@
 
 import sys
 from contextlib import suppress
+from itertools import product
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from benchmarks.fuzz.watch import listener, opened_files
 from semfov import SemfovError, read_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.rasters import RasterPicture
+from semfov.data.sources import open_stream
 from semfov.paths.georeference import georeference
 from tests.refusals import unusable
 
@@ -72,12 +74,25 @@ def elsewhere(name):
 BESIDE = (
     *("{name}.ovr", "{name}.aux.xml", "{name}.msk", "{stem}.aux", "{stem}.wld", "{stem}.tfw", "{stem}.pgw"),
     *("{stem}.jgw", "{stem}.j2w", "{stem}.prj", "{stem}.tab", "{stem}.IMD", "{stem}.RPB", "{name}.ovr.aux.xml"),
+    *(
+        "{stem}_RPC.TXT",
+        "{stem}.hdr",
+        "{stem}.xml",
+        "{stem}.rrd",
+        "{stem}.json",
+        "{stem}.txt",
+        "{stem}.sub",
+        "world.tfw",
+    ),
+    *("data.yaml", "classes.txt", "mine.json"),
 )
 HEADS = (
     *(b"", b"\x89PNG", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0", b"II*\0\x08\0\0\0", b"MM\0*"),
+    *(b"BM", b"GIF89a", b"RIFF\0\0\0\0WEBP", b"P6\n"),
     *(b"II+\0\x08\0\0\0", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP  \r\n\x87\n"),
 )
-KINDS = ".tif", ".jp2", ".png", ".jpg"
+SOURCES = ".tif", ".jp2", ".png", ".jpg"  # of mosaics
+KINDS = *SOURCES, ".bmp", ".gif", ".webp", ".ppm"
 
 
 def picture(path, comment=b""):
@@ -121,8 +136,7 @@ def check_alone(folders, address, path, allowed, *, read=True):
         assert not (abs(pixels.astype(int) - SECRET) <= 3).any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("inside", [False, True], ids=["itself", "in a mosaic"])
+@pytest.mark.parametrize(("kind", "inside"), [*product(KINDS, [False]), *product(SOURCES, [True])], ids=str)
 def test_nothing_beside_a_raster_is_opened(folders, address, kind, inside):
     public, private = folders
     path = picture(public / f"a{kind}")
@@ -152,7 +166,7 @@ def test_a_head_is_no_picture(folders, address, kind, head):
                 check_alone(folders, address, shown, {path.name}, read=False)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SOURCES)
 def test_what_is_written_in_a_picture_is_no_mosaic(folders, address, kind):
     """A sound picture with the text of a mosaic in its comment, in its metadata, or behind its end."""
     public, private = folders
@@ -165,6 +179,56 @@ def test_what_is_written_in_a_picture_is_no_mosaic(folders, address, kind):
         (public / "b.vrt").write_text(mosaic(path.name, relative=1))
         for shown in (path, public / "b.vrt"):
             check_alone(folders, address, shown, {path.name}, read=kind != ".png")
+
+
+def film(path):
+    """Write a film of four frames."""
+    cv2 = pytest.importorskip("cv2", reason="needs OpenCV (pip install opencv-python-headless)")
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter_fourcc(*("MJPG" if path.suffix == ".avi" else "mp4v")), 5, (64, 64)
+    )
+    for shade in (40, 60, 80, 100):
+        writer.write(np.full((64, 64, 3), shade, np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.mark.parametrize("kind", [".mp4", ".mkv", ".avi"])
+def test_nothing_beside_a_film_is_opened(folders, address, kind):
+    public, private = folders
+    path = film(public / f"a{kind}")
+    for beside in (*BESIDE, "{stem}.srt", "{stem}.idx", "{stem}.m3u8"):
+        text = mosaic(private / "secret.tif")
+        (public / beside.format(name=path.name, stem=path.stem)).write_text(text)
+    with opened_files(public, private) as names:
+        assert len([*open_stream(path).frames]) == 4
+    assert names == {path.name}
+    assert not address[1]
+
+
+@pytest.mark.parametrize("kind", [".mp4", ".mkv", ".avi", ".gif"])
+def test_a_text_with_the_name_of_a_film_opens_nothing(folders, address, kind):
+    """Lists of films, a session of a stream, a place for subtitles: FFmpeg knows them by their content."""
+    public, private = folders
+    film(public / "beside.mp4")
+    url, requests = address
+    port = url.rpartition(":")[2]
+    place = f"m=video {port} RTP/AVP 96\na=rtpmap:96 H264/90000\n"
+    texts = [
+        *(f"#EXTM3U\n#EXTINF:1,\n{name}\n" for name in (f"{url}/a.ts", private / "secret.tif")),
+        *(f"ffconcat version 1.0\nfile '{name}'\n" for name in ("beside.mp4", f"{url}/a", private / "secret.tif")),
+        f"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\n{place}",
+        f"<?xml version='1.0'?><MPD><Period><BaseURL>{url}/a.mp4</BaseURL></Period></MPD>",
+        "# VobSub index file, v7 (do not modify this line!)\nid: en, index: 0\n",
+        mosaic(private / "secret.tif"),
+    ]
+    for text in texts:
+        path = public / f"a{kind}"
+        path.write_text(text)
+        with opened_files(public, private) as names:
+            unusable("a text, such as a playlist", open_stream, path)
+        assert names == {path.name}
+    assert not requests
 
 
 def siblings(folders, url):
