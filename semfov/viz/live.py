@@ -196,7 +196,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
         A function that adds a frame `(h, w, 3)`; all have the size of the first one.
 
     Raises:
-        DataError: OpenCV is not installed, or cannot write such a video.
+        DataError: OpenCV is not installed, or cannot write such a video, as on a full disk.
     """
     with needing("OpenCV", path, "opencv-python-headless", DataError):
         import cv2  # noqa: F401
@@ -207,6 +207,7 @@ def video(path: Path, rate: float) -> Iterator[Callable[[_Frame], None]]:
         try:
             yield writer.add
             if writer.close():
+                writer.check()
                 named.replace(temporary)
         finally:
             writer.close()
@@ -226,6 +227,7 @@ class _FrameWriter:
         self._file = file
         self._path = path
         self._rate = rate
+        self._frames = 0
         self._writer: Any = None
 
     def add(self, frame: _Frame) -> None:
@@ -233,6 +235,7 @@ class _FrameWriter:
         if self._writer is None:
             self._open(frame.shape[1], frame.shape[0])
         self._writer.write(np.ascontiguousarray(frame[..., ::-1]))  # OpenCV writes BGR
+        self._frames += 1
 
     def _open(self, width: int, height: int) -> None:
         """Open the file for frames of a size; raises `DataError` where OpenCV has no encoder."""
@@ -250,3 +253,17 @@ class _FrameWriter:
             return False
         self._writer.release()
         return True
+
+    def check(self) -> None:
+        """Raise `DataError` where the file does not end with the last frame: OpenCV says nothing of a full disk."""
+        import cv2
+
+        film = cv2.VideoCapture(str(self._file.absolute()))
+        film.set(cv2.CAP_PROP_POS_FRAMES, self._frames - 1)
+        is_read, _ = film.read()
+        is_whole = is_read and film.get(cv2.CAP_PROP_FRAME_COUNT) >= self._frames
+        film.release()
+        if not is_whole:
+            raise DataError(
+                f"cannot write {self._path}: the disk may be full; make room, and give the same command again"
+            )

@@ -20,7 +20,7 @@ from semfov.paths import FoveaMoment
 from semfov.paths.fovea import moment_look
 from semfov.viz.live import draw_moment, video, video_suffix
 from tests import small
-from tests.refusals import refused
+from tests.refusals import refused, unusable
 
 cv2 = pytest.importorskip("cv2")
 
@@ -328,3 +328,26 @@ def test_videos_are_written_completely_or_not_at_all(tmp_path):
         fail()
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["film.avi"]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
+def test_a_film_that_does_not_fit_on_the_disk_is_not_written(tmp_path, suffix):
+    """OpenCV says nothing of it. A limit of the size of files stands for the disk."""
+    resource = pytest.importorskip("resource")
+    rng = np.random.default_rng(0)
+    path = tmp_path / f"film{suffix}"
+
+    def write(frames):
+        with video(path, 10) as add:
+            for _ in range(frames):
+                add(rng.integers(0, 255, (128, 128, 3), np.uint8))
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 17, hard))
+    try:
+        unusable("the disk may be full; make room", write, 100)
+        assert not [*tmp_path.iterdir()]
+        write(2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.stat().st_size > 1000
