@@ -209,6 +209,23 @@ def open_stream(source: str | Path | int, most: int | None = None, white: White 
     return _open_recorder(_Film(path, container), most, white)
 
 
+def has_frames(path: Path, count: int) -> bool:
+    """Tell whether a video can be read up to its last frame.
+
+    Args:
+        path: its file, which was just written by OpenCV.
+        count: number of frames that were written.
+    """
+    import cv2
+
+    film = _Film(path).recorder(cv2)
+    film.set(cv2.CAP_PROP_POS_FRAMES, count - 1)
+    is_read, _ = film.read()
+    stated = film.get(cv2.CAP_PROP_FRAME_COUNT)
+    film.release()
+    return is_read and stated >= count
+
+
 def _open_folder(folder: Path, most: int | None, white: White | None) -> Stream:
     """Open a folder of frames, whose rate nothing tells."""
     gaps: Counter[str] = Counter()

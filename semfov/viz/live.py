@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.data.sources import has_frames
 from semfov.detection.objects import NO_TRACK
 from semfov.errors import DataError, needing
 from semfov.io.files import replacing
@@ -256,14 +257,7 @@ class _FrameWriter:
 
     def check(self) -> None:
         """Raise `DataError` where the file does not end with the last frame: OpenCV says nothing of a full disk."""
-        import cv2
-
-        film = cv2.VideoCapture(str(self._file.absolute()))
-        film.set(cv2.CAP_PROP_POS_FRAMES, self._frames - 1)
-        is_read, _ = film.read()
-        is_whole = is_read and film.get(cv2.CAP_PROP_FRAME_COUNT) >= self._frames
-        film.release()
-        if not is_whole:
+        if not has_frames(self._file, self._frames):
             raise DataError(
                 f"cannot write {self._path}: the disk may be full; make room, and give the same command again"
             )
