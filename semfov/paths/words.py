@@ -217,7 +217,7 @@ class Words(ABC):
         return f"This assumes that {share}; if half of them did, it would be {at_half:.2f} after these looks."
 
     def lack(self) -> str:
-        """Say what an undecided search lacked: what `found` takes, and that no place has it.
+        """Say what an undecided search lacked: a place that is sure, and what `found` takes.
 
         Returns:
             The sentence; empty for other decisions, and where it is not known what `found` takes.
@@ -226,9 +226,13 @@ class Words(ABC):
         decision = record.decision
         if decision is None or decision.outcome != "undecided" or decision.confirm is None:
             return ""
-        if record.closer:
-            return f"No place reached probability {decision.confirm:.3g} ({len(record.closer)} looked at closely)."
-        return f"To call it found takes {self.decided_by} {decision.confirm:.3g}, and a look that shows it."
+        if self.decided_by != "probability":
+            return f"To call it found takes {self.decided_by} {decision.confirm:.3g}, and a look that shows it."
+        is_likely = "is probably" if decision.probability >= _CLEAR else "may be"
+        reached = f"none reached probability {decision.confirm:.3g} ({len(record.closer)} looked at closely)"
+        if not record.closer:
+            reached = f"to call it found takes probability {decision.confirm:.3g}, and a look that shows it"
+        return f"It {is_likely} there, but no place is sure: {reached}."
 
     @property
     def ended(self) -> str:

@@ -100,7 +100,8 @@ def _draw_people(axes: Axes, fixations: Fixations, image: Tensor, boxes: Tensor 
 def _draw_record(axes: Axes, record: Record, image: Tensor, boxes: Tensor | None, *, objects: bool) -> None:
     """Draw the looks of a record, and its objects if they are wanted."""
     draw_place(axes, record, image, boxes)
-    title = f"{record.describe()}. {record.words.assumption()}".removesuffix(". ")
+    remarks = filter(None, [record.words.lack(), record.words.assumption()])
+    title = ". ".join([record.describe(), " ".join(remarks)]).removesuffix(". ")
     axes.set_title(fill(title, 100), parse_math=False)
     entries = annotation_entries(record, boxes)
     if objects:
