@@ -29,8 +29,10 @@ OPTIONS = _by_word(
         "grid": "cells columns rows",
         "detector name": "model yolo",
         "model": "models",
+        "models model": "checkpoint ckpt",
+        "host": "bind server_name share",
         "device": "gpu cuda",
-        "half": "fp16 float16",
+        "half": "amp fp16 float16",
         "out": (
             "csv excel export figure format geojson heatmap json output output_dir overlay pdf plot png project save "
             "save_img show svg visualise visualize"
@@ -48,7 +50,7 @@ OPTIONS = _by_word(
         "seconds": "duration max_seconds time time_budget time_limit timeout",
         "workers": "jobs num_workers parallel processes threads",
         "on_look": "callback on_step",
-        "looks quiet": "verbose",
+        "looks quiet": "log_level verbose",
         "quiet": "silent",
         "batch": "batch_size",
         "classes": "names",
@@ -74,12 +76,13 @@ def note_of_former(former: str, present: str) -> str:
 
 COMMANDS = _by_word(
     {
-        "find": "analyse analyze annotate batch count detect infer label predict run segment",
+        "find": "analyse analyze annotate batch count detect infer label predict run segment survey",
         "gaze": "aoi attention eye-tracking fixations heat-map heatmap saliency scanpath scanpaths",
+        "gaze --compare": "ab abtest diff",
         "live": "camera stream track video watch webcam",
         "fit": "calibrate finetune learn train",
         "compare": "bench benchmark eval evaluate sahi slice tile val validate",
-        "detectors": "list model models weights",
+        "detectors": "download list model models pull weights",
         "explore": "map scan",
         "app": "gradio gui serve ui web",
         "demo": "example examples start try",
@@ -88,10 +91,38 @@ COMMANDS = _by_word(
 )
 """Commands of ours by words of others."""
 
+ADVICE = _by_word(
+    {
+        "the same command goes on where it stopped": "continue restart resume",
+        "what is transparent in a picture is left out": "exclude ignore mask",
+        "semfov chooses the windows; `semfov compare` sets all slices beside it": (
+            "overlap overlap_ratio slice slice_size sliding tile tile_size tiles"
+        ),
+        "--out FILE.geojson has the coordinates of a GeoTIFF": "coordinates crs epsg gps latlon",
+        "--out FILE.csv has all boxes, to choose by their size": "max_area max_size min_area min_size",
+        "the map keeps the picture's colours; --out FOLDER writes it beside a table": "cmap colormap colourmap opacity",
+        "the model is of adults without a task; `semfov fit --help` has that of your viewers": (
+            "age audience gender persona"
+        ),
+        "the agent has one; in a checkout `python -m eval.search --help` compares several": (
+            "acquisition policies policy strategy"
+        ),
+    }
+)
+"""What to do in place of an option that others have, and the command has not."""
+
 _LOOKING = ("search", "find_all", "explore")
 
 _OF_TARGETS = "find_all(picture, target) lists what is there of a class, search(picture, target) decides"
-_OTHER_METHODS = {("explore", "target"): _OF_TARGETS, ("gaze", "target"): _OF_TARGETS}
+_OF_VIEWERS = "gaze.scanpaths(people, seconds=…) draws viewers from a prediction"
+_OTHER_METHODS = {
+    ("explore", "target"): _OF_TARGETS,
+    ("gaze", "target"): _OF_TARGETS,
+    ("gaze", "people"): _OF_VIEWERS,
+    ("gaze", "seconds"): _OF_VIEWERS,
+    ("gaze", "areas"): "gaze.share(areas) and gaze.visits(areas) are of a prediction",
+    ("search", "policy"): "explore takes one, and semfov.rollout one of yours",
+}
 """What to call in place of a method of an agent, by its name and the option that it has not."""
 
 _OF_DETECTORS = ("iou", "limit", "input_size", "device", "weights", "per_class", "classes")
@@ -110,6 +141,8 @@ _OTHER_PLACES = _by_word(
         "leave it out, as nothing is printed; on_look= is called after each look": "progress quiet verbose",
         "a whole list is looked at by semfov.run(pictures, target, workers=)": "batch_size jobs num_workers workers",
         "color='bgr' says that an array is BGR": "bgr channels",
+        "what is transparent in a picture is left out": "exclude ignore mask roi",
+        "semfov.run(pictures, target, out=FILE) goes on where it stopped": "restart resume",
         "agent.half() makes numbers of 16 bits of a detector of PyTorch": "float16 fp16 half",
     }
 )
@@ -141,13 +174,15 @@ def other_method(method: str, option: str, known: Collection[str]) -> str | None
     Returns:
         The advice; None if there is none.
     """
-    if (method, option) in _OTHER_METHODS:
-        return _OTHER_METHODS[method, option]
+    meant = (option, *OPTIONS.get(option, "").split())
+    advice = next((_OTHER_METHODS[method, word] for word in meant if (method, word) in _OTHER_METHODS), None)
+    if advice is not None:
+        return advice
     if method not in _LOOKING or meant_options(option, known):
         return None
     if option in _OTHER_PLACES:
         return _OTHER_PLACES[option]
-    of_detector = next((name for name in (option, *OPTIONS.get(option, "").split()) if name in _OF_DETECTORS), None)
+    of_detector = next((name for name in meant if name in _OF_DETECTORS), None)
     if of_detector is None:
         return None
     return f"an agent is made with it: semfov.ActivePerception.recommended({of_detector}=…)"
@@ -162,6 +197,8 @@ PACKAGE = _by_word(
             "Agent detect explore find find_all load predict search"
         ),
         "record.plot(), or semfov.viz": "plot show",
+        "seed= of a search or an exploration, or torch.manual_seed": "manual_seed seed seed_everything set_seed",
+        "semfov.envs, whose environments gymnasium.make knows": "Env make",
         "semfov.read_image": "imread open",
         "semfov.load_detector(name or file), or semfov.ActivePerception.recommended(name)": (
             "AutoDetectionModel AutoModel Detector YOLO from_pretrained get_model pipeline"
@@ -191,7 +228,11 @@ AGENT = _by_word(
         "agent.gaze(picture), which has share(areas) and visits(areas)": "aoi aois areas regions roi rois",
         "semfov.ActivePerception.from_pretrained(folder)": "load",
         "semfov.fit_detector(model, photographs, annotations)": "finetune fit",
-        "agent.live(target), whose step takes frames": "stream update video watch webcam",
+        "a new call, as an agent keeps nothing of earlier pictures": "clear close reset",
+        "semfov.run(folder, target)": "find_folder find_in_folder run_folder search_folder",
+        "record.belief_map(-1), of looks by a fovea or a head": "belief beliefs posterior",
+        "agent.explore(picture, policy=…), or semfov.rollout with one of yours": "act policy select_action",
+        "agent.live(target), whose step takes frames": "step stream update video watch webcam",
         "agent.classes[1:]": "class_names labels names",
         "agent.eye.detector": "detector model",
         "semfov.fit_detector, which writes a folder of models, and semfov.ActivePerception.from_pretrained(folder)": (
@@ -218,8 +259,13 @@ LIVE = _by_word(
 
 OBJECTS = _by_word(
     {
-        "objects.boxes, which are corners: objects.boxes[:, 2:] - objects.boxes[:, :2] are their sizes": "area xywh",
+        "objects.boxes, which are corners: objects.boxes[:, 2:] - objects.boxes[:, :2] are their sizes": (
+            "area areas height sizes width xywh"
+        ),
         "objects.above(score), or objects.of(name)": "filter select where",
+        "(objects.boxes[:, :2] + objects.boxes[:, 2:]) / 2": "center centers centre centres centroids",
+        "objects[objects.scores.argsort(descending=True)]": "sort sorted",
+        "objects.boxes, as the detector has no masks": "mask masks segmentation",
         "len(objects.of(name)), or record.expected with what was not seen": "count",
         "the objects as they are, as each has one box already": "nms with_nms with_nmm",
         "record.to_csv(path, 'objects')": "save to_csv write",
@@ -243,7 +289,11 @@ RECORD = _by_word(
         "len(record.objects), or record.expected with what was not seen": "count counts n num_objects number total",
         "record.to_frame()": "dataframe df to_dataframe to_df to_excel to_pandas",
         "record.why_it_ended()": "reason stop_reason stopped why",
-        "record.looks": "history n_looks num_looks steps windows",
+        "record.looks": "history n_looks num_looks slices steps tiles windows",
+        "record.objects.boxes, as the detector has no masks": "mask masks segmentation",
+        "record.objects.above(score), or record.objects.of(name)": "filter select where",
+        "record.expected_error, and record.objects.scores": "std uncertainties uncertainty",
+        "record.rows(), which has the value of each look": "gains reward rewards values",
         "record.plot()": "draw show visualize",
         "record.classes": "names",
         "record.objects, or the detections of a look, record[0].detections": (
@@ -261,8 +311,10 @@ RECORD = _by_word(
         "semfov.run(picture, target, crops=FOLDER)": "crop save_crop save_crops",
         "record.rows(), which has the seconds of each look": "duration elapsed seconds speed time times timing",
         "record.objects.track_ids, of a stream": "id ids track_id tracker_id",
-        "[look.fixation for look in record]": "fixations gaze path saccades scanpath sequence",
-        "record.belief_map(-1), of looks by a fovea or a head": "belief heat_map heatmap map posterior probabilities",
+        "[look.fixation for look in record]": "actions fixations gaze path saccades scanpath sequence",
+        "record.belief_map(-1), of looks by a fovea or a head": (
+            "belief beliefs entropy heat_map heatmap logits map posterior probabilities"
+        ),
     }
 )
 
@@ -276,6 +328,7 @@ GAZE_PREDICTION = _by_word(
             "export save to_frame to_json to_pandas to_png"
         ),
         "gaze.density": "fixation_map heat_map heatmap map probability saliency saliency_map",
+        "semfov.paths.Drafts(gaze, other)": "ab diff difference versus",
         "gaze.density.log()": "log_density log_probability logits",
         "gaze.scanpaths(people)": "fixations sample sample_scanpaths scanpath",
         "gaze.visits(areas)": "noticed seen_by time_to_first_fixation ttff viewers",

@@ -112,6 +112,12 @@ WRONG_USE = {
     "search --sensor wide": "sensor: expected 'published' or 'published-narrow' or",
     "search --agent recomended": "or 'raw', got 'recomended'; did you mean 'recommended'?",
     "search --draw portrait": "draw: expected some of 'scanpath', 'views', 'belief', 'belief_bars', 'animation'",
+    "find . --resume": "unknown option --resume; the same command goes on where it stopped",
+    "find . --mask roi.png": "unknown option --mask; what is transparent in a picture is left out",
+    "find . --min-size 20": "unknown option --min-size; --out FILE.csv has all boxes",
+    "gaze a.jpg --colormap jet": "unknown option --colormap; the map keeps the picture's colours",
+    "diff a.jpg b.jpg": "unknown command 'diff'; did you mean 'gaze --compare'?",
+    "resume": "unknown command 'resume'; the same command goes on where it stopped",
     "live a.mp4 b.mp4": "unexpected argument 'b.mp4'",
 }
 

@@ -16,6 +16,7 @@ from semfov import ActivePerception, words
 from semfov.cli.commands import SUBCOMMANDS
 from semfov.cli.options import FindOptions
 from semfov.detection.load import loader_options
+from semfov.errors import InputError
 from semfov.gaze.saliency import FixationDensity
 from semfov.paths import GazePrediction
 from tests import small
@@ -27,6 +28,8 @@ ATTRIBUTES = (
 )  # fmt: skip
 REMEDIES = {
     *(remedy for table in (*ATTRIBUTES, words._OTHER_PLACES) for remedy in table.values()),
+    *words.ADVICE.values(),
+    *words._OTHER_METHODS.values(),
     *(f"semfov.{call}" for call in words.MAKERS.values()),
     *(words.other_method("search", option, ()) for option in words._OF_DETECTORS),
     *(f"agent.{call}" for call in re.findall(r"\w+\(.*?\)", words._OF_TARGETS)),
@@ -104,6 +107,10 @@ def test_what_a_remedy_names_is_there(remedy, things):
         ("record", "num_looks", "record.looks"),
         ("gaze", "hotspots", "gaze.peaks()"),
         ("gaze", "aois", "gaze.share(areas)"),
+        ("agent", "reset", "an agent keeps nothing of earlier pictures"),
+        ("record", "masks", "the detector has no masks"),
+        ("objects", "sort", "objects[objects.scores.argsort(descending=True)]"),
+        ("gaze", "diff", "semfov.paths.Drafts(gaze, other)"),
     ],
 )
 def test_words_of_others_are_answered_with_ours(thing, word, remedy, things):
@@ -111,11 +118,26 @@ def test_words_of_others_are_answered_with_ours(thing, word, remedy, things):
         getattr(things[thing], word)
 
 
+@pytest.mark.parametrize(
+    ("method", "option", "remedy"),
+    [
+        ("gaze", "viewers", "gaze.scanpaths(people, seconds=…)"),
+        ("gaze", "aoi", "gaze.share(areas)"),
+        ("search", "policy", "explore takes one"),
+        ("find_all", "mask", "what is transparent in a picture is left out"),
+        ("find_all", "resume", "semfov.run(pictures, target, out=FILE)"),
+    ],
+)
+def test_options_of_others_are_answered_with_ours(method, option, remedy, things):
+    with pytest.raises(InputError, match=re.escape(remedy)):
+        getattr(things["agent"], method)(PIXELS, **{option: 1})
+
+
 def test_remedies_are_read():
     """So that the test above cannot pass because nothing is found in them."""
     roots = ("semfov", "agent", "record", "objects", "decision", "look", "live", "gaze")
     silent = [remedy for remedy in REMEDIES if "`" not in remedy and not [*expressions(remedy, roots)]]
-    assert len(silent) < 10 < len(REMEDIES) - 50
+    assert len(silent) < 16 < len(REMEDIES) - 50
 
 
 def test_methods_of_the_record_are_there(things):
