@@ -128,7 +128,7 @@ _WHOLE = {
 """Tables of the pages that are not of a single experiment."""
 
 _SEARCHED = [f"CP@{n}" for n in (1, 5, 15, 30)]
-_EXPLORED = [str(n) for n in (0, 1, 5, 10, 20)]
+_EXPLORED = [str(n) for n in (0, 1, 5, 20)]
 """Columns of the tables of runs that the pages show."""
 
 _HANDLERS: dict[type, Callable[[Any], None]] = {

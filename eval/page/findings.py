@@ -124,7 +124,7 @@ class _Advantage:
         printed = paper.TABLE_II | paper.TABLE_I
         if self.one not in printed or self.other not in printed or self.shifts != paper.TABLE_SHIFTS:
             return "-"
-        pairs = zip(printed[self.one][:-1], printed[self.other][:-1], strict=True)
+        pairs = zip(printed[self.one], printed[self.other], strict=True)
         return " / ".join(f"{one - other:+.1f}" for one, other in pairs)
 
 

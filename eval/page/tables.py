@@ -13,7 +13,7 @@ from semfov.runs.tables import percent, table
 
 Runs = dict[str, Experiment]
 
-_SENSITIVITY_SHIFTS = (1, 5, 15, 30)
+_SENSITIVITY_SHIFTS = (1, 5, 30)
 """Gaze shifts after which the study of settings is shown."""
 
 
@@ -39,8 +39,6 @@ def beside_paper(runs: Runs) -> list[str]:
         for place, n in enumerate(paper.TABLE_SHIFTS):
             ours = [_performance_cell(folder, policy, n) for folder in folders.values()]
             rows.append([policy if place == 0 else "", f"CP@{n}", f"{figures[place]:.2f}", *ours])
-        ours = [_largest_error(folder, policy) for folder in folders.values()]
-        rows.append(["", "max. SEM", f"{figures[-1]:.3f}", *ours])
     return table(rows)
 
 
@@ -48,12 +46,6 @@ def _performance_cell(folder: Path, policy: str, shifts: int) -> str:
     """Cumulative performance in percent, with its standard error over images."""
     curve = averaged(records_of(folder, policy, commonest=True), shifts)
     return percent(curve.mean[shifts], curve.over_images[shifts])
-
-
-def _largest_error(folder: Path, policy: str) -> str:
-    """Largest standard error of the mean over the repetitions, in percent, as published."""
-    curve = averaged(records_of(folder, policy, commonest=True), max(paper.TABLE_SHIFTS))
-    return f"{100 * curve.over_repetitions.max():.3f}"
 
 
 def sensitivity(runs: Runs) -> list[str]:
