@@ -121,12 +121,12 @@ def test_a_fault_at_one_picture_is_a_row_with_its_reason(
         (
             None,
             (0.5, 0.5),
-            "The probabilities assume that half of the pictures hold it. If you know better, give a prior.\n",
+            "The probabilities assume that half of the pictures hold it. If you know better, give --prior.\n",
         ),
         (
             None,
             (0.05,),
-            "The probabilities assume that 5 % of the pictures hold it. If you know better, give a prior.\n",
+            "The probabilities assume that 5 % of the pictures hold it. If you know better, give --prior.\n",
         ),
         (0.15, (0.15,), "The probabilities assume that 15 % of the pictures hold it.\n"),
         (None, (0.5, 0.1), ""),
