@@ -69,7 +69,7 @@ class WindowTask:
         score_threshold: probability, without evidence score, from which on objects count; None for the usual one.
         detector: name of the detector; None if it is not known.
         usual_score: score from which on objects count where neither evidence nor `score_threshold` says it
-            (`Detector.score_threshold`).
+            (that of the detector).
     """
 
     goal: Goal

@@ -4,7 +4,7 @@ What a box counts for by its score, from the faintest on. Each threshold has its
 
     a box from this score on                              threshold
     ----------------------------------------------------  --------------------------------------------------------------
-    is a hint of where to zoom in, and counts for         `FAINT`, `Detector.faint`
+    is a hint of where to zoom in, and counts for         `FAINT`, `faint` of a `Detector`
     `Detections.highest`
     is a detection: beliefs of a fovea read all of them   `Selection.threshold`, option `threshold` of `load_detector`
     is a candidate for an object, or is tracked           `FAINTEST` in `semfov.detection.objects`
