@@ -11,6 +11,7 @@ from semfov.detection.objects import box_text
 from semfov.paths.outcome import Outcome
 
 _MATTERS = 0.1  # change of the probability, at one half, from which on the assumed share is said
+_PROBABLE = 2 / 3  # from which on a target that no place shows for sure is called probably there
 _CLEAR = 0.5  # probability or score from which on a place was clearly seen as the target
 
 
@@ -228,7 +229,7 @@ class Words(ABC):
             return ""
         if self.decided_by != "probability":
             return f"To call it found takes {self.decided_by} {decision.confirm:.3g}, and a look that shows it."
-        is_likely = "is probably" if decision.probability >= _CLEAR else "may be"
+        is_likely = "is probably" if decision.probability >= _PROBABLE else "may be"
         reached = f"none reached probability {decision.confirm:.3g} ({len(record.closer)} looked at closely)"
         if not record.closer:
             reached = f"to call it found takes probability {decision.confirm:.3g}, and a look that shows it"

@@ -230,14 +230,14 @@ def test_a_first_look_that_is_close_enough_is_not_called_a_closer_look():
 
 def test_an_undecided_search_says_what_found_takes():
     """Of a place where closer looks decide, otherwise of the picture; also where a limit ended it."""
-    path = replace(zoom_path(), decision=Decision("undecided", 0.61, confirm=0.7402), ending="passes")
+    path = replace(zoom_path(), decision=Decision("undecided", 0.67, confirm=0.7402), ending="passes")
     doubt = "It is probably there, but no place is sure: none reached probability 0.74 (1 looked at closely)."
     assert path.summary().startswith(
-        f"cup: undecided (there with probability 0.61) in 3 looks (the limit of passes=). {doubt} Best place: box "
+        f"cup: undecided (there with probability 0.67) in 3 looks (the limit of passes=). {doubt} Best place: box "
     )
     assert path.words.ended == f"All 3 passes were used. {doubt}"
     assert path.plot(image=torch.zeros(3, 300, 400)).axes[0].get_title().replace("\n", " ").endswith(doubt)
-    rare = replace(path, decision=replace(path.decision, probability=0.49))
+    rare = replace(path, decision=replace(path.decision, probability=0.66))
     assert rare.words.lack().startswith("It may be there, but no place is sure: none reached")
     by_presence = replace(path, closer=(), ending="decision")
     assert by_presence.words.lack() == (
