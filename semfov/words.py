@@ -82,7 +82,7 @@ COMMANDS = _by_word(
         "live": "camera stream track video watch webcam",
         "fit": "calibrate finetune learn train",
         "compare": "bench benchmark eval evaluate sahi slice tile val validate",
-        "detectors": "download list model models pull weights",
+        "detectors": "info list model models weights",
         "explore": "map scan",
         "app": "gradio gui serve ui web",
         "demo": "example examples start try",
@@ -104,12 +104,17 @@ ADVICE = _by_word(
         "the model is of adults without a task; `semfov fit --help` has that of your viewers": (
             "age audience gender persona"
         ),
+        "the default detector is in the package, others are read when they are named": "download install pull setup",
+        "--print-config prints the settings, and --config FILE reads them": "configure dry_run settings",
+        "the page of detectors in the documentation has the call, under Export": "export onnx",
+        "save the page as a picture first": "screenshot url webpage",
+        "give all pictures to one command": "combine concat merge",
         "the agent has one; in a checkout `python -m eval.search --help` compares several": (
             "acquisition policies policy strategy"
         ),
     }
 )
-"""What to do in place of an option that others have, and the command has not."""
+"""What to do in place of an option or a command that others have, and `semfov` has not."""
 
 _LOOKING = ("search", "find_all", "explore")
 
@@ -122,6 +127,9 @@ _OTHER_METHODS = {
     ("gaze", "seconds"): _OF_VIEWERS,
     ("gaze", "areas"): "gaze.share(areas) and gaze.visits(areas) are of a prediction",
     ("search", "policy"): "explore takes one, and semfov.rollout one of yours",
+    **dict.fromkeys(
+        [("search", "temperature"), ("explore", "temperature")], "semfov.gaze.Softmax is for semfov.rollout"
+    ),
 }
 """What to call in place of a method of an agent, by its name and the option that it has not."""
 

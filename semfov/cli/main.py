@@ -249,7 +249,7 @@ def _refusal(command: str, option: str) -> str | None:
     if _means_positional(option, positional):
         return _without_option(command, option, positional)
     # The parser lists all options of the other subcommands, which have few.
-    is_advised = command in (*_LOOKING, "gaze")
+    is_advised = command in (*_LOOKING, "gaze", "app")
     return _meant_instead(command, option) if is_advised else None
 
 

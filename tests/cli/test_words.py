@@ -117,6 +117,8 @@ WRONG_USE = {
     "find . --min-size 20": "unknown option --min-size; --out FILE.csv has all boxes",
     "gaze a.jpg --colormap jet": "unknown option --colormap; the map keeps the picture's colours",
     "diff a.jpg b.jpg": "unknown command 'diff'; did you mean 'gaze --compare'?",
+    "app --share": "unknown option --share; did you mean --host?",
+    "export yolox-nano": "unknown command 'export'; the page of detectors",
     "resume": "unknown command 'resume'; the same command goes on where it stopped",
     "live a.mp4 b.mp4": "unexpected argument 'b.mp4'",
 }
