@@ -255,7 +255,7 @@ def _assumed_in_all(files: PictureFiles) -> str:
     how_many = "half" if share == 0.5 else f"{100 * share:.3g} %"
     options = files.job.options
     is_given = isinstance(options, SearchOptions) and options.prior is not None
-    hint = "" if is_given else " If you know better, give --prior."
+    hint = "" if is_given else " If you know better, give `semfov search --prior`."
     return f"The probabilities assume that {how_many} of the pictures hold it.{hint}\n"
 
 

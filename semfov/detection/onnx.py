@@ -362,9 +362,9 @@ def load_onnx(
         check_file(path, size)  # the sizes inside follow from the canvas, which is known only now
     outputs = session.probe(size)
     published = published_name is not None
-    known_head = WEIGHTS[NETWORKS[digest]].head if is_known else None
-    if "head" not in settings and known_head is not None:
-        settings["head"] = known_head  # by a table, as a pass to find it out takes as long as the first look
+    known_weights = WEIGHTS.get(NETWORKS.get(digest, ""))
+    if "head" not in settings and known_weights is not None and known_weights.head is not None:
+        settings["head"] = known_weights.head  # to find it out takes as long as the first look
     if "head" not in settings:
         count = _class_count(settings.get("classes"), published=published)
         settings["head"] = _recognised_head(session, outputs, size, count)

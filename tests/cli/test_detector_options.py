@@ -287,7 +287,7 @@ def test_every_option_that_any_message_names_is_one_of_some_command():
     known = {dashed(option) for command in SUBCOMMANDS for option in _option_names(command)}
     # Those of a fit are dotted, and `test_words` checks the ones of its help.
     known |= set(re.findall(r"--([a-z][a-z._]*)", SUBCOMMANDS["fit"].help))
-    known |= {"config", "help", "help-all", "help_all", "version"}
+    known |= {"config", "help", "help-all", "help_all", "print-config", "version"}
     unknown = []
     for file in sorted(HERE.rglob("*.py")):
         name = file.relative_to(HERE).as_posix()

@@ -115,19 +115,14 @@ def test_a_fault_at_one_picture_is_a_row_with_its_reason(
     assert 'raise KeyError("a fault of the code")' in printed
 
 
+KNOWN_BETTER = " If you know better, give `semfov search --prior`."
+
+
 @pytest.mark.parametrize(
     ("prior", "shares", "told"),
     [
-        (
-            None,
-            (0.5, 0.5),
-            "The probabilities assume that half of the pictures hold it. If you know better, give --prior.\n",
-        ),
-        (
-            None,
-            (0.05,),
-            "The probabilities assume that 5 % of the pictures hold it. If you know better, give --prior.\n",
-        ),
+        (None, (0.5, 0.5), f"The probabilities assume that half of the pictures hold it.{KNOWN_BETTER}\n"),
+        (None, (0.05,), f"The probabilities assume that 5 % of the pictures hold it.{KNOWN_BETTER}\n"),
         (0.15, (0.15,), "The probabilities assume that 15 % of the pictures hold it.\n"),
         (None, (0.5, 0.1), ""),
         (None, (None,), ""),
