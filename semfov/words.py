@@ -91,30 +91,48 @@ COMMANDS = _by_word(
 )
 """Commands of ours by words of others."""
 
-ADVICE = _by_word(
+_ADVICE = _by_word(
     {
         "the same command goes on where it stopped": "continue restart resume",
         "what is transparent in a picture is left out": "exclude ignore mask",
-        "semfov chooses the windows; `semfov compare` sets all slices beside it": (
-            "overlap overlap_ratio slice slice_size sliding tile tile_size tiles"
-        ),
-        "--out FILE.geojson has the coordinates of a GeoTIFF": "coordinates crs epsg gps latlon",
-        "--out FILE.csv has all boxes, to choose by their size": "max_area max_size min_area min_size",
-        "the map keeps the picture's colours; --out FOLDER writes it beside a table": "cmap colormap colourmap opacity",
-        "the model is of adults without a task; `semfov fit --help` has that of your viewers": (
-            "age audience gender persona"
-        ),
         "the default detector is in the package, others are read when they are named": "download install pull setup",
         "--print-config prints the settings, and --config FILE reads them": "configure dry_run settings",
         "the page of detectors in the documentation has the call, under Export": "export onnx",
         "save the page as a picture first": "screenshot url webpage",
         "give all pictures to one command": "combine concat merge",
+    }
+)
+
+_ADVICE_FOR_OBJECTS = _by_word(
+    {
+        "semfov chooses the windows; `semfov compare` sets all slices beside it": (
+            "overlap overlap_ratio slice slice_size sliding tile tile_size tiles"
+        ),
+        "--out FILE.geojson has the coordinates of a GeoTIFF": "coordinates crs epsg gps latlon",
+        "--out FILE.csv has all boxes, to choose by their size": "max_area max_size min_area min_size",
         "the agent has one; in a checkout `python -m eval.search --help` compares several": (
             "acquisition policies policy strategy"
         ),
     }
 )
+
+_ADVICE_FOR_GAZE = _by_word(
+    {
+        "the map keeps the picture's colours; --out FOLDER writes it beside a table": "cmap colormap colourmap opacity",
+        "the model is of adults without a task; `semfov fit --help` has that of your viewers": (
+            "age audience gender persona"
+        ),
+    }
+)
+
+ADVICE = {**_ADVICE, **_ADVICE_FOR_OBJECTS, **_ADVICE_FOR_GAZE}
 """What to do in place of an option or a command that others have, and `semfov` has not."""
+
+ADVICE_OF = {
+    **{command: {**_ADVICE, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")},
+    "gaze": {**_ADVICE, **_ADVICE_FOR_GAZE},
+}
+"""The same for the options of each command."""
 
 _LOOKING = ("search", "find_all", "explore")
 
@@ -317,7 +335,7 @@ RECORD = _by_word(
         "record.object_rows()": "objects_table to_json_list tolist",
         "record.save(path), record.to_csv(path), record.to_json(path) or record.report(path)": "export write",
         "semfov.run(picture, target, crops=FOLDER)": "crop save_crop save_crops",
-        "record.rows(), which has the seconds of each look": "duration elapsed seconds speed time times timing",
+        "record.rows(), which has the seconds of each look": "duration elapsed speed time times timing",
         "record.objects.track_ids, of a stream": "id ids track_id tracker_id",
         "[look.fixation for look in record]": "actions fixations gaze path saccades scanpath sequence",
         "record.belief_map(-1), of looks by a fovea or a head": (

@@ -195,7 +195,10 @@ class PictureEpisode(Episode[_Record_co]):
         """Decide at the end, which a limit makes, or the last look, and give its reason."""
 
     def run(self) -> _Record_co:
-        """Look until the decision, a limit, or the last look, and make the record."""
+        """Look until the decision, a limit, or the last look, and make the record.
+
+        An error of a look, such as that of a camera, ends it without a record; `on_look` gets the records before.
+        """
         limit = None
         while limit is None and self.ending is None and self.look() is not None:
             limit = self.limits.reached(self.passes, self.record)

@@ -54,6 +54,7 @@ _VIEWERS = 15  # whose scanpaths the page of a prediction has
 _MOST_BYTES = 2**26  # of a file that is uploaded
 _MOST_PIXELS = 2**25  # of a picture: on this page it is decoded as a whole
 _SECONDS = 60.0  # longest time of a search, for which others wait
+_FARTHEST = 2**31  # pixels of a point from the picture's corner
 _MOST_WAITING = 64  # requests in the queue; further ones are refused
 _SECONDS_KEPT = 3600  # of a picture that was given; a person may read for long before the next look
 _SECONDS_SWEPT = 600  # after which those that are older are removed, again and again
@@ -260,7 +261,9 @@ class _Calls:
         if not target:
             return cells, "", _WHICH_OWN
         with _errors_on_page():
-            are_numbers = isinstance(point, list | tuple) and all(isinstance(side, int | float) for side in point)
+            are_numbers = isinstance(point, list | tuple) and all(
+                isinstance(side, int | float) and abs(side) <= _FARTHEST for side in point
+            )
             check(are_numbers and len(point) == 2, "point", "(x, y) in pixels of the picture", point)
             image = _read(path)
             grid = Grid(self.agent.columns, self.agent.rows, (image.shape[-1], image.shape[-2]))

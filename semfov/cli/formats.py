@@ -1,7 +1,8 @@
 """Formats of files of results: what a picture adds to a file, and how the file is written of the pictures so far.
 
 A format is one class, which is registered under its suffix by being defined. The command, its help and its checks know
-it from then on. This file imports no tensors, as the help needs it.
+it from then on. Formats are text: a binary one also needs `semfov.cli.results`. This file imports no tensors, as the
+help needs it.
 """
 
 from __future__ import annotations

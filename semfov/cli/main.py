@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
-from semfov.words import ADVICE, COMMANDS, FORMER, OPTIONS, dashed, meant_options, note_of_former
+from semfov.words import ADVICE, ADVICE_OF, COMMANDS, FORMER, OPTIONS, dashed, meant_options, note_of_former
 
 if TYPE_CHECKING:
     from semfov.runs.settings import Settings
@@ -193,7 +193,7 @@ def _unknown(name: str) -> str:
         return f"expected a command before {name}: {', '.join(SUBCOMMANDS)}"
     matches = [COMMANDS[name]] if name in COMMANDS else get_close_matches(name, SUBCOMMANDS, n=1)
     hint = f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(SUBCOMMANDS)}"
-    hint = ADVICE.get(name, hint)
+    hint = ADVICE.get(name.replace("-", "_"), hint)
     return f"unknown command {name!r}; {hint}"
 
 
@@ -275,7 +275,8 @@ def _meant_instead(command: str, option: str) -> str | None:
     having = [f"`semfov {name}`" for name in _LOOKING if option in _option_names(name)]
     if having:
         return f"{unknown}; it is one of {' and '.join(having)}"
-    return f"{unknown}; {ADVICE[option]}" if option in ADVICE else None
+    advice = ADVICE_OF.get(command, {}).get(option)
+    return f"{unknown}; {advice}" if advice else None
 
 
 _RENAME = "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too)"

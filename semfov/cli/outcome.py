@@ -184,7 +184,7 @@ def terminal_columns(text: str) -> int:
     """
     columns = 0
     for letter in text:
-        if not unicodedata.combining(letter):
+        if unicodedata.category(letter) not in ("Mn", "Me", "Cf"):
             columns += 2 if unicodedata.east_asian_width(letter) in "WF" else 1
     return columns
 

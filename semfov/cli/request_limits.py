@@ -1,5 +1,6 @@
 """What the page of `semfov app` may be asked for: its own addresses, small requests, and files that it was given."""
 
+import asyncio
 import json
 import os
 from collections.abc import Iterator
@@ -23,7 +24,9 @@ _WRITTEN = {*_CALLS, _UPLOAD, "/gradio_api/cancel", "/gradio_api/reset"}
 
 _MOST_REQUEST = 2**18  # bytes of a request that is no upload
 _FRAME = 2**16  # bytes around the file of an upload
-_MOST_KEPT = 2**31  # bytes of all files of visitors
+_MOST_KEPT = 2**31  # bytes of all files of visitors, those that arrive among them
+_LEAST_KEPT = 2**16  # bytes as which a file counts at least, so that their number is limited, too
+_MOST_DIGITS = 20  # of a size
 
 
 class RequestLimits:
@@ -43,6 +46,7 @@ class RequestLimits:
         self._folder = folder.resolve()
         self._most_bytes = most_bytes
         self._seconds_kept = seconds_kept
+        self._arriving = 0  # bytes of the uploads that are under way
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -53,10 +57,25 @@ class RequestLimits:
             body = await _body(receive)
             receive = _replayed(body, receive)
             refusal = self._refusal_of_call(body)
-        if refusal is None:
-            await self._app(scope, receive, send)
-        else:
+        if refusal is not None:
             await refuse(scope, send, *refusal)
+        elif scope["path"] == _UPLOAD:
+            await self._upload(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+    async def _upload(self, scope: Message, receive: Receive, send: Send) -> None:
+        """Pass an upload on, unless too much is kept or under way."""
+        length = int(header(scope, "content-length"))
+        self._arriving += length
+        try:
+            kept = await asyncio.to_thread(self._kept_bytes)
+            if kept + self._arriving > _MOST_KEPT:
+                await refuse(scope, send, 503, "too many pictures are kept; give yours in an hour\n")
+            else:
+                await self._app(scope, receive, send)
+        finally:
+            self._arriving -= length
 
     def _refusal(self, scope: Message) -> tuple[int, str] | None:
         """Say why a request may not pass, by its head, as a status and words; None for one that may."""
@@ -73,14 +92,12 @@ class RequestLimits:
     def _refusal_by_size(self, scope: Message) -> tuple[int, str] | None:
         """Say why a request is too large, or of unknown size, which browsers never send."""
         length = header(scope, "content-length")
-        if not (length.isascii() and length.isdigit()) or header(scope, "transfer-encoding"):
+        is_number = length.isascii() and length.isdigit() and len(length) <= _MOST_DIGITS
+        if not is_number or header(scope, "transfer-encoding"):
             return 411, "expected the size of the request\n"
-        is_upload = scope["path"] == _UPLOAD
-        most = self._most_bytes + _FRAME if is_upload else _MOST_REQUEST
+        most = self._most_bytes + _FRAME if scope["path"] == _UPLOAD else _MOST_REQUEST
         if int(length) > most:
             return 413, f"expected a maximum of {most:,} bytes\n"
-        if is_upload and self._kept_bytes() + int(length) > _MOST_KEPT:
-            return 503, "too many pictures are kept; give yours in an hour\n"
         return None
 
     def _kept_bytes(self) -> int:
@@ -97,7 +114,7 @@ class RequestLimits:
                 if found.st_mtime < time() - self._seconds_kept:
                     path.unlink()
                 else:
-                    total += found.st_size
+                    total += max(found.st_size, _LEAST_KEPT)
             except FileNotFoundError:
                 continue  # Gradio has removed or moved it since
         return total

@@ -12,6 +12,7 @@ from semfov.cli.outcome import table_lines
 from semfov.detection import Candidates, Detector, Objects, score_vectors
 from semfov.detection.objects import SCORE_THRESHOLD, box_text
 from semfov.detection.onnx import OnnxDetector
+from semfov.detection.onnx_heads import HEADS
 from semfov.detection.selection import suppress
 from semfov.io.compatibility import NETWORKS
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
@@ -159,11 +160,13 @@ def _about_low_scores(confidence: Tensor) -> str:
 
 
 def _about_colours(bare: Trial, eye: WindowEye, photo: Path) -> list[str]:
-    """Say whether an ONNX file shows more with the other order of the channels; that of a known network is right."""
+    """Say whether an ONNX file shows more with the other order of the channels than that of a known network."""
     detector = eye.detector
-    if not isinstance(detector, OnnxDetector) or detector.digest in NETWORKS:
+    if not isinstance(detector, OnnxDetector):
         return []
     usual = detector.preprocessing
+    if detector.digest in NETWORKS and usual.channels == HEADS[detector.head].preprocessing.channels:
+        return []
     other: Literal["rgb", "bgr"] = "bgr" if usual.channels == "rgb" else "rgb"
     detector.preprocessing = replace(usual, channels=other)
     try:

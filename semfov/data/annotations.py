@@ -132,7 +132,7 @@ def _box_polygons(data: Entry) -> None:
     """Give the objects without `bbox` the box around their polygons, where they have some."""
     entries = data.get("annotations")
     for entry in entries if isinstance(entries, list) else []:
-        if isinstance(entry, dict) and not entry.get("bbox") and _are_polygons(entry.get("segmentation")):
+        if isinstance(entry, dict) and entry.get("bbox") in (None, []) and _are_polygons(entry.get("segmentation")):
             xs = [x for polygon in entry["segmentation"] for x in polygon[::2]]
             ys = [y for polygon in entry["segmentation"] for y in polygon[1::2]]
             entry["bbox"] = [min(xs), min(ys), max(xs) - min(xs), max(ys) - min(ys)]

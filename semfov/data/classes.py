@@ -201,7 +201,9 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
     words = _between_commas(name)
     if len(words) > 1:
         # An unknown one of them is told alone.
-        known = [known_class(word, classes, argument) for word in words]
+        known = [*dict.fromkeys(known_class(word, classes, argument) for word in words)]
+        if len(known) == 1:
+            return list(classes).index(known[0]) + 1
         raise InputError(f"{argument}: expected one class, got {' and '.join(known)}")
     suggestions = [classes[place] for place in matches] or _similar_classes(name, classes)
     raise InputError(_unknown(argument, name, suggestions, classes))

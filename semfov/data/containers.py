@@ -17,7 +17,10 @@ _MARKS: dict[tuple[int, bytes], Container] = {
 }
 """Bytes that tell a container, with their place in the file. WebM is Matroska."""
 
-_TEXT = re.compile(rb"(?!YUV4MPEG2 )(\xef\xbb\xbf)?[\t\n\r -~]*")
+_LIST = re.compile(rb"(\xef\xbb\xbf)?(#EXTM3U|ffconcat|<|v=0)")
+"""The first bytes of a list of films, whatever follows."""
+
+_TEXT = re.compile(rb"(?!YUV4MPEG2 |nut/multimedia )(\xef\xbb\xbf)?[\t\n\r -~]+")
 """The first bytes of a text. FFmpeg would open the files and addresses that one names: a playlist, `ffconcat`, SDP."""
 
 _HEAD = 16  # bytes of a file, or of a box of MP4, that tell what it is
@@ -29,6 +32,8 @@ def container_of(path: Path) -> Container:
     """Tell the container of a video by its first bytes; raises `DataError` for a file that cannot be read."""
     with reading(path, f"source: {path}"), path.open("rb") as file:
         head = file.read(_HEAD)
+    if _LIST.match(head):
+        return "text"
     for (place, mark), kind in _MARKS.items():
         if head.startswith(mark, place):
             return kind

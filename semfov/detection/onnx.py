@@ -362,9 +362,10 @@ def load_onnx(
         check_file(path, size)  # the sizes inside follow from the canvas, which is known only now
     outputs = session.probe(size)
     published = published_name is not None
-    known_weights = WEIGHTS.get(NETWORKS.get(digest, ""))
-    if "head" not in settings and known_weights is not None and known_weights.head is not None:
-        settings["head"] = known_weights.head  # to find it out takes as long as the first look
+    published_weights = WEIGHTS.get(published_name or "")
+    if "head" not in settings and published_weights is not None and published_weights.sha256 == digest:
+        # To find it out takes as long as the first look.
+        settings["head"] = str(published_weights.head)
     if "head" not in settings:
         count = _class_count(settings.get("classes"), published=published)
         settings["head"] = _recognised_head(session, outputs, size, count)
@@ -417,7 +418,7 @@ def _recognised_head(session: OnnxSession, outputs: Mapping[str, Tensor], size: 
     """Recognise the head of a model by the shapes of its outputs, and by a pass where several heads fit them."""
     shapes = tuple((name, tuple(output.shape)) for name, output in outputs.items())
     signature = Signature(session.image, shapes, size, session.producer, classes, session.metadata)
-    grey = torch.full((1, 3, size[1], size[0]), 0.5)
+    grey = torch.full((1, 3, size[1], size[0]), 127.5 if session.takes_bytes else 0.5)
     return recognise(signature, lambda: session(grey))
 
 

@@ -302,7 +302,10 @@ def _density(terms: dict[str, Tensor], left_out: Sequence[str], raster: tuple[in
 
 
 def _scores(density: Tensor, cell: Tensor) -> Tensor:
-    """Average NSS, AUC and log likelihood in bits above uniform of fixations in cells of densities `(E, N)`."""
+    """Average NSS, AUC and log likelihood in bits above uniform of fixations in cells of densities `(E, N)`.
+
+    They are `nss`, `auc` and `log_likelihood` of `semfov.metrics.scanpath`, for many densities at once.
+    """
     at_fixation = density.gather(1, cell[:, None])[:, 0]
     z = (at_fixation - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
     lower = (density < at_fixation[:, None]).float().mean(1)

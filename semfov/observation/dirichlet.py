@@ -122,6 +122,7 @@ def categorical_covariance(alpha: Tensor) -> Tensor:
 
     Off the diagonal this is `σ_ij = -p_i p_j`, the "co-variances of the class distribution" of Luzio, Bernardino and
     Moreno (2024, equation 6). It is not the covariance of the probabilities under the Dirichlet (`covariance`).
+    No rule of fusion and no policy reads it.
 
     Args:
         alpha: `(..., K)`, parameters, positive.

@@ -34,7 +34,7 @@ class TrackingModel:
         size: standard deviation of the logarithm of the width and height of a box.
         entering: the same after a look at an object that the border of the frame cuts, so that the next look decides.
         growth: variance by which the logarithm of the size changes in a second.
-        gate: largest squared distance of a detection from its object, in standard deviations.
+        gate: largest squared distance of a detection from its object, in variances.
         density: logarithm of the density of detections of other objects, for a square side.
         slope: a, for an octave.
         middle: b, in octaves.

@@ -114,6 +114,7 @@ def test_sizes_are_limited_before_anything_is_read(tmp_path, path, headers, stat
 
 def test_all_visitors_together_fill_no_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(request_limits, "_MOST_KEPT", 100)
+    monkeypatch.setattr(request_limits, "_LEAST_KEPT", 1)
     kept = tmp_path / "a" / "photo.png"
     kept.parent.mkdir()
     kept.write_bytes(b"1" * 90)
@@ -123,3 +124,38 @@ def test_all_visitors_together_fill_no_disk(tmp_path, monkeypatch):
     os.utime(kept, (long_ago, long_ago))  # as what broken uploads leave behind
     assert answered(tmp_path, UPLOAD, body=b"1" * 90) == b"1" * 90
     assert not kept.exists()
+
+
+def test_small_files_of_visitors_are_limited_in_number(tmp_path):
+    for number in range(4):
+        (tmp_path / f"{number}.png").write_bytes(b"1")
+    assert RequestLimits(None, tmp_path, 1000, 60)._kept_bytes() == 4 * 2**16
+
+
+def test_uploads_that_arrive_together_count_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(request_limits, "_MOST_KEPT", 100)
+    statuses = []
+
+    async def both():
+        arrived, is_over = asyncio.Event(), asyncio.Event()
+
+        async def page(scope, receive, send):
+            arrived.set()
+            await is_over.wait()
+
+        async def send(message):
+            statuses.append(message.get("status"))
+
+        limits = RequestLimits(page, tmp_path, 1000, 60)
+        scope = {"type": "http", "method": "POST", "path": UPLOAD, "headers": sized(60)}
+        first = asyncio.create_task(limits(scope, None, send))
+        await arrived.wait()
+        await limits(scope, None, send)
+        is_over.set()
+        await first
+        statuses.append("next")
+        await limits(scope, None, send)
+
+    asyncio.run(both())
+    assert statuses[0] == 503
+    assert statuses[-1] == "next"

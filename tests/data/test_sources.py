@@ -131,6 +131,8 @@ def test_the_pictures_of_a_folder_are_the_frames_of_a_stream(tmp_path, monkeypat
         "ffconcat version 1.0\nfile video.avi\n",
         "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
         "# VobSub index file, v7 (do not modify this line!)\n",
+        "#EXTM3U\n#\x01\n#EXTINF:5,\nvideo.avi\n",
+        "#EXTM3U\nAVI \nvideo.avi\n",
         "words, which FFmpeg would draw",
     ],
 )
@@ -138,6 +140,12 @@ def test_a_text_is_no_video(video, text, suffix):
     path = video.with_name(f"list{suffix}")
     path.write_text(text)
     unusable("expected a video, got a text, such as a playlist", open_stream, path)
+
+
+def test_films_that_begin_with_words_and_empty_ones_are_no_texts(tmp_path):
+    for name, head in (("a.nut", b"nut/multimedia container\0"), ("a.y4m", b"YUV4MPEG2 W8 H6\n"), ("a.mp4", b"")):
+        (tmp_path / name).write_bytes(head)
+        unusable("cannot be opened|no frame could be read", open_stream, tmp_path / name)
 
 
 def test_the_name_of_a_video_is_no_protocol(video, monkeypatch):

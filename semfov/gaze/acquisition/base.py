@@ -126,6 +126,8 @@ class AcquisitionFunction(nn.Module, ABC):
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Compute the value of fixating each cell next.
 
+        Where the gaze is now it does not know: a head alone values what a move costs (`semfov.head.PerSecond`).
+
         Args:
             belief: belief of B episodes after their last look.
             visited: `(B, X·Y)` boolean, cells that were fixated.
