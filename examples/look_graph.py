@@ -132,10 +132,6 @@ class Value:
         """Select by some indices along an axis."""
         return self.node("Gather", index, axis=axis)
 
-    def first(self, count: int) -> Value:
-        """Select the first rows."""
-        return self.node("Slice", [0], [count])
-
     def without_background(self, axis: int) -> Value:
         """Leave out the first score along an axis."""
         return self.node("Slice", [1], [_END], [axis])

@@ -48,7 +48,7 @@ def write_run_report(
         titles: title of each way to average.
         label: what the curves show.
         shifts: numbers of gaze shifts of the tables.
-        others: curves of others' for comparison, which join the first way to average.
+        others: curves of others, for comparison, which join the first way to average.
         episodes: largest number of episodes to step through.
 
     Returns:

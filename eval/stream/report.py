@@ -77,7 +77,7 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         chosen = [*records.values(), [each for frame in frames if frame > config.after for each in records[frame]]]
         cells = [f"{precision_of(group):.2f}" for group in chosen[:-1]]
         cells.append(plus_minus(values[way], error, 3))
-        cells.append(f"{values[way] / of_slices:.2f}" if of_slices else "-")
+        cells.append(f"{values[way] / of_slices:.2f}" if of_slices > 0 else "-")
         milliseconds = sum(outcome.costs[way].milliseconds for outcome in outcomes) / len(outcomes)
         precisions.append([way, *cells, str(outcomes[0].costs[way].passes), f"{milliseconds:.0f}"])
         listed.append([way, *map(listed_cell, chosen)])

@@ -27,8 +27,8 @@ from semfov.paths import Record
 from semfov.settings import How
 from semfov.zoom.lattice import Lattice
 
-_MOST_WHOLE = 1 << 24  # pixels of a picture of which a prediction of gaze reads all
-_VIEWED = 1024  # pixels along the longer side that a prediction of gaze needs at least, for six views of a detector
+_MOST_WHOLE = 1 << 24  # pixels from which on a picture with long sides is reduced for a prediction of gaze
+_VIEWED = 1024  # pixels that a prediction of gaze needs at least, for six views of a detector
 
 PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 """A picture of any common kind and size (`semfov.as_image`), one that is read window by window, or a scene: a
@@ -165,13 +165,14 @@ class OpenedPicture:
         around = self.source.image() if isinstance(self.source, Panorama) else None
         return around.to(like)[None] if isinstance(around, Tensor) else self.image(like)
 
-    def viewed(self, like: Tensor) -> tuple[Tensor, tuple[int, int]]:
+    def viewed(self, like: Tensor, *, panorama: bool = False) -> tuple[Tensor, tuple[int, int]]:
         """Read the pixels that a prediction of gaze needs of a flat picture, or of a panorama.
 
         A large picture is reduced as it is read: at its full size it would take gigabytes as floats.
 
         Args:
             like: as for `image`.
+            panorama: whether it is looked at as a panorama, in views as high as the picture.
 
         Returns:
             `(3, h, w)`, RGB in [0, 1], and `(width, height)` of the picture itself.
@@ -183,7 +184,8 @@ class OpenedPicture:
         if not self.scene and math.prod(self._size()) > _MOST_WHOLE:
             width, height = self.large.size
             self._check_area(width, height)
-            reduction = self.large.reduction(max(width, height) / _VIEWED)
+            side_of_view = min(width, height) if panorama else max(width, height)
+            reduction = self.large.reduction(side_of_view / _VIEWED)
             shape = (max(1, height // reduction), max(1, width // reduction))
             # Predictions count cells by the size of the picture.
             if reduction > 1 and cells_of(shape) == cells_of((height, width)):

@@ -160,7 +160,7 @@ class _GazeJob:
         """Predict where people look in a picture, and write the density."""
         options = self.options
         source = self.sources[number]
-        image, size = OpenedPicture.of(source.picture()).viewed(torch.zeros(1))
+        image, size = OpenedPicture.of(source.picture()).viewed(torch.zeros(1), panorama=options.panorama)
         file = None if source.file is None else str(source.file)
         stated_model = None if options.model is None else self.model
         prediction = GazePrediction.of(

@@ -139,7 +139,7 @@ class Drafts:
             A sentence or None.
         """
         in_first, in_second = self.areas(areas)
-        if in_first != in_second:
+        if in_first != in_second or self.first.size != self.second.size:
             return None
         first, second = self.names
         return f"Areas are at the same place in both drafts. What moves needs boxes for {first} and for {second}."

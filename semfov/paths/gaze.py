@@ -299,6 +299,7 @@ class GazePrediction(OtherWords):
             agent.gaze("poster.jpg").visits({"logo": (10, 20, 200, 80)})["logo"].viewers  # 0.36
         """
         boxes = self.areas(areas)
+        check_number(seconds, "seconds", 0.1, 60.0)
         if seconds not in self._viewing:
             self._viewing[seconds] = self.scanpaths(_VIEWERS, seconds=seconds)
         viewers = self._viewing[seconds]
@@ -486,7 +487,7 @@ class GazePrediction(OtherWords):
         from semfov.report.gaze import gaze_page_html, gaze_part
         from semfov.report.template import write_html
 
-        part = gaze_part(self, self.scanpaths(people, seconds=seconds, seed=seed), areas)
+        part = gaze_part(self, self.scanpaths(people, seconds=seconds, seed=seed), areas, seconds)
         return write_html(Path(path), gaze_page_html(f"semfov: where people look in {self.name}", [part]))
 
     def to_csv(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> None:

@@ -328,8 +328,8 @@ class DecisionsByCloserLooks(DecisionsByPresence):
 
     def _examine_shown(self) -> None:
         """Examine the places that need no pass, and decide."""
-        while self.shown is not None:
-            self.verifier.examine(self.shown)
+        while (shown := self.shown) is not None:
+            self.verifier.examine(shown)
         self.outcome = self.verifier.outcome()
 
     @property

@@ -59,6 +59,8 @@ def test_an_area_that_moves_has_its_box_in_each_draft(drafts):
     moving = {"before.png": {"button": LEFT}, "after.png": {"button": RIGHT}}
     assert "same place" not in drafts.describe(moving) + drafts_section(drafts, moving)
     assert "same place" in drafts_section(drafts, {"button": LEFT})
+    larger = Drafts(drafts.first, draft("b/after.png", 0.5, size=(208, 156)))
+    assert "same place" not in larger.describe({"button": LEFT})
     twins = Drafts(draft("a/x.png", 0.4), draft("b/x.png", 0.5))
     assert [*twins.shares({"a/x.png": {"button": LEFT}, "b/x.png": {"button": RIGHT}})] == ["button"]
     other = {"before.png": {"button": LEFT}, "after.png": {"logo": RIGHT}}

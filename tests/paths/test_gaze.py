@@ -129,7 +129,15 @@ def test_visits_of_areas_are_those_of_drawn_viewers(gaze):
     assert str(visits["sliver"]) == "seen by no viewer"
     with pytest.raises(AttributeError, match=r"use gaze\.visits\(areas\)"):
         _ = gaze.ttff
-    refused("seconds", gaze.visits, areas, seconds=0)
+    for seconds in (0, [3], True):
+        refused("seconds", gaze.visits, areas, seconds=seconds)
+
+
+def test_a_page_counts_viewers_in_the_time_that_is_asked_for(gaze, tmp_path):
+    areas = {"left": (0, 0, 52, 78)}
+    for seconds in (0.2, 2.0):
+        page = gaze.report(tmp_path / "page.html", people=2, seconds=seconds, areas=areas).read_text(encoding="utf-8")
+        assert f">{100 * gaze.visits(areas, seconds=seconds)['left'].viewers:.0f} %<" in page
 
 
 def test_a_picture_unlike_those_of_the_fit_has_a_caution():
@@ -431,6 +439,12 @@ def test_a_large_picture_is_predicted_from_a_reduced_copy(tmp_path, monkeypatch)
     image, size = OpenedPicture.of(path).viewed(torch.zeros(1))
     assert size == (width, height)
     assert image.shape[-1] == width // 4
+    # Views of a panorama are as high as it is, and need its pixels where those of the width would do.
+    monkeypatch.setattr("semfov.agents.picture._VIEWED", width / 6.5)
+    for panorama, reduction in ((False, 4), (True, 1)):
+        image, size = OpenedPicture.of(path).viewed(torch.zeros(1), panorama=panorama)
+        assert (image.shape[-1], size) == (width // reduction, (width, height))
+    monkeypatch.setattr("semfov.agents.picture._VIEWED", width / 8)
     for whole, prediction in zip(expected, [agent.gaze(path), agent.gaze(path, seen=seen)], strict=True):
         assert prediction.size == (width, height)
         assert 0.5 * (prediction.cells - whole.cells).abs().sum() < 0.15

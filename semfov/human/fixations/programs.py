@@ -305,7 +305,7 @@ PROGRAMS = (
         "iMotions",
         ("fixationx", "fixationy"),
         duration=("fixationduration",),
-        picture=("sourcestimuliname", "stimulusname"),
+        picture=("sourcestimuliname", "stimulusname", "stimulus", "image", "picture"),
         subject=("respondentname", "respondent"),
         number=("fixationindex", "fixationindexbystimulus"),
         needs=("fixationduration",),
