@@ -471,7 +471,7 @@ def _connect_person(calls: _Calls, panel: _Panel, views: _Views, usual: "gradio.
     sought = [panel.picture, panel.target, usual]
     shown = [cells, views.own, views.about]
     # One picture at a time is read for these, and another one for a search.
-    one_at_a_time: dict[str, Any] = {"concurrency_id": "own looks", **_PRIVATE}
+    one_at_a_time = {"concurrency_id": "own looks", **_PRIVATE}
     for changed in (panel.picture.change, views.again.click, panel.target.change):
         changed(fresh, sought, shown, **one_at_a_time)
     views.own.select(click, [*sought, cells], shown, **one_at_a_time)

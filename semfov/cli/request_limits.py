@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from time import time
-from typing import Any
 
 from semfov.cli.doorkeeper import Application, Message, Receive, Send, header, refuse
 
@@ -146,7 +145,7 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(name)
 
 
-def _paths(value: Any) -> Iterator[object]:
+def _paths(value: object) -> Iterator[object]:
     """List what stands for paths of files in the arguments of a call, at any depth."""
     waiting = [value]
     while waiting:

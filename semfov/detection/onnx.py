@@ -40,8 +40,8 @@ from semfov.io.schema import excerpt
 _ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name. They have a fixed input, whose size can be changed all the same."""
 
-_AS_BYTES: dict[str, Any] = {"scale": 255.0, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
-"""Preprocessing of a model whose input are bytes."""
+_AS_BYTES = Preprocessing(scale=255.0)
+"""Preprocessing of a model whose input are bytes; the order of channels and the padding may be others."""
 
 _ROUNDING = 0.02  # how far beyond 0 and 1 the scores of networks of 8 and 16 bits may lie
 _MOST_BOXES = 2**20  # largest number of boxes of a canvas; YOLOv5 has 102,000 for 1280 px
@@ -425,15 +425,21 @@ def _recognised_head(session: OnnxSession, outputs: Mapping[str, Tensor], size: 
 def _usual_preprocessing(head: str, session: OnnxSession) -> Preprocessing:
     """Choose the preprocessing of a head; a model that takes bytes scales them itself."""
     usual = HEADS[head].preprocessing
-    return replace(usual, **_AS_BYTES) if session.takes_bytes else usual
+    return _with_bytes_of(usual) if session.takes_bytes else usual
+
+
+def _with_bytes_of(preprocessing: Preprocessing) -> Preprocessing:
+    """Copy a preprocessing for a model of bytes, which have the values of the canvas."""
+    return replace(preprocessing, scale=_AS_BYTES.scale, mean=_AS_BYTES.mean, std=_AS_BYTES.std)
 
 
 def _check_bytes_alone(session: OnnxSession, preprocessing: Preprocessing) -> None:
     """Raise `InputError` for a preprocessing of a model of bytes that makes other numbers of them."""
     if session.takes_bytes:
-        are_bytes = all(getattr(preprocessing, name) == value for name, value in _AS_BYTES.items())
-        values = {name: getattr(preprocessing, name) for name in _AS_BYTES}
-        check(are_bytes, "preprocessing", f"{_AS_BYTES} for {session.path.name}, which takes bytes", values)
+        are_bytes = preprocessing == _with_bytes_of(preprocessing)
+        expected = f"scale=255, mean 0 and std 1 for {session.path.name}, which takes bytes"
+        got = f"scale={preprocessing.scale:g}, mean={preprocessing.mean}, std={preprocessing.std}"
+        check(are_bytes, "preprocessing", expected, got)
 
 
 def _merged_preprocessing(
