@@ -60,9 +60,9 @@ class Doorkeeper:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        if not self.admits(header(scope, "host"), header(scope, "origin") or None):
+        if not self.admits(header(scope, "host") or "", header(scope, "origin")):
             await refuse(scope, send, 403, _STRANGER)
-        elif self._has_token(header(scope, "cookie")) or scope.get("path") == _BEGIN:
+        elif self._has_token(header(scope, "cookie") or "") or scope.get("path") == _BEGIN:
             await self._app(scope, receive, send)
         elif scope["type"] == "http" and self._is_token(_token_of(scope)):
             await self._welcome(send)
@@ -123,7 +123,7 @@ def _token_of(scope: Message) -> str:
     return values[0]
 
 
-def header(scope: Message, name: str) -> str:
+def header(scope: Message, name: str) -> str | None:
     """Read a header of a request.
 
     Args:
@@ -131,10 +131,10 @@ def header(scope: Message, name: str) -> str:
         name: in small letters.
 
     Returns:
-        The last one of the name; empty for none.
+        The last one of the name; None for none.
     """
     values = [value for key, value in scope.get("headers", ()) if key == name.encode()]
-    return str(values[-1].decode("latin-1")) if values else ""
+    return str(values[-1].decode("latin-1")) if values else None
 
 
 async def refuse(scope: Message, send: Send, status: int, words: str) -> None:

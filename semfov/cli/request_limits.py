@@ -65,7 +65,7 @@ class RequestLimits:
 
     async def _upload(self, scope: Message, receive: Receive, send: Send) -> None:
         """Pass an upload on, unless too much is kept or under way."""
-        length = int(header(scope, "content-length"))
+        length = int(header(scope, "content-length") or 0)
         self._arriving += length
         try:
             kept = await asyncio.to_thread(self._kept_bytes)
@@ -90,7 +90,7 @@ class RequestLimits:
 
     def _refusal_by_size(self, scope: Message) -> tuple[int, str] | None:
         """Say why a request is too large, or of unknown size, which browsers never send."""
-        length = header(scope, "content-length")
+        length = header(scope, "content-length") or ""
         is_number = length.isascii() and length.isdigit() and len(length) <= _MOST_DIGITS
         if not is_number or header(scope, "transfer-encoding"):
             return 411, "expected the size of the request\n"

@@ -31,6 +31,7 @@ def sent_through(keeper, **scope):
         ("127.0.0.1", "127.0.0.1:7860", "http://127.0.0.1:7861", False),
         ("127.0.0.1", "127.0.0.1:7860", "https://elsewhere.org", False),
         ("127.0.0.1", "127.0.0.1:7860", "null", False),
+        ("127.0.0.1", "127.0.0.1:7860", "", False),
         ("127.0.0.1", "elsewhere.org:7860", "http://elsewhere.org:7860", False),
         ("127.0.0.1", "192.168.0.7:7860", None, False),
         ("127.0.0.1", "", None, False),
@@ -46,7 +47,7 @@ def sent_through(keeper, **scope):
 @pytest.mark.parametrize("kind", ["http", "websocket"])
 def test_requests_enter_by_the_address_that_was_asked_for_and_from_its_own_page(host, address, origin, admitted, kind):
     """A page of another site may know the port, and may have a name of its own for this machine."""
-    headers = [(b"host", address.encode()), *([(b"origin", origin.encode())] if origin else [])]
+    headers = [(b"host", address.encode()), *([(b"origin", origin.encode())] if origin is not None else [])]
     entered, sent = sent_through((host,), type=kind, headers=headers)
     assert entered == admitted
     assert bool(sent) != admitted
