@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from semfov.runs.config import WHERE
@@ -49,3 +49,19 @@ def own_settings(config: Settings, *others: str) -> dict[str, Any]:
     """List the settings without those that the eye and scenes tell, that change no outcome, or that are `others`."""
     left_out = (*WHERE, "store", "data", "detector", *others)
     return {name: value for name, value in config.plain().items() if name not in left_out}
+
+
+def grouped(records: Iterable[ResultRecord], field: str) -> dict[str, list[ResultRecord]]:
+    """Group records by a field, such as the way that a search was made; groups and records keep their order.
+
+    Args:
+        records: the records.
+        field: name of the field.
+
+    Returns:
+        The records of each value.
+    """
+    groups: dict[str, list[ResultRecord]] = {}
+    for record in records:
+        groups.setdefault(record[field], []).append(record)
+    return groups

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from eval.comparison.records import grouped
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.plain import PLAIN, PlainDecisions, plain_rules
 from eval.decide.run import LANDINGS, LANDINGS_TEXT, landing_cells
@@ -32,14 +33,6 @@ _DECISIONS = [
 """Column headings of the table of decisions."""
 
 
-def searches_by_policy(records: Sequence[ResultRecord]) -> dict[str, list[ResultRecord]]:
-    """Group records by way to search; all ways make the same searches, in the same order."""
-    groups: dict[str, list[ResultRecord]] = {}
-    for record in records:
-        groups.setdefault(record["policy"], []).append(record)
-    return groups
-
-
 def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, Tensor], Tensor]:
     """Compare what ways to search and their references say of presence.
 
@@ -49,7 +42,7 @@ def probabilities(records: Sequence[ResultRecord]) -> tuple[dict[str, Tensor], T
     Returns:
         By way to search, the probability or score of presence `(M,)`; and whether the target is present, `(M,)`.
     """
-    groups = searches_by_policy(records)
+    groups = grouped(records, "policy")  # all ways make the same searches, in the same order
     searches = next(iter(groups.values()))
     scores = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
     scores[SHARP] = torch.tensor([record["sharp"] for record in searches])
@@ -70,7 +63,7 @@ def decision_summary(records: Sequence[ResultRecord], sensed: str) -> str:
     Returns:
         The tables, as Markdown.
     """
-    groups = searches_by_policy(records)
+    groups = grouped(records, "policy")  # all ways make the same searches, in the same order
     reference = next(iter(groups))  # the way with which the others are compared
     searches = groups[reference]
     plain = plain_rules(searches)

@@ -125,11 +125,11 @@ class _Compared:
         """Score the model on the held-out pictures of all folds."""
         return self.store.scores(self.name, _bar(self.folds, self.name))
 
-    def splits(self) -> dict[str, Scores]:
-        """Score the model by what it was fitted to."""
+    def splits(self, whole: Scores) -> dict[str, Scores]:
+        """Score the model by what it was fitted to; `whole` are its scores (`scores`)."""
         without_saccades = replace(self.config.fit, saccade_epochs=0)
         count = self.config.folds
-        splits = {f"{self.name}: all data sets, all people": self.scores()}
+        splits = {f"{self.name}: all data sets, all people": whole}
         if len(self.config.fixations) > 1:
             folds = [StudiedFold(self.groups, number, count, without_saccades, only=0) for number in range(count)]
             scores = self.store.scores(f"{self.name} first data set", _bar(folds, "first data set"))
@@ -197,7 +197,7 @@ def compare_viewing(config: ViewingConfig) -> None:
         compared = _Compared(config, detector.name, _features(detector), config.fit, fingerprint)
         results.scores[detector.name] = compared.scores()
         if number == config.studied:
-            results.splits = compared.splits()
+            results.splits = compared.splits(results.scores[detector.name])
             if config.sequences:
                 results.sequences = compared.sequences()
             if config.glimpses:

@@ -9,6 +9,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from eval.comparison.records import grouped
 from eval.comparison.telling import CALIBRATED, ERRORS_TEXT, FREQUENCY, TELLING, Telling, calibrated
 from eval.decide.run import overlap
 from semfov.agents.episode import EpisodeLimits, Goal
@@ -89,14 +90,6 @@ def decide_all(
     return records
 
 
-def by_way(records: Sequence[ResultRecord]) -> dict[str, list[ResultRecord]]:
-    """Read the records of each way of searching; all ways have the same searches in the same order."""
-    ways: dict[str, list[ResultRecord]] = {}
-    for record in records:
-        ways.setdefault(record["way"], []).append(record)
-    return ways
-
-
 def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, Tensor], Tensor]:
     """Compare what ways of searching and their references say of presence.
 
@@ -106,7 +99,7 @@ def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, Tensor],
     Returns:
         The probability or score of each way `(M,)`; and whether the target is present, `(M,)`.
     """
-    ways = by_way(records)
+    ways = grouped(records, "way")  # all ways have the same searches in the same order
     searches = next(iter(ways.values()))
     scores = {way: torch.tensor([record["probability"] for record in group]) for way, group in ways.items()}
     for name, field in ((_OVERVIEW, "overview"), (_SLICES, "slices"), (FREQUENCY, "frequency")):
@@ -117,7 +110,7 @@ def presence_scores(records: Sequence[ResultRecord]) -> tuple[dict[str, Tensor],
 def decision_tables(records: Sequence[ResultRecord]) -> list[str]:
     """Write the tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
     scores, there = presence_scores(records)
-    ways = by_way(records)
+    ways = grouped(records, "way")  # all ways have the same searches in the same order
     searches = next(iter(ways.values()))
     places = {way: torch.tensor([right_box(record) for record in group]) for way, group in ways.items()}
     telling = Telling(scores, there, [record["scene"] for record in searches], places)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from eval.bootstrap import Bootstrap
-from eval.comparison.records import gather
+from eval.comparison.records import gather, grouped
 from eval.comparison.summary import announce, write_summary
-from eval.zoom.decisions import by_way, decision_tables, presence_scores
+from eval.zoom.decisions import decision_tables, presence_scores
 from eval.zoom.folds import outcomes_in_folds
 from eval.zoom.objects import SEMFOV, object_table
 from eval.zoom.run import ZoomConfig, ZoomRun
@@ -61,9 +61,9 @@ def zoom_summary(records: list[ResultRecord], run: ZoomRun) -> str:
     if groups["objects"]:
         lines += object_table(groups["objects"])
     if groups["recall"]:
-        lines += recalls(by_way(groups["recall"]), run)
+        lines += recalls(grouped(groups["recall"], "way"), run)
     if groups["first hit"]:
-        lines += _first_hits(by_way(groups["first hit"]))
+        lines += _first_hits(grouped(groups["first hit"], "way"))
     if groups["decision"]:
         lines += decision_tables(groups["decision"])
     return "\n".join(lines)
@@ -154,7 +154,7 @@ def _curves(records: list[ResultRecord], run: ZoomRun) -> Path:
     passes = run.config.passes
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
-    for way, group in by_way([record for record in records if record["measure"] == "recall"]).items():
+    for way, group in grouped((record for record in records if record["measure"] == "recall"), "way").items():
         axes.plot(range(1, passes + 1), curve(group, passes), label=way)
     axes.set(xlabel="passes of the detector", ylabel="recall", ylim=(0, None))
     axes.legend(fontsize="small")

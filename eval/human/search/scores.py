@@ -98,6 +98,7 @@ class People:
         self.longest = longest
         self.bootstrap = bootstrap
         self.pictures = by_picture(self.searches)
+        self._ids = {id(search) for search in self.searches}  # by which those of people are told from a model's
         self.clusters: dict[str, Any] = {}  # in each picture, of all people's fixations
         self.cells: dict[str, list[_Array]] = {}
         self.words: dict[str, list[list[int]]] = {}
@@ -174,14 +175,13 @@ class People:
         Returns:
             For each pair the six measures of `Beside.alike`; MultiMatch is NaN unless both searches succeed.
         """
-        themselves = {id(search) for search in self.searches}
         pairs = []
         for search, word in zip(searches, self._words(name, searches), strict=True):
             path = in_cells(search, self.grid)
             people = zip(self.pictures[name], self.cells[name], self.words[name], strict=True)
             for other, path_of_other, word_of_other in people:
                 # Each pair of people is counted only once.
-                if id(search) in themselves and other.subject <= search.subject:
+                if id(search) in self._ids and other.subject <= search.subject:
                     continue
                 scanpath_measures = [math.nan] * len(DIMENSIONS)
                 if _succeeds(search) and _succeeds(other):
