@@ -132,6 +132,10 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Find what an earlier look shows of a candidate as closely as a closer look would; None where none does."""
         return None
 
+    def is_judged(self, candidate: CandidatePlace) -> bool:
+        """Tell whether no closer look says more than the look behind a candidate, whose probability stays as it is."""
+        return False
+
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place; box `(4,)` of the target in the closer look."""
         boxes = torch.stack([candidate.box, box])

@@ -163,18 +163,26 @@ class Verifier(Generic[LookType]):
         Returns:
             The closer look, with its probabilities.
         """
-        assert self.candidate is not None
-        features, box = self.places.examine(self.candidate, detections)
-        with torch.no_grad():
-            fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
-        prior = self.places.prior
-        look = self.places.record(box, prior.at_place(fitted_place, fitted_presence), prior(fitted_presence))
+        candidate = self.candidate
+        assert candidate is not None
+        features, box = self.places.examine(candidate, detections)
+        if self.places.is_judged(candidate):
+            look = self.places.record(box, candidate.probability, self.places.presence)
+        else:
+            look = self.places.record(box, *self._verified(features))
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [verdict for verdict in self.verdicts if not self._is_replaced(verdict, look)]
         self.verdicts.append(_Verdict(look))
         self._judged = None
         self._choose()
         return look
+
+    @torch.no_grad()
+    def _verified(self, features: torch.Tensor) -> tuple[float, float]:
+        """Compute the probabilities of the place and of the picture after a closer look with features `(7,)`."""
+        fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
+        prior = self.places.prior
+        return prior.at_place(fitted_place, fitted_presence), prior(fitted_presence)
 
     def look_closely(self, close_up: LookAt, room: float = math.inf) -> list[CandidatePlace]:
         """Make all closer looks that are due.

@@ -253,6 +253,8 @@ class PhotographPlaces(CandidateBoxes):
     r"""Places of a photograph, hints among them; all are examined at which the chance of a hit is large enough.
 
     It is :math:`v = p \, (1 - \max_i p_i)`, with the probability p of the place and those of the closer looks so far.
+
+    An object that fills the photograph needs no closer look: its place keeps the probability p, and the photograph P.
     """
 
     least = 0.002
@@ -291,6 +293,10 @@ class PhotographPlaces(CandidateBoxes):
         """Find what the look at the window of a place showed; None where there was none."""
         look = self._shown.get(self._showing(candidate))
         return None if look is None else look.detections
+
+    def is_judged(self, candidate: CandidatePlace) -> bool:
+        """Tell whether the look at the whole shows a place as closely as any: it says nothing new a second time."""
+        return self._showing(candidate) == Window.overview(self._lattice)
 
     def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
         """Count the look, unless its window was looked at before; objects that were examined are left out."""

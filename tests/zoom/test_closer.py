@@ -419,6 +419,27 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     assert places.record(box, 0.4, 0.5).index == 1
 
 
+@pytest.mark.parametrize("share", [0.5, 0.1])
+def test_a_place_that_fills_the_photograph_keeps_its_probability(share):
+    """No closer look at it is made, and what the look at the whole says is not taken as evidence a second time."""
+    boxes = torch.tensor([[[10.0, 10, 180, 140], [60.0, 60, 80, 80]]])
+    whole = Detections(boxes, torch.tensor([[[0, 0.9, 0], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
+    prior = Prior(share, fitted=0.4)
+    judge = Verifier(Alike(), PhotographPlaces(1, OVER, prior=prior), Thresholds(0.5, 1e-4), most=9)
+    judge.see(TargetFacts(whole, 1, 0.8, 0.9, 0.0))
+    large = judge.candidate
+    look = judge.examine(judge.shown)
+    assert (look.place, look.presence) == pytest.approx((prior(0.8), prior(0.8)), abs=1e-6)
+    assert look.place == large.probability
+    # A place that a closer look shows better is verified.
+    small = judge.candidate
+    closely = Detections(boxes[:, 1:] + 1, torch.tensor([[[0, 0.9, 0]]]), torch.ones(1, 1).bool())
+    before = prior.inverse.at_place(small.probability, prior(0.8))
+    verified, _ = closer_features(0.8, before, 0.3, closely, small.box, 1)
+    expected = Alike()(verified).sigmoid().tolist()
+    assert judge.examine(closely).presence == pytest.approx(prior(expected[1]), abs=1e-6)
+
+
 @pytest.mark.parametrize(("rate", "passes"), [(0.0, 1), (2.5, 2)])
 def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
     boxes = torch.tensor([[[4.0, 4, 24, 24], [30.0, 4, 50, 24], [120.0, 90, 140, 110]]])
