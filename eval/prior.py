@@ -9,17 +9,19 @@ that it holds and one that it does not hold, whose share is one half. The table 
 score, the expected calibration error, the area under ROC and the decisions beside the share of the searches whose
 target is there, and the difference of the Brier score to that with the share of the fit, paired over the photographs.
 `best` is the Brier score after an offset and a slope of the log odds that are fitted to these searches themselves: what
-is left is ranking, not calibration. If the command is stopped, repeat it to continue.
+is left is ranking, not calibration. With `--enlarged 4` the same photographs have as many pixels as those of a camera,
+and are searched as large pictures. If the command is stopped, repeat it to continue.
 """
 
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from eval.bootstrap import Bootstrap
 from eval.comparison.records import gather
@@ -29,8 +31,10 @@ from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
 from semfov.agents.windows import window_eye
 from semfov.belief.prior import PriorLike
 from semfov.data.classes import class_index
+from semfov.data.scene import Annotation, Scene, Scenes
 from semfov.episode.stopwatch import Stopwatch
 from semfov.fit.logistic import logistic_regression
+from semfov.io.files import json_sha256
 from semfov.io.ranges import Count, Seed, Share, Whole
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
@@ -73,6 +77,7 @@ class PriorConfig(WorkConfig):
         max_target_area: share of a photograph that a class covers at most to be searched for in pairs of one that is
             there and one that is not.
         windows: evidence for windows, by name or file (None: the one that is shipped for the detector).
+        enlarged: factor by which photographs are enlarged first.
         seed: seed of the classes that are drawn.
         out: folder for the table and the records.
     """
@@ -84,8 +89,40 @@ class PriorConfig(WorkConfig):
     drawn: Whole = 3
     max_target_area: Share = 0.2
     windows: str | None = None
+    enlarged: Count = 1
     seed: Seed = 0
     out: Path = Path("runs/prior")
+
+
+class EnlargedScenes(Scenes):
+    """Photographs that are enlarged: the same scenes with as many pixels as a camera's, though not as sharp.
+
+    Args:
+        scenes: the photographs.
+        factor: by which their sides grow.
+    """
+
+    def __init__(self, scenes: Scenes, factor: int) -> None:
+        self.scenes = scenes
+        self.factor = factor
+        self.classes = scenes.classes
+        self.ids = scenes.ids
+        self.fingerprint = json_sha256([scenes.fingerprint, factor])
+
+    def __getitem__(self, index: int) -> Scene:
+        scene = self.scenes[index]
+        enlarged = F.interpolate(scene.image[None], scale_factor=self.factor, mode="bicubic")[0].clamp(0, 1)
+        return replace(scene, image=enlarged, boxes=scene.boxes * self.factor)
+
+    def digest(self, index: int) -> str:
+        return json_sha256([self.scenes.digest(index), self.factor])
+
+    def annotation(self, index: int) -> Annotation:
+        annotation = self.scenes.annotation(index)
+        width, height = annotation.size
+        return replace(
+            annotation, boxes=annotation.boxes * self.factor, size=(width * self.factor, height * self.factor)
+        )
 
 
 class PriorRun(SceneRun):
@@ -98,6 +135,8 @@ class PriorRun(SceneRun):
         check_sources(config.data, config.detector)
         detector = make_detector(config.detector)
         self.scenes = make_scenes(config.data, detector.classes)
+        if config.enlarged > 1:
+            self.scenes = EnlargedScenes(self.scenes, config.enlarged)
         name = detector.name if config.windows is None else config.windows
         self.evidence = GlimpseEvidence.from_pretrained(name).requires_grad_(False)
         self.eye = window_eye(detector, self.evidence).eval().requires_grad_(False)

@@ -100,7 +100,7 @@ class SearchFacts:
         return _LookFacts(look, score, closest, named, float(scores[best]), look.detections.boxes[0, best])
 
     def case(self, hit_chance: float) -> Tensor:
-        """Facts `(10,)` for `GlimpseEvidence.anywhere`: scores, what remains to be seen, and numbers of looks.
+        """Facts `(10,)` for `GlimpseEvidence.presence`: scores, what remains to be seen, and numbers of looks.
 
         Args:
             hit_chance: chance that the best remaining window shows the target.
@@ -140,10 +140,12 @@ class SearchFacts:
             hit_chance: chance that the best remaining window shows the target.
         """
         best = torch.tensor(self.best)
+        target = torch.tensor(self.belief.target)
         photograph = self.belief.photograph
         if photograph is not None:
-            return float(photograph.presence(best, torch.tensor(self.belief.target)).sigmoid())
-        return float(self.belief.evidence.anywhere(best, self.case(hit_chance)).sigmoid())
+            return float(photograph.presence(best, target).sigmoid())
+        whole = torch.tensor(self.looks[0].score)
+        return float(self.belief.evidence.presence(best, self.case(hit_chance), whole, target).sigmoid())
 
 
 CLOSER = 100  # largest number of closer looks in a large picture: as many as there are passes for

@@ -4,6 +4,7 @@ r"""Learned evidence by magnification: predictions from a look at a window of wh
 - `anywhere` gives the log odds that the picture holds a class, from the highest score and facts about the search.
 """
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -251,6 +252,32 @@ class GlimpseEvidence(DecidingModule, Pretrained):
             Log odds, `(...)`.
         """
         return torch.logit(best, eps=1e-4) + through(self.judge, case)[..., 0]
+
+    def presence(self, best: Tensor, case: Tensor, whole: Tensor, target: Tensor) -> Tensor:
+        r"""Predict whether a large picture holds a class that it shows small, as a scene, or large, as a photograph.
+
+        Either is as likely before the looks, so that the odds are the mean of both:
+
+        .. math:: \frac{P}{1 - P} = \frac{1}{2} \left( \frac{P_s}{1 - P_s} + \frac{P_l}{1 - P_l} \right)
+
+        :math:`P_s` is that of `anywhere`. :math:`P_l` is that of the look at the whole (`PhotographEvidence.presence`),
+        with a target in half of the searches; without evidence for photographs P is :math:`P_s`.
+
+        Args:
+            best: `(...)`, highest score of the class in any look.
+            case: `(..., 10)`, further facts about the search.
+            whole: `(...)`, highest score of the class in the look at the whole.
+            target: `(...)`, classes 1..K.
+
+        Returns:
+            Log odds, `(...)`.
+        """
+        small = self.anywhere(best, case)
+        photograph = self.photograph
+        if photograph is None or photograph.shares is None:
+            return small
+        large = photograph.presence(whole, target) - photograph.shares[target - 1].logit()
+        return torch.logaddexp(small, large) - math.log(2)
 
     def taper(self, span: int) -> Tensor:
         """Weigh the cells along a side of a window, r; objects at its border are cut.

@@ -6,7 +6,8 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from eval.prior import PAIR, _best_brier, prior_summary
+from eval.prior import PAIR, EnlargedScenes, _best_brier, prior_summary
+from semfov.data import EmbeddedScenes
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 
@@ -89,3 +90,19 @@ def test_the_best_brier_score_is_that_of_a_logistic_regression_of_the_log_odds()
     expected = float((fitted - there.double()).square().mean())
     # Half a case for and against without facts is added, so that the fit is always finite.
     assert _best_brier(probability, there) == pytest.approx(expected, abs=2e-3)
+
+
+def test_enlarged_photographs_show_the_same_objects():
+    scenes = EmbeddedScenes(("person", "cat"), count=2)
+    enlarged = EnlargedScenes(scenes, 3)
+    before = scenes[1]
+    scene = enlarged[1]
+    width, height = before.size
+    assert scene.size == enlarged.annotation(1).size == (3 * width, 3 * height)
+    assert torch.equal(scene.boxes, before.boxes * 3)
+    assert torch.equal(enlarged.annotation(1).boxes, scene.boxes)
+    assert torch.equal(scene.labels, before.labels)
+    # The middle of each block of 3 x 3 pixels is the pixel itself.
+    assert torch.allclose(scene.image[:, 1::3, 1::3], before.image, atol=1e-5)
+    assert enlarged.digest(1) not in {scenes.digest(1), enlarged.digest(0)}
+    assert (enlarged.ids, enlarged.classes) == (scenes.ids, scenes.classes)

@@ -30,7 +30,7 @@ from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import DISPERSION, FACTS, SPREAD, Certainty, number_of
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import find_everything, look_for
-from semfov.zoom.evidence import CASE
+from semfov.zoom.evidence import CASE, PhotographEvidence
 from semfov.zoom.hint_maps import features
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
@@ -104,6 +104,23 @@ def test_before_fitting_the_probability_is_the_best_score(eye, picture):
     for step in seen:
         facts.add(step.look)
         assert facts.presence(step.next_value) == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.02])
+def test_a_large_picture_may_be_a_photograph(share):
+    """The odds are the mean of those of a scene and of those of a photograph, with a target in half of them."""
+    model = GlimpseEvidence(3).eval()
+    torch.nn.init.normal_(model.judge[-1].weight)
+    best, whole, target = torch.rand(50), torch.rand(50), torch.randint(1, 4, (50,))
+    case = torch.randn(50, CASE)
+    small = model.anywhere(best, case)
+    assert torch.equal(model.presence(best, case, whole, target), small)
+    model.photograph = PhotographEvidence(3, shares=torch.full((3,), share))
+    torch.nn.init.normal_(model.photograph.whole.weight)
+    p = model.presence(best, case, whole, target).sigmoid().double()
+    large = model.photograph.presence(whole, target).double().exp() * (1 - share) / share
+    expected = (small.double().exp() + large) / 2
+    assert torch.allclose(p / (1 - p), expected, rtol=1e-3)
 
 
 def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
