@@ -90,7 +90,7 @@ class MosaicSearch(TargetSearch[TargetFacts]):
 
     def candidates(self) -> CandidateBoxes:
         assert self.model.thresholds is not None
-        return CandidateBoxes(self.target, self.model.thresholds.confirm)
+        return CandidateBoxes(self.target, self.model.thresholds.confirm, self.source.lattice)
 
     def close_up(self, box: Tensor) -> Detections:
         return look_closely(self.source, box).detections

@@ -27,7 +27,7 @@ USUAL_WINDOW = 0.6, 2.0
 MOST_IN_PHOTOGRAPH = 3
 """Default for the largest number of closer looks in a photograph: more would go to the objects of a crowd."""
 
-_WHOLE = 0.9  # share of a photograph from which on a window shows no more than the look at the whole
+_WHOLE = 0.9  # share of a picture from which on a window shows no more than the look at the whole
 
 _SMALLEST = 1e-4  # probability below which, and below 1 less it, one counts as this in log odds
 
@@ -108,6 +108,13 @@ class _Scored(NamedTuple):
         return _Scored(boxes, self.scores * are_ahead.to(self.scores.device), inside_frame(boxes, size))
 
 
+class _ShownWindow(NamedTuple):
+    """A window that was looked at: the number of the look in the path, and what it shows."""
+
+    number: int
+    detections: Detections
+
+
 class CandidateBoxes(CandidatePlaces[TargetFacts]):
     r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
 
@@ -117,7 +124,10 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). In a stream scores fade, and
     places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
 
-    Private attributes: `_look` is the last look of the search. `_scored` has the boxes of the target that looks have
+    An object that fills the picture needs no closer look: its place keeps the probability p, and the picture P.
+
+    Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
+    that of the whole, unless other frames have passed since. `_scored` has the boxes of the target that looks have
     shown, where they lie in the present frame, and `_looks` the time of each of these looks, with its number of boxes.
 
     Invariant: `_scored` has the boxes of `_looks`, in their order. `_most_evident`, once it was computed, is that of
@@ -128,11 +138,20 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     """Score from which on a box seems to hold the target."""
 
     def __init__(
-        self, target: int, likely: float, forgetting: Forgetting | None = None, prior: Prior | None = None
+        self,
+        target: int,
+        likely: float,
+        lattice: Lattice,
+        forgetting: Forgetting | None = None,
+        prior: Prior | None = None,
+        window: tuple[float, float] = USUAL_WINDOW,
     ) -> None:
         super().__init__(forgetting, prior)
         self.target = target
         self.likely = likely
+        self._lattice = lattice
+        self._window = window
+        self._shown: dict[Window, _ShownWindow] = {}
         self._scored = _Scored(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).bool())
         self._lost_boxes: LostScene[_Scored] = LostScene()
 
@@ -145,6 +164,8 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         self._next = look.next_index
         self.detections = look.detections
         self.presence = self.prior(look.presence)
+        if look.next_index == 1:
+            self._shown[Window.overview(self._lattice)] = _ShownWindow(0, look.detections)
         scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
@@ -152,6 +173,31 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
             in_view = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
             self._looks.append((self._now, len(boxes)))
             self._scored = self._scored.joined(_Scored(boxes, scores[of_target], in_view))
+
+    def shown_at(self, candidate: CandidatePlace) -> Detections | None:
+        """Find what the look at the window of a place showed; None where there was none."""
+        look = self._shown.get(self._showing(candidate))
+        return None if look is None else look.detections
+
+    def is_judged(self, candidate: CandidatePlace) -> bool:
+        """Tell whether the look at the whole shows a place as closely as any: it says nothing new a second time."""
+        return self._showing(candidate) == Window.overview(self._lattice)
+
+    def _showing(self, candidate: CandidatePlace) -> Window:
+        """Choose the window of a closer look at a place, or the whole photograph where it shows no more."""
+        window = closer_window(self._lattice, candidate.box, self._window)
+        x1, y1, x2, y2 = window.region(self._lattice)
+        if (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size):
+            return Window.overview(self._lattice)
+        return window
+
+    def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
+        """Count the look, unless the look at the whole shows the place as closely."""
+        shown = self._shown.get(self._showing(candidate))
+        if shown is None:
+            return super()._telling(candidate, detections)
+        self._index = shown.number
+        return detections
 
     @property
     def hit_chance(self) -> float:
@@ -194,6 +240,12 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         self._change()
         super().wait(passed)
         self._forget_boxes()
+        self._forget_windows()
+
+    def _forget_windows(self) -> None:
+        """Forget what windows of earlier frames showed, where the scene changes."""
+        if self.forgetting.rate:
+            self._shown.clear()
 
     def _forget_boxes(self) -> None:
         """Forget the boxes of looks that are forgotten, which are the oldest."""
@@ -242,19 +294,10 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         return self.prior.at_place(chance, presence)
 
 
-class _ShownWindow(NamedTuple):
-    """A window of a photograph that was looked at: the number of the look in the path, and what it shows."""
-
-    number: int
-    detections: Detections
-
-
 class PhotographPlaces(CandidateBoxes):
     r"""Places of a photograph, hints among them; all are examined at which the chance of a hit is large enough.
 
     It is :math:`v = p \, (1 - \max_i p_i)`, with the probability p of the place and those of the closer looks so far.
-
-    An object that fills the photograph needs no closer look: its place keeps the probability p, and the photograph P.
     """
 
     least = 0.002
@@ -268,10 +311,7 @@ class PhotographPlaces(CandidateBoxes):
         window: tuple[float, float] = USUAL_WINDOW,
         prior: Prior | None = None,
     ) -> None:
-        super().__init__(target, 0.0, forgetting, prior)
-        self._lattice = lattice
-        self._window = window
-        self._shown: dict[Window, _ShownWindow] = {}
+        super().__init__(target, 0.0, lattice, forgetting, prior, window)
 
     def see(self, look: TargetFacts) -> None:
         """Take in a look at the whole photograph."""
@@ -289,15 +329,6 @@ class PhotographPlaces(CandidateBoxes):
         place = self._most_evident
         return None if place is None or self._hit_chance_at(place) < thresholds.stop_below else place
 
-    def shown_at(self, candidate: CandidatePlace) -> Detections | None:
-        """Find what the look at the window of a place showed; None where there was none."""
-        look = self._shown.get(self._showing(candidate))
-        return None if look is None else look.detections
-
-    def is_judged(self, candidate: CandidatePlace) -> bool:
-        """Tell whether the look at the whole shows a place as closely as any: it says nothing new a second time."""
-        return self._showing(candidate) == Window.overview(self._lattice)
-
     def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
         """Count the look, unless its window was looked at before; objects that were examined are left out."""
         window = self._showing(candidate)
@@ -309,19 +340,10 @@ class PhotographPlaces(CandidateBoxes):
         # Not a copy with another mask, whose highest scores would be those of what was examined, too.
         return Detections(detections.boxes, detections.scores, others, detections.confidence * others)
 
-    def wait(self, passed: float = FRAME) -> None:
-        """Let seconds pass; closer looks at earlier frames show other pixels where the scene changes."""
-        super().wait(passed)
+    def _forget_windows(self) -> None:
+        # The look at the whole is made anew in each frame.
         if self.forgetting.rate:
             self._shown = {window: shown for window, shown in self._shown.items() if window.within is None}
-
-    def _showing(self, candidate: CandidatePlace) -> Window:
-        """Choose the window of a closer look at a place, or the whole photograph where it shows no more."""
-        window = closer_window(self._lattice, candidate.box, self._window)
-        x1, y1, x2, y2 = window.region(self._lattice)
-        if (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size):
-            return Window.overview(self._lattice)
-        return window
 
     def _hit_chance_at(self, place: CandidatePlace) -> float:
         """Chance that a look at a place shows the target, if no closer look so far has."""

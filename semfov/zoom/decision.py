@@ -386,7 +386,7 @@ def decisions_of(
         return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior)
     places: CandidateBoxes
     if photograph is None:
-        places = CandidateBoxes(belief.target, thresholds.confirm, forgetting, prior)
+        places = CandidateBoxes(belief.target, thresholds.confirm, belief.lattice, forgetting, prior)
     else:
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
     thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.stop_below)

@@ -102,7 +102,7 @@ def test_the_window_shows_the_box_with_its_surroundings_and_lies_in_the_picture(
 
 def test_the_strongest_detection_is_examined_first_and_each_place_once():
     source = Scripted([0.9, 0.1, 0.5], side=27.0)  # boxes of closer looks overlap the others by less than half
-    candidates = CandidateBoxes(1, 0.0)
+    candidates = CandidateBoxes(1, 0.0, LATTICE)
     looks = [
         seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540], [104.0, 100, 144, 140]], [0.6, 0.8, 0.55]),
         seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]),
@@ -130,7 +130,7 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
 def verifier(model, scores, most=2):
     """A verifier of the target in class 1."""
     looks = Scripted(scores)
-    return Verifier(model, CandidateBoxes(1, 0.7), AT, most), lambda box: look_closely(looks, box).detections
+    return Verifier(model, CandidateBoxes(1, 0.7, LATTICE), AT, most), lambda box: look_closely(looks, box).detections
 
 
 def look(number, presence, left, *boxes):
@@ -761,3 +761,21 @@ def test_with_poses_of_a_still_camera_a_search_is_the_same_to_the_bit(detector, 
         assert one.decision.outcome == other.decision.outcome
         assert [look.region for look in one] == [look.region for look in other]
         assert torch.equal(one.objects.boxes, other.objects.boxes)
+
+
+def test_an_object_that_fills_a_large_picture_needs_no_closer_look():
+    """The look at the whole shows it as closely; in a stream a later frame shows other pixels."""
+    boxes = torch.tensor([[[10.0, 10, 1000, 750], [60.0, 60, 90, 90]]])
+    whole = Detections(boxes, torch.tensor([[[0, 0.9, 0], [0, 0.5, 0]]]), torch.ones(1, 2).bool())
+    for rate in (0.0, 2.5):
+        judge = Verifier(Alike(), CandidateBoxes(1, 0.6, LATTICE, Forgetting(rate)), Thresholds(0.5, 1e-4), most=9)
+        judge.see(TargetFacts(whole, 1, 0.8, 0.9, 0.3))
+        assert judge.shown is whole
+        if rate:
+            judge.wait()
+            assert judge.shown is None
+            continue
+        look = judge.examine(judge.shown)
+        assert (look.index, look.place, look.presence) == (0, pytest.approx(0.8, abs=1e-6), 0.8)
+        judge.end()
+        assert judge.candidate is None or judge.shown is None  # a small place takes a pass
