@@ -80,6 +80,16 @@ def test_files_named_on_a_page_exist(page):
     assert [name for name in sorted(named) if not list(DOCS.parent.glob(name))] == []
 
 
+def test_names_on_the_map_stand_in_their_files():
+    """A row such as `follow` of `semfov/tracking/tracker.py` names what its file defines."""
+    text = (DOCS / "map.md").read_text(encoding="utf-8")
+    named = re.findall(r"((?:`\w+`(?:, | and )?)+) of `([\w/]+\.py)`", text)
+    pairs = [(name, file) for names, file in named for name in re.findall(r"\w+", names.replace(" and ", " "))]
+    sources = {file: (DOCS.parent / file).read_text(encoding="utf-8") for _, file in pairs}
+    assert len(pairs) > 5
+    assert [pair for pair in pairs if not re.search(rf"\b{pair[0]}\b", sources[pair[1]])] == []
+
+
 def test_the_map_names_every_room():
     """Every folder and module of the package is in the map, except for the version and the errors."""
     text = (DOCS / "map.md").read_text(encoding="utf-8")
