@@ -24,7 +24,8 @@ from eval.comparison.summary import announce, by_scene, collect_records, write_s
 from eval.search.report import found
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import InputError
-from semfov.fit.through_belief import SearchedLooks, fit_through_belief, searched_looks
+from semfov.fit.samples import AnnotatedLooks, annotated_looks
+from semfov.fit.through_belief import fit_through_belief
 from semfov.io.files import write_text
 from semfov.io.ranges import Count, Range
 from semfov.metrics.episodes import FloatArray, standard_error
@@ -75,7 +76,7 @@ class _Folds:
     Attributes:
         config: the settings.
         ids: id of each photograph.
-        searches: the searches in each photograph; None for one without.
+        searches: looks at the photographs with a class to search for.
         start: the observation model that the fits start from.
     """
 
@@ -88,18 +89,14 @@ class _Folds:
         self.ids = [*run.scenes.ids]
         photographs = range(len(run.scenes))
         looks = ((index, run.detections(index), run.grid(index).centres) for index in photographs)
-        searches = searched_looks(run.scenes, looks, run.cells, config.data.max_target_area)
-        self.searches: list[SearchedLooks | None] = [searches.get(index) for index in photographs]
+        annotated = annotated_looks(run.scenes, looks, run.cells, config.data.max_target_area)
+        self.searches: list[AnnotatedLooks] = [searched for searched in annotated if len(searched.targets)]
         self.start = make_observation(config.belief.model, run.eye)
 
     def fit(self, left_out: int | None) -> FovealObservationModel:
         """Fit a model to the photographs of all folds but one; None leaves none out."""
         config = self.config
-        chosen = [
-            search
-            for number, search in enumerate(self.searches)
-            if search is not None and number % config.folds != left_out
-        ]
+        chosen = [searched for searched in self.searches if searched.photograph % config.folds != left_out]
         record = {"looks": config.looks, "steps": config.steps, "photographs": len(chosen)}
         return fit_through_belief(self.start, chosen, looks=config.looks, steps=config.steps, search=record)
 

@@ -15,27 +15,21 @@ Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 import json
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 
 from semfov.errors import check
-from semfov.fit.cells import MOST_PHOTOGRAPHS, MappedLooks, fit_cells, mapped_looks
+from semfov.fit.cells import MOST_PHOTOGRAPHS, fit_cells
 from semfov.fit.observation import count_misses, fit_published, statistics_of
-from semfov.fit.samples import Samples
+from semfov.fit.samples import AnnotatedLooks, Samples, annotated_looks
 from semfov.fit.settings import FitConfig
-from semfov.fit.through_belief import (
-    SearchedLooks,
-    fit_through_belief,
-    mean_landing_loss,
-    searched_looks,
-    starting_model,
-)
+from semfov.fit.through_belief import fit_through_belief, mean_landing_loss, starting_model
 from semfov.fit.training import split
 from semfov.io.files import write_text
 from semfov.io.ranges import Count, Positive, Range, Share, Weight, Whole
@@ -275,12 +269,9 @@ def _fit_to_search(
     config: FitFomConfig, sampler: Sampler, model: FovealObservationModel
 ) -> tuple[FovealObservationModel, str]:
     """Fit a model through the belief; returns it, and how much better searches of held-out photographs land."""
-    searches: dict[int, SearchedLooks] = {}
-    for shard in sampler.by_shard():
-        looks = ((index, *shard.looks_at(index)) for index in shard.scenes.unique().tolist())
-        searches |= searched_looks(sampler.scenes, looks, _CELLS, config.max_target_area)
-    training = [looks for index, looks in searches.items() if index % config.holdout]
-    judged = [looks for index, looks in searches.items() if index % config.holdout == 0]
+    searches = [searched for searched in _annotated(config, sampler) if len(searched.targets)]
+    training = [searched for searched in searches if searched.photograph % config.holdout]
+    judged = [searched for searched in searches if searched.photograph % config.holdout == 0]
     options = {"looks": config.looks, "steps": config.steps, "seed": config.seed}
     fitted = fit_through_belief(model, training, **options, search={**options, "photographs": len(training)})
     if not judged:
@@ -308,7 +299,8 @@ def fit_fom(config: FitFomConfig) -> None:
     if config.mosaics:
         model.metadata["cells"] = misses.total.sum(1).tolist()
     elif config.method in _TRAINED:
-        fit_cells(model, _mapped_looks(config, sampler), seed=config.seed)
+        training = (looks for looks in _annotated(config, sampler) if looks.photograph % config.holdout)
+        fit_cells(model, [*islice(training, MOST_PHOTOGRAPHS)], seed=config.seed)
     saved = model
     landing = ""
     if config.method == "search":
@@ -338,15 +330,11 @@ def _fit_model(
     return fit_discriminative(start, training.scores, training.distance, training.labels)
 
 
-def _mapped_looks(config: FitFomConfig, sampler: Sampler) -> list[MappedLooks]:
-    """List looks at photographs that are not held out, with what their cells hold."""
-    mapped: list[MappedLooks] = []
+def _annotated(config: FitFomConfig, sampler: Sampler) -> Iterator[AnnotatedLooks]:
+    """Go through the looks at photographs with objects, and what their cells hold."""
     for shard in sampler.by_shard():
-        fitted_on = [index for index in shard.scenes.unique().tolist() if index % config.holdout]
-        mapped += mapped_looks(sampler.scenes, shard, fitted_on, _CELLS)
-        if len(mapped) >= MOST_PHOTOGRAPHS:
-            break
-    return mapped[:MOST_PHOTOGRAPHS]
+        looks = ((index, *shard.looks_at(index)) for index in shard.scenes.unique().tolist())
+        yield from annotated_looks(sampler.scenes, looks, _CELLS, config.max_target_area)
 
 
 def _count_misses(config: FitFomConfig, sampler: Sampler, model: FovealObservationModel) -> MissCounts:

@@ -1,18 +1,13 @@
 """Fit what a look says about whole cells, so that the map of all classes is right as often as it says."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.belief.observers import SemanticMap
-from semfov.data.scene import Scenes
-from semfov.detection.detections import Detections
 from semfov.errors import DataError
-from semfov.fit.samples import Samples
-from semfov.metrics.episodes import answers_of
+from semfov.fit.samples import AnnotatedLooks
 from semfov.observation.descent import Lbfgs
 from semfov.observation.foveal import FovealObservationModel
 
@@ -25,51 +20,7 @@ _LEAST = 1e-9  # of a probability whose logarithm is taken
 _PULL = 1e-4  # weight that keeps the numbers finite where cells hold nothing, or looks tell them all apart
 
 
-@dataclass(frozen=True)
-class MappedLooks:
-    """Looks at a photograph, and what its cells hold.
-
-    Attributes:
-        detections: of R looks.
-        fixations: `(R, 2)`, in pixels.
-        grid: the cells.
-        answers: `(X·Y, K+1)` boolean, whether a cell holds nothing, and each class.
-    """
-
-    detections: Detections
-    fixations: Tensor
-    grid: Grid
-    answers: Tensor
-
-
-def mapped_looks(
-    scenes: Scenes, samples: Samples, photographs: Iterable[int], cells: tuple[int, int]
-) -> list[MappedLooks]:
-    """List stored looks with what the cells of their photographs hold.
-
-    Args:
-        scenes: the photographs.
-        samples: labelled detections of their looks.
-        photographs: numbers of those that count.
-        cells: columns and rows of the grid.
-
-    Returns:
-        The looks at each of the first `MOST_PHOTOGRAPHS` photographs with objects.
-    """
-    mapped: list[MappedLooks] = []
-    for index in photographs:
-        if len(mapped) == MOST_PHOTOGRAPHS:
-            break
-        annotation = scenes.annotation(index)
-        grid = Grid(*cells, annotation.size)
-        answers = answers_of(annotation, grid, len(scenes.classes) + 1)
-        if answers.any():
-            answers[:, 0] = ~answers.any(-1)
-            mapped.append(MappedLooks(*samples.looks_at(index), grid, answers))
-    return mapped
-
-
-def map_loss(observer: SemanticMap, mapped: MappedLooks, order: Tensor) -> Tensor:
+def map_loss(observer: SemanticMap, annotated: AnnotatedLooks, order: Tensor) -> Tensor:
     r"""Compute the loss of a map after looks in a given order, a mean over cells and looks.
 
     .. math:: -\ln \sum_{k \in x} P(C^x = k)
@@ -78,24 +29,24 @@ def map_loss(observer: SemanticMap, mapped: MappedLooks, order: Tensor) -> Tenso
 
     Args:
         observer: weighs the looks and updates the belief; the loss is differentiable in its parameters.
-        mapped: looks at a photograph.
+        annotated: looks at a photograph.
         order: `(n,)`, numbers of the looks to make.
 
     Returns:
         A scalar.
     """
-    looks = observer.weigh(mapped.detections[order], mapped.fixations[order], mapped.grid)
-    belief = observer.start(1, mapped.grid, looks.ratio)
+    looks = observer.weigh(annotated.detections[order], annotated.fixations[order], annotated.grid)
+    belief = observer.start(1, annotated.grid, looks.ratio)
     losses = []
     for number in range(len(order)):
         belief = observer.update(belief, looks[number : number + 1])
-        right = (belief.class_probabilities()[0] * mapped.answers).sum(-1)
+        right = (belief.class_probabilities()[0] * annotated.answers).sum(-1)
         losses.append(-right.clamp(min=_LEAST).log().mean())
     return torch.stack(losses).mean()
 
 
 @torch.no_grad()
-def mean_map_loss(model: FovealObservationModel, photographs: Sequence[MappedLooks]) -> float:
+def mean_map_loss(model: FovealObservationModel, photographs: Sequence[AnnotatedLooks]) -> float:
     """Average the loss of the maps of photographs (`map_loss`), with all looks in the order in which they are stored.
 
     Args:
@@ -106,11 +57,11 @@ def mean_map_loss(model: FovealObservationModel, photographs: Sequence[MappedLoo
         The mean over photographs, in nats.
     """
     observer = SemanticMap(model)
-    losses = [map_loss(observer, mapped, torch.arange(len(mapped.fixations))) for mapped in photographs]
+    losses = [map_loss(observer, annotated, torch.arange(len(annotated.fixations))) for annotated in photographs]
     return float(torch.stack(losses).mean())
 
 
-def fit_cells(model: FovealObservationModel, photographs: Sequence[MappedLooks], *, seed: int = 0) -> None:
+def fit_cells(model: FovealObservationModel, photographs: Sequence[AnnotatedLooks], *, seed: int = 0) -> None:
     """Learn what a look says about whole cells (its `log_cell`), in place.
 
     These are three numbers, the odds of a miss, an exponent, and the weight of background. They minimise the negative
@@ -129,8 +80,8 @@ def fit_cells(model: FovealObservationModel, photographs: Sequence[MappedLooks],
     observer = SemanticMap(model)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        ratio = torch.cat([_closest_looks(observer, mapped, generator) for mapped in photographs]).double()
-    answers = torch.cat([mapped.answers.expand(_COUNTS, -1, -1) for mapped in photographs])
+        ratio = torch.cat([_closest_looks(observer, annotated, generator) for annotated in photographs]).double()
+    answers = torch.cat([annotated.answers.expand(_COUNTS, -1, -1) for annotated in photographs])
     start = model.log_cell.detach().clone()
     optimiser = Lbfgs([model.log_cell], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
 
@@ -147,11 +98,11 @@ def fit_cells(model: FovealObservationModel, photographs: Sequence[MappedLooks],
     model.zero_grad()
 
 
-def _closest_looks(observer: SemanticMap, mapped: MappedLooks, generator: torch.Generator) -> Tensor:
+def _closest_looks(observer: SemanticMap, annotated: AnnotatedLooks, generator: torch.Generator) -> Tensor:
     """Sum what the closest of the first 1, 2, 4 and 8 looks says about each cell, `(4, X·Y, K+1)`."""
-    order = torch.randperm(len(mapped.fixations), generator=generator)[: 2 ** (_COUNTS - 1)]
-    looks = observer.weigh(mapped.detections[order], mapped.fixations[order], mapped.grid)
-    cells = torch.arange(len(mapped.grid))
+    order = torch.randperm(len(annotated.fixations), generator=generator)[: 2 ** (_COUNTS - 1)]
+    looks = observer.weigh(annotated.detections[order], annotated.fixations[order], annotated.grid)
+    cells = torch.arange(len(annotated.grid))
     ratios = []
     for doubling in range(_COUNTS):
         closest = looks.distance[: 2**doubling].argmin(0)  # (X·Y,), number of the look

@@ -42,8 +42,7 @@ def folder_report(inputs: PartInputs, seconds: float) -> str:
     """
     config = inputs.config
     run = inputs.run
-    training = {*range(len(run.scenes))} - {*inputs.held_out}
-    counts = class_counts(run, training)
+    counts = class_counts(run, inputs.training)
     lines = [
         f"# Models of {run.eye.detector.name}",
         "",

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import torch
@@ -11,10 +12,10 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.eye import Eye
-from semfov.fit.cells import fit_cells, mapped_looks, mean_map_loss
+from semfov.fit.cells import MOST_PHOTOGRAPHS, fit_cells, mean_map_loss
 from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
-from semfov.fit.samples import Samples, all_cells
+from semfov.fit.samples import AnnotatedLooks, Samples, all_cells, annotated_looks
 from semfov.fit.training import split
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.metrics.episodes import FloatArray
@@ -151,14 +152,16 @@ class ObservationFit(PartFit):
 
     def _fit_maps(self, samples: Samples, models: Mapping[str, FovealObservationModel]) -> dict[str, float]:
         """Fit what looks say about cells with each model; returns the loss of its maps of held-out photographs."""
-        scenes, cells, every = self.run.scenes, self.config.cells, self.settings["holdout"]
-        fitted_on = [index for index in range(len(scenes)) if index % every]
-        judged_on = [index for index in range(len(scenes)) if index % every == 0]
-        photographs = mapped_looks(scenes, samples, fitted_on, cells)
-        judged = mapped_looks(scenes, samples, judged_on, cells)
+        photographs = self._annotated(samples, self.inputs.training)
+        judged = self._annotated(samples, self.inputs.held_out)
         for model in models.values():
             fit_cells(model, photographs, seed=self.settings["seed"])
         return {name: mean_map_loss(model, judged or photographs) for name, model in models.items()}
+
+    def _annotated(self, samples: Samples, photographs: Iterable[int]) -> list[AnnotatedLooks]:
+        """List the looks at the first photographs with objects."""
+        looks = ((index, *samples.looks_at(index)) for index in photographs)
+        return [*islice(annotated_looks(self.run.scenes, looks, self.config.cells), MOST_PHOTOGRAPHS)]
 
     @property
     def _edges(self) -> list[float]:
@@ -171,9 +174,8 @@ class ObservationFit(PartFit):
         options = {"expected": "empirical", "fixations": self.config.fixations, "seed": self.config.seed}
         start = fit_published(run.eye, run.scenes, statistics, self._edges, **options)
         model = fit_discriminative(start, training.scores, training.distance, training.labels)
-        fitted_on = {index for index in range(len(run.scenes)) if index % self.settings["holdout"]}
         cells = partial(all_cells, cells=self.config.cells)
-        misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
+        misses = count_misses(run.scenes, samples, {*self.inputs.training}, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         return model
 

@@ -56,7 +56,8 @@ class PartInputs:
         absent: number of absent classes to search for in a photograph; None: as many as present ones.
         protocol: the searches and explorations by which parts are compared.
         compared_at: number of gaze shifts after which they are compared.
-        held_out: numbers of the photographs that are held out.
+        training: numbers of the photographs to learn from.
+        held_out: numbers of the other photographs.
         judged: those of them on which searches and explorations are compared.
         results: the parts that are finished, by name.
     """
@@ -73,7 +74,9 @@ class PartInputs:
         shifts = min(_MOST_SHIFTS, self.config.columns * self.config.rows - 1)  # until all cells are fixated
         self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
         self.compared_at = min(5, shifts)
-        self.held_out = [index for index in range(len(run.scenes)) if index % (self.config.holdout or 5) == 0]
+        every = self.config.holdout or 5
+        self.training = [index for index in range(len(run.scenes)) if index % every]
+        self.held_out = [index for index in range(len(run.scenes)) if index % every == 0]
         self.judged: Sequence[int] = self.held_out[: self.config.judged]
         self.results: dict[str, PartResult] = {}
 

@@ -1,13 +1,15 @@
-"""Labelled detections: the detector's scores, the distance from the fixation, and the true class."""
+"""Looks at photographs beside what is there: labelled detections, and the classes that cells hold."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.scene import Annotation
+from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
+from semfov.metrics.episodes import answers_of
 from semfov.observation.matching import match
 
 
@@ -124,3 +126,60 @@ def all_cells(
     """
     grid = Grid(*cells, size)
     return grid, grid.distance(fixation), torch.ones(len(grid), dtype=torch.bool)
+
+
+@dataclass(frozen=True)
+class AnnotatedLooks:
+    """Looks at a photograph, and what its cells hold.
+
+    Attributes:
+        photograph: its number.
+        detections: of R looks.
+        fixations: `(R, 2)`, in pixels.
+        grid: the cells.
+        answers: `(X·Y, K+1)` boolean, the classes of a cell, or background alone.
+        targets: `(T,)`, classes 1..K that may be searched for.
+    """
+
+    photograph: int
+    detections: Detections
+    fixations: Tensor
+    grid: Grid
+    answers: Tensor
+    targets: Tensor
+
+    @property
+    def goal(self) -> Tensor:
+        """Cells that hold each target, `(T, X·Y)` boolean."""
+        return self.answers[:, self.targets].T.contiguous()
+
+
+def annotated_looks(
+    scenes: Scenes,
+    looks: Iterable[tuple[int, Detections, Tensor]],
+    cells: tuple[int, int],
+    max_target_area: float | None = None,
+) -> Iterator[AnnotatedLooks]:
+    """Find what the cells of photographs hold.
+
+    Args:
+        scenes: the photographs.
+        looks: number of a photograph, detections of R looks at it, and their fixations `(R, 2)`, in pixels.
+        cells: columns and rows of the grid.
+        max_target_area: classes that cover a larger share of the image are not searched for; None: no limit.
+
+    Yields:
+        The looks at each photograph with objects.
+    """
+    for index, detections, fixations in looks:
+        annotation = scenes.annotation(index)
+        grid = Grid(*cells, annotation.size)
+        answers = answers_of(annotation, grid, len(scenes.classes) + 1)
+        if not answers.any():
+            continue
+        # A target in every cell is found at once.
+        is_search = answers.any(0) & ~answers.all(0)
+        legal = legal_targets(annotation, max_target_area)
+        targets = torch.tensor([target for target in legal if is_search[target]], dtype=torch.long)
+        answers[:, 0] = ~answers.any(-1)
+        yield AnnotatedLooks(index, detections, fixations, grid, answers, targets)

@@ -17,8 +17,9 @@ from semfov.episode import Step, rollout
 from semfov.errors import DataError, check
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.presence import COUNTED, BeliefsOfSearches, fit_presence, judge_presence
+from semfov.fit.samples import annotated_looks
 from semfov.fit.settings import FitOnCellsConfig
-from semfov.fit.through_belief import fit_through_belief, searched_looks
+from semfov.fit.through_belief import fit_through_belief
 from semfov.fit.training import split, training_of
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
@@ -167,8 +168,8 @@ def _with_odds_of_a_miss(
         return deepcopy(start)
     read = track(range(len(run.scenes)), "reading looks", "photograph")
     looks = ((index, run.detections(index), run.grid(index).centres) for index in read)
-    searches = searched_looks(run.scenes, looks, run.cells, config.max_target_area)
-    training = [searched for index, searched in searches.items() if index % config.holdout]
+    annotated = annotated_looks(run.scenes, looks, run.cells, config.max_target_area)
+    training = [searched for searched in annotated if len(searched.targets) and searched.photograph % config.holdout]
     record = {"looks": config.looks, "steps": config.steps, "photographs": len(training)}
     return fit_through_belief(start, training, looks=config.looks, steps=config.steps, seed=config.seed, search=record)
 

@@ -1,20 +1,17 @@
 """Fit an observation model through the belief, so that searches with it land on their targets sooner."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from semfov.belief.grid import Grid
 from semfov.belief.observers import SemanticSearch
-from semfov.data.scene import Annotation, Scenes, legal_targets
-from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
+from semfov.fit.samples import AnnotatedLooks
 from semfov.fit.training import descend
 from semfov.observation.foveal import FovealObservationModel
 
@@ -24,66 +21,7 @@ _MISS = 1e-4  # value from which the odds of a miss are learned
 _DEGREE = 2  # of the curve over the levels: few photographs show what each level alone is like
 
 
-@dataclass(frozen=True)
-class SearchedLooks:
-    """Looks at a photograph, and the classes that may be searched for in it.
-
-    Attributes:
-        detections: of R looks.
-        fixations: `(R, 2)`, in pixels.
-        grid: the cells.
-        targets: `(T,)`, classes 1..K.
-        goal: `(T, X·Y)` boolean, the cells that objects of each class overlap.
-    """
-
-    detections: Detections
-    fixations: Tensor
-    grid: Grid
-    targets: Tensor
-    goal: Tensor
-
-
-def searched_looks(
-    scenes: Scenes,
-    looks: Iterable[tuple[int, Detections, Tensor]],
-    cells: tuple[int, int],
-    max_target_area: float | None,
-) -> dict[int, SearchedLooks]:
-    """Find the searches that looks at photographs allow.
-
-    Args:
-        scenes: the photographs.
-        looks: number of a photograph, detections of R looks at it, and their fixations `(R, 2)`, in pixels.
-        cells: columns and rows of the grid.
-        max_target_area: classes that cover a larger share of the image are not searched for; None: no limit.
-
-    Returns:
-        The looks with these classes by the number of the photograph; those without a class to search for are left out.
-    """
-    searches = {}
-    for index, detections, fixations in looks:
-        annotation = scenes.annotation(index)
-        grid = Grid(*cells, annotation.size)
-        goals = _goals(annotation, grid, max_target_area)
-        if goals:
-            targets = torch.tensor([*goals])
-            searches[index] = SearchedLooks(detections, fixations, grid, targets, torch.stack([*goals.values()]))
-    return searches
-
-
-def _goals(annotation: Annotation, grid: Grid, max_target_area: float | None) -> dict[int, Tensor]:
-    """Find the cells `(X·Y,)` of each class that may be searched for."""
-    covered = grid.footprint(annotation.boxes)
-    goals: dict[int, Tensor] = {}
-    for target in legal_targets(annotation, max_target_area):
-        goal = covered[annotation.labels == target].any(0)
-        # A target in every cell is found at once.
-        if goal.any() and not goal.all():
-            goals[target] = goal
-    return goals
-
-
-def landing_loss(observer: SemanticSearch, searched: SearchedLooks, order: Tensor) -> Tensor | None:
+def landing_loss(observer: SemanticSearch, searched: AnnotatedLooks, order: Tensor) -> Tensor | None:
     r"""Compute the loss of searches that fixate in a given order, a mean over looks and targets not found yet.
 
     .. math:: -\ln \frac{\sum_{x \in \text{goal}} P(t \in x)}{\sum_x P(t \in x)}, \quad x \text{ not fixated yet}
@@ -99,6 +37,7 @@ def landing_loss(observer: SemanticSearch, searched: SearchedLooks, order: Tenso
         A scalar; None if the first look fixates all targets.
     """
     fixations = searched.fixations[order]
+    goal = searched.goal
     looks = observer.weigh(searched.detections[order], fixations, searched.grid)
     belief = observer.start(1, searched.grid, looks.ratio)
     visited = torch.zeros(len(searched.grid), dtype=torch.bool)
@@ -106,20 +45,20 @@ def landing_loss(observer: SemanticSearch, searched: SearchedLooks, order: Tenso
     for number, cell in enumerate(searched.grid.cell_of(fixations).tolist()):
         belief = observer.update(belief, looks[number : number + 1])
         visited = visited.index_fill(0, torch.tensor(cell), True)
-        going = ~(searched.goal & visited).any(-1)
+        going = ~(goal & visited).any(-1)
         if not going.any():
             break
         targets = searched.targets[going]
         # One row of the belief for each target that is not found yet.
         rows = torch.zeros(len(targets), dtype=torch.long)
         probability = belief[rows].chance(targets).masked_fill(visited, 0)
-        landing = (probability * searched.goal[going]).sum(-1) / probability.sum(-1)
+        landing = (probability * goal[going]).sum(-1) / probability.sum(-1)
         losses.append(-landing.log().mean())
     return torch.stack(losses).mean() if losses else None
 
 
 @torch.no_grad()
-def mean_landing_loss(model: FovealObservationModel, searches: Sequence[SearchedLooks], looks: int = 8) -> float:
+def mean_landing_loss(model: FovealObservationModel, searches: Sequence[AnnotatedLooks], looks: int = 8) -> float:
     """Average the loss of searches over photographs, with their first looks in the order in which they are stored.
 
     Args:
@@ -154,7 +93,7 @@ def starting_model(model: FovealObservationModel) -> FovealObservationModel:
 
 def fit_through_belief(
     model: FovealObservationModel,
-    searches: Sequence[SearchedLooks],
+    searches: Sequence[AnnotatedLooks],
     *,
     looks: int = 8,
     steps: int = 200,

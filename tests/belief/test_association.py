@@ -12,7 +12,8 @@ from semfov.belief.association import one_of, refuted
 from semfov.belief.observers import AnyOf, SemanticSearch
 from semfov.belief.observers.semantic_search import SearchEvidence
 from semfov.belief.prior import Prior
-from semfov.fit.through_belief import SearchedLooks, fit_through_belief, landing_loss
+from semfov.fit.samples import AnnotatedLooks
+from semfov.fit.through_belief import fit_through_belief, landing_loss
 from semfov.gaze.policies import Policy
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
@@ -260,9 +261,10 @@ def draw_search(generator, dtype=torch.float32):
             frame[2][number] = True
         for kept, each in zip((boxes, scores, mask), frame, strict=True):
             kept.append(each)
-    goal = (torch.arange(20) == cup)[None]
+    answers = torch.zeros(20, 4, dtype=torch.bool)
+    answers[cup, 1] = True
     seen = Detections(torch.stack(boxes).to(dtype), torch.stack(scores).to(dtype), torch.stack(mask))
-    return SearchedLooks(seen, centres, GRID, torch.tensor([1]), goal)
+    return AnnotatedLooks(0, seen, centres, GRID, answers, torch.tensor([1]))
 
 
 def landing(observer, searches, looks=3):

@@ -10,11 +10,12 @@ from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief.observers import SemanticMap
 from semfov.data.scene import Annotation
 from semfov.errors import DataError
-from semfov.fit import cells
-from semfov.fit.cells import MappedLooks, fit_cells, map_loss, mapped_looks, mean_map_loss
+from semfov.fit.cells import fit_cells, map_loss, mean_map_loss
+from semfov.fit.samples import AnnotatedLooks, annotated_looks
 
 GRID = Grid(5, 4, (100, 80))
 FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
+NO_TARGETS = torch.zeros(0, dtype=torch.long)
 MISS, EXPONENT, BACKGROUND = CELL = (0.05, 1.4, 0.6)
 
 
@@ -99,7 +100,7 @@ def test_a_belief_fades_towards_the_prior(looks):
 
 def test_gradients_reach_the_numbers_of_cells_and_alpha(looks):
     fom = model()
-    mapped = MappedLooks(looks, FIXATIONS.double(), GRID, torch.rand(20, 4) < 0.5)
+    mapped = AnnotatedLooks(0, looks, FIXATIONS.double(), GRID, torch.rand(20, 4) < 0.5, NO_TARGETS)
 
     def loss(cell, alpha):
         fom.log_cell.data, fom.log_alpha.data = cell, alpha
@@ -127,7 +128,7 @@ def test_the_fit_finds_how_often_cells_hold_nothing(looks):
     nothing = Detections(looks.boxes, looks.scores, torch.zeros_like(looks.mask))
     answers = torch.zeros(20, 4, dtype=torch.bool)
     answers[:15, 0] = answers[15:, 2] = True
-    mapped = MappedLooks(nothing, FIXATIONS.double(), GRID, answers)
+    mapped = AnnotatedLooks(0, nothing, FIXATIONS.double(), GRID, answers, NO_TARGETS)
     fom = model()
     others = {key: value.clone() for key, value in fom.state_dict().items() if key != "log_cell"}
     before = mean_map_loss(fom, [mapped])
@@ -152,7 +153,7 @@ def test_numbers_stay_finite_where_looks_tell_all_cells_apart():
         answers = torch.zeros(16, 3, dtype=torch.bool)
         answers[:, 0], answers[:, name] = ~covered, covered
         seen = Detections(box, scores.expand(8, 1, 3), torch.ones(8, 1, dtype=torch.bool))
-        photographs.append(MappedLooks(seen, grid.centres[:8], grid, answers))
+        photographs.append(AnnotatedLooks(0, seen, grid.centres[:8], grid, answers, NO_TARGETS))
     fit_cells(fom, photographs)
     miss, exponent, background = fom.log_cell.exp().tolist()
     assert 0 < miss < 1
@@ -161,17 +162,22 @@ def test_numbers_stay_finite_where_looks_tell_all_cells_apart():
     assert mean_map_loss(fom, photographs) < 0.01
 
 
-def test_photographs_without_objects_do_not_count_as_read(monkeypatch):
-    monkeypatch.setattr(cells, "MOST_PHOTOGRAPHS", 1)
+def test_photographs_without_objects_are_left_out():
     boxes = torch.tensor([[0.0, 0.0, 50.0, 50.0]])
     one = Annotation(boxes, torch.tensor([1]), torch.tensor([False]), (100, 80))
     none = Annotation(boxes[:0], one.labels[:0], one.crowd[:0], one.size)
-    held = {0: none, 1: one, 2: one}
+    held = {0: none, 1: one}
     scenes = SimpleNamespace(annotation=held.__getitem__, classes=("cup", "cat"))
-    samples = SimpleNamespace(looks_at=lambda index: (index, FIXATIONS))
-    (only,) = mapped_looks(scenes, samples, range(3), (5, 4))
-    assert only.detections == 1
+    looks = [(index, index, FIXATIONS) for index in held]
+    (only,) = annotated_looks(scenes, looks, (5, 4))
+    assert (only.photograph, only.detections) == (1, 1)
     assert only.answers.sum(0).tolist() == [11, 9, 0]
+    assert only.targets.tolist() == [1]
+    assert torch.equal(only.goal, only.answers[None, :, 1])
+    (large,) = annotated_looks(scenes, looks, (5, 4), max_target_area=0.2)
+    assert not len(large.targets)
+    (full,) = annotated_looks(scenes, looks, (1, 1))  # a search for it would end at once
+    assert not len(full.targets)
 
 
 def test_a_fit_needs_a_photograph():
