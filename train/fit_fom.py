@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
+from torch import Tensor
 
 from semfov.errors import check
 from semfov.fit.cells import MOST_PHOTOGRAPHS, fit_cells
@@ -31,7 +32,6 @@ from semfov.fit.samples import AnnotatedLooks, Samples, annotated_looks
 from semfov.fit.settings import FitConfig
 from semfov.fit.through_belief import fit_through_belief, mean_landing_loss, starting_model
 from semfov.fit.training import split
-from semfov.io.files import write_text
 from semfov.io.ranges import Count, Positive, Range, Share, Weight, Whole
 from semfov.io.tables import csv_text
 from semfov.metrics.calibration import Calibration, calibration
@@ -44,7 +44,7 @@ from semfov.version import __version__
 from semfov.viz import plot_reliability
 from semfov.viz.style import save_figure
 from train.mosaic_samples import MosaicSampler
-from train.outputs import commit, model_path
+from train.outputs import commit, model_path, write_outputs
 from train.samples import Sampler, collect_samples
 
 _Models = dict[str, FovealObservationModel]
@@ -159,6 +159,11 @@ class _Evaluation:
             }
         self.figures = {name: calibration(posterior, judged.labels) for name, posterior in self.predictions.items()}
 
+    def compared(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Return the posteriors by raw scores and by the last model, each with the true classes."""
+        *_, last = self.predictions
+        return {name: (self.predictions[name], self.judged.labels) for name in ("raw scores", last)}
+
     def model_rows(self) -> list[list[str]]:
         """Make rows of a table of the measures of each model."""
         rows = [["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]]
@@ -234,23 +239,12 @@ def _report_markdown(config: FitFomConfig, evaluation: _Evaluation) -> str:
     )
 
 
-def _write_report(config: FitFomConfig, evaluation: _Evaluation, landing: str) -> list[Path]:
-    """Print the report, and write it with counts, settings, measures and a reliability diagram; returns the files."""
-    model = evaluation.model
-    text = landing + _report_markdown(config, evaluation)
-    print(text)
-    write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", config.yaml())
-    write_text(config.out / "manifest.json", json.dumps(_manifest(evaluation), indent=2) + "\n")
+def _counts(model: FovealObservationModel) -> str:
+    """List the detections of the fit by class and level, as CSV."""
     classes = ("background", *model.classes)
     counts = ([name, *row] for name, row in zip(classes, model.metadata["counts"], strict=True))
     head = ["class", *(f"level {level}" for level in range(len(model.edges) + 1))]
-    write_text(config.out / "counts.csv", csv_text([head, *counts]))
-    last = list(evaluation.predictions)[-1]
-    compared = {name: (evaluation.predictions[name], evaluation.judged.labels) for name in ("raw scores", last)}
-    figure = save_figure(plot_reliability(compared), config.out / "reliability.png")
-    names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
-    return [*(config.out / name for name in names), figure]
+    return csv_text([head, *counts])
 
 
 def _manifest(evaluation: _Evaluation) -> dict[str, object]:
@@ -307,9 +301,10 @@ def fit_fom(config: FitFomConfig) -> None:
         saved, landing = _fit_to_search(config, sampler, model)
     path = model_path(config, sampler.eye.detector.name)
     saved.save(path)
-    models = _compared_models(config, published, model)
-    written = _write_report(config, _Evaluation(model, models, samples[held_out]), landing)
-    print("written:", *(f"  {file}" for file in [path, *written]), sep="\n")
+    evaluation = _Evaluation(model, _compared_models(config, published, model), samples[held_out])
+    diagram = save_figure(plot_reliability(evaluation.compared()), config.out / "reliability.png")
+    files = {"manifest.json": json.dumps(_manifest(evaluation), indent=2) + "\n", "counts.csv": _counts(model)}
+    write_outputs(config, landing + _report_markdown(config, evaluation), files, path, diagram)
 
 
 def _published_fit(config: FitFomConfig, sampler: Sampler) -> Callable[..., FovealObservationModel]:

@@ -54,7 +54,7 @@ def fit_gaze(config: FitGazeConfig) -> None:
     path = model_path(config, detector.name)
     fitted.model.save(path)
     means = json.dumps(summaries(fitted.scores[fitted.way]), indent=2)
-    write_outputs(config, gaze_report(fitted), ("folds.json", f"{means}\n"), path)
+    write_outputs(config, gaze_report(fitted), {"folds.json": f"{means}\n"}, path)
 
 
 main = command(fit_gaze, FitGazeConfig, __doc__)

@@ -37,7 +37,7 @@ def fit_search(config: FitSearchConfig) -> None:
     fitted = search.fit_search(start, config, run)
     path = model_path(config, run.eye.detector.name)
     fitted.model.save(path)
-    write_outputs(config, fitted.report, ("judged.json", json.dumps(fitted.judged, indent=2) + "\n"), path)
+    write_outputs(config, fitted.report, {"judged.json": json.dumps(fitted.judged, indent=2) + "\n"}, path)
 
 
 main = command(fit_search, FitSearchConfig, __doc__)

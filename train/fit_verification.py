@@ -66,7 +66,7 @@ def fit_verification(config: FitVerificationConfig) -> None:
     path = model_path(config, run.eye.detector.name)
     fitted.model.save(path)
     report = verification_report(fitted, f"{len(photographs)} photographs")
-    write_outputs(config, report.text, ("judged.json", json.dumps(report.figures, indent=2) + "\n"), path)
+    write_outputs(config, report.text, {"judged.json": json.dumps(report.figures, indent=2) + "\n"}, path)
 
 
 def _check_thresholds(config: FitVerificationConfig, searching: FovealObservationModel) -> None:

@@ -45,7 +45,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     model.metadata |= {part: settings for part in parts if part != "photograph"}
     path = inside(config.out, f"{fit.eye.detector.name}.safetensors")
     model.save(path)
-    write_outputs(config, "\n".join(lines), ("figures.json", json.dumps(fit.figures, indent=1)), path)
+    write_outputs(config, "\n".join(lines), {"figures.json": json.dumps(fit.figures, indent=1)}, path)
 
 
 main = command(fit_zoom, FitZoomConfig, __doc__)

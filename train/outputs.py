@@ -1,6 +1,7 @@
 """What fits write: the model, a report, and the settings and measures."""
 
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -41,21 +42,17 @@ def model_path(config: OutputSettings, detector: str) -> Path:
     return inside(config.out, f"{config.name or detector}.safetensors")
 
 
-def write_outputs(config: OutputSettings, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
+def write_outputs(config: OutputSettings, report: str, figures: Mapping[str, str], *others: Path) -> None:
     """Print the report, write it with the settings and the measures to `config.out`, and list the written files.
 
     Args:
         config: settings of the fit.
         report: the report in Markdown.
-        figures: name and text of the file of measures.
-        model: the file of the model, which is written already.
+        figures: texts of the files of measures, by name.
+        others: files that are written already, such as the model.
     """
-    name_of_figures, text_of_figures = figures
-    files = {"report.md": report, "config.yaml": config.yaml(), name_of_figures: text_of_figures}
+    files = {"report.md": report, "config.yaml": config.yaml(), **figures}
     print(report)
     for name, text in files.items():
         write_text(inside(config.out, name), text)
-    written = [config.out / name for name in files]
-    if model is not None:
-        written.insert(0, model)
-    print("written:", *(f"  {path}" for path in written), sep="\n")
+    print("written:", *(f"  {path}" for path in (*others, *(config.out / name for name in files))), sep="\n")

@@ -118,7 +118,7 @@ def fit_templates(config: FitTemplatesConfig) -> None:
             "",
         ]
     )
-    write_outputs(config, text, ("areas.json", json.dumps({"mean": mean, "areas": areas}) + "\n"), path)
+    write_outputs(config, text, {"areas.json": json.dumps({"mean": mean, "areas": areas}) + "\n"}, path)
 
 
 def _objects_of(detector: Detector, scenes: Scenes, index: int) -> tuple[Tensor, Tensor, Tensor]:
