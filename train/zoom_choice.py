@@ -7,7 +7,7 @@ import torch
 
 from semfov.data.mosaics import Mosaics
 from semfov.fit.windows import MosaicFit
-from semfov.fit.windows_evidence import ZoomExample
+from semfov.fit.windows_evidence import ANY_CLASS, ZoomExample
 from semfov.runs.progress import track
 from semfov.runs.window_looking import found_in
 from semfov.zoom.episode import find_everything
@@ -89,7 +89,7 @@ def judge_survey(survey: Survey, examples: Sequence[ZoomExample], where: str = "
     of_overviews = []
     of_closer_looks = []
     for example in examples:
-        overview, *closer = example.losses(survey, None, example.closer)
+        overview, *closer = example.losses(survey, ANY_CLASS, example.closer)
         of_overviews.append(overview)
         of_closer_looks += closer
     figures = {f"{name}, overview{where}": float(torch.stack(of_overviews).mean())}

@@ -1,7 +1,6 @@
 """Fit the evidence for photographs: whether one holds a class, before and after closer looks, and what an object is."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -14,7 +13,7 @@ from semfov.fit.logistic import logistic_regression
 from semfov.fit.searches import TargetSearch
 from semfov.fit.verification import OneKindError, fit_verification
 from semfov.fit.verification_report import NO_PLACES, verification_report
-from semfov.fit.windows_certainty import Exploration, fit_spread, left_out
+from semfov.fit.windows_certainty import Exploration, fit_with_spread
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
@@ -135,7 +134,7 @@ def fit_photographs(
     evidence = PhotographEvidence(model.classes, window=config.window).eval().requires_grad_(False)
     evidence.usual.copy_(_log_odds_held(held.sum(0), len(pictures)))
     looks = _look_at(pictures, looked, eye, evidence, config)
-    report_on_spread = _fit_certainty(evidence, looks.explored)
+    evidence.certainty, report_on_spread = fit_with_spread(looks.explored, _fit_objects, _CHECKED)
     _fit_whole(evidence, looks.searches, held)
     drawn = shares_by_frequency(evidence.usual, pictures)
     evidence.shares = measured_shares(evidence, looks.scores, held[looked], drawn)
@@ -185,18 +184,6 @@ def _look_at(
             searches.append(_WholeSearch(number, target, source, overview, objects, evidence, spare=spare))
         explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, source.lattice, annotation)
     return _PhotographLooks(torch.stack(scores), searches, explored)
-
-
-def _fit_certainty(evidence: PhotographEvidence, explored: dict[str, list[Exploration]]) -> list[str]:
-    """Fit the probability of an object, and the spread of expected numbers in folds; returns lines of Markdown."""
-    numbers = left_out(explored, _fit_objects, _CHECKED)
-    certainty = _fit_objects([exploration for fold in explored.values() for exploration in fold])
-    evidence.certainty = certainty
-    if not numbers:
-        return []
-    spread, report = fit_spread(numbers)
-    evidence.certainty = replace(certainty, spread=spread)
-    return report
 
 
 def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], held: Tensor) -> None:

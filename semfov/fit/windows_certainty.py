@@ -244,21 +244,12 @@ class _Numbers(NamedTuple):
         return float(((self.held - self.mean).abs() <= 2 * error).double().mean())
 
 
-def left_out(
+def _left_out(
     explored: Mapping[str, Sequence[Exploration]],
     fit: Callable[[Sequence[Exploration]], Certainty],
-    checked: Sequence[int] = _CHECKED,
+    checked: Sequence[int],
 ) -> dict[tuple[str, int], _Numbers]:
-    """Claim numbers in pictures of each kind with a certainty that was fitted to the other kinds.
-
-    Args:
-        explored: explorations by kind.
-        fit: fits a certainty to explorations.
-        checked: numbers of looks after which numbers are claimed.
-
-    Returns:
-        The numbers by kind and number of looks.
-    """
+    """Claim numbers in pictures of each kind after some looks, with a certainty that was fitted to the other kinds."""
     numbers = {}
     for kind, explorations in explored.items():
         others: list[Exploration] = []
@@ -324,6 +315,29 @@ def fit_spread(numbers: Mapping[tuple[str, int], _Numbers]) -> tuple[float, list
     ]
 
 
+def fit_with_spread(
+    explored: Mapping[str, Sequence[Exploration]],
+    fit: Callable[[Sequence[Exploration]], Certainty],
+    checked: Sequence[int] = _CHECKED,
+) -> tuple[Certainty, list[str]]:
+    """Fit a certainty to explorations of all kinds, and its spread to kinds that are left out in turn.
+
+    Args:
+        explored: explorations by kind.
+        fit: fits a certainty to explorations.
+        checked: numbers of looks after which the expected number is compared with the annotated one.
+
+    Returns:
+        The certainty, and lines of Markdown about its spread.
+    """
+    certainty = fit([exploration for of_kind in explored.values() for exploration in of_kind])
+    numbers = _left_out(explored, fit, checked)
+    if not numbers:
+        return certainty, []
+    spread, report = fit_spread(numbers)
+    return replace(certainty, spread=spread), report
+
+
 def fit_certainty(model: GlimpseEvidence, fitted: PicturesByKind, judged: PicturesByKind, *, passes: int) -> list[str]:
     """Fit the certainty of a model on some kinds of pictures, and evaluate it on others.
 
@@ -339,13 +353,8 @@ def fit_certainty(model: GlimpseEvidence, fitted: PicturesByKind, judged: Pictur
     by_kind = explorations_of_kinds(model, fitted, passes)
     training = [exploration for group in by_kind.values() for exploration in group]
     held_out = [exploration for group in explorations_of_kinds(model, judged, passes).values() for exploration in group]
-    certainty = _fit_certainty(training, passes)
+    certainty, report_on_spread = fit_with_spread(by_kind, partial(_fit_certainty, passes=passes))
     model.certainty = certainty
-    report_on_spread: list[str] = []
-    numbers = left_out(by_kind, partial(_fit_certainty, passes=passes))
-    if numbers:
-        spread, report_on_spread = fit_spread(numbers)
-        model.certainty = replace(certainty, spread=spread)
     facts, right = _judged(held_out, passes)
     chances = certainty.probability(facts)
     is_listed = chances >= 0.5

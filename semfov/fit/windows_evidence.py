@@ -22,7 +22,7 @@ from semfov.data.scene import Scenes
 from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.fit.training import descend
 from semfov.observation.matching import box_iou
-from semfov.zoom.belief import before_of
+from semfov.zoom.belief import Rates, before_of
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.hints import DETECTION_SCORE, Gist
 from semfov.zoom.looks import Window, WindowLooks, half_steps
@@ -35,8 +35,8 @@ _CLOSER_LOOKS = 2
 """Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
 _LEAST_RATE = 1e-6  # keeps logarithms of expected numbers finite
 
-Predictor = GlimpseEvidence | Survey
-"""What predicts the numbers of objects that closer looks find: of classes, or of any class."""
+ANY_CLASS = torch.tensor([0])
+"""The target for objects of any class, as in a `ZoomBelief`; classes are 1..K."""
 
 
 class WindowResult(NamedTuple):
@@ -61,7 +61,7 @@ class _WindowCounts(NamedTuple):
     Attributes:
         rows: `(n,)`, first row of the outer look's cells that they show.
         columns: `(n,)`, first column.
-        new: `(n, K)`, by class, numbers of objects that no earlier look had found.
+        new: `(n, K+1)`, numbers of objects that no earlier look had found: of any class first, then by class.
     """
 
     rows: Tensor
@@ -110,7 +110,7 @@ class LookCounts(NamedTuple):
         Args:
             look: the look.
             results: looks at the picture.
-            classes: `(M, K)`, 1 for the class of each object.
+            classes: `(M, K+1)`, 1 for the class of each object, and in the first column for any.
             earlier: `(M,)` boolean, the objects that were found before.
 
         Returns:
@@ -129,13 +129,13 @@ class LookCounts(NamedTuple):
             counts[size] = _WindowCounts(torch.tensor(first_rows), torch.tensor(first_columns), new)
         return cls(look, counts)
 
-    def loss(self, model: Predictor, log_rates: Tensor, targets: Tensor | None) -> Tensor:
+    def loss(self, model: Rates, log_rates: Tensor, targets: Tensor) -> Tensor:
         """Average the Poisson negative log likelihood of the numbers over classes and windows, up to a constant.
 
         Args:
             model: weighs the cells of windows.
-            log_rates: `(T, 3, rows, columns)`, of T classes, or of all together (T = 1).
-            targets: `(T,)`, the classes 1..K; None for all together.
+            log_rates: `(T, 3, rows, columns)`, of each target.
+            targets: `(T,)`, classes 1..K, or `ANY_CLASS`.
 
         Returns:
             A scalar.
@@ -144,7 +144,7 @@ class LookCounts(NamedTuple):
         terms = []
         for (steps, span), counts in self.counts.items():
             expected = _expected_in_windows(rates[:, steps - 1], model.taper(span), counts.rows, counts.columns)
-            new = counts.new.sum(-1)[None] if targets is None else counts.new[:, targets - 1].mT
+            new = counts.new[:, targets].mT
             terms.append((expected - new * expected.clamp(min=_LEAST_RATE).log()).flatten())
         return torch.cat(terms).mean() if terms else log_rates.sum() * 0
 
@@ -245,10 +245,11 @@ class ZoomExample(NamedTuple):
         highest = torch.stack([result.show for result in results]).amax(0)  # (K,), in any look
         is_shown = highest >= score_threshold
         is_hinted = (highest >= _HINT) & ~is_shown
-        one_hot = F.one_hot(labels - 1, len(highest)).float()
+        classes = F.one_hot(labels, len(highest) + 1).float()
+        classes[:, 0] = 1  # of any class
         in_overview = results[0].found
         overview, *closer = [
-            LookCounts.of(result.gist, results, one_hot, in_overview | result.found)
+            LookCounts.of(result.gist, results, classes, in_overview | result.found)
             for result in results
             if result.gist is not None
         ]
@@ -260,26 +261,26 @@ class ZoomExample(NamedTuple):
         classes = self.overview.gist.scores.shape[-1]
         return targets if len(targets) else _drawn(torch.arange(classes) + 1, 1)
 
-    def losses(self, model: Predictor, targets: Tensor | None, closer: Sequence[LookCounts]) -> list[Tensor]:
+    def losses(self, model: Rates, targets: Tensor, closer: Sequence[LookCounts]) -> list[Tensor]:
         """Compute the losses of the overview and of closer looks, whose predictions build on those of the overview.
 
         Args:
             model: predicts the numbers of objects.
-            targets: `(T,)`, classes 1..K; None for all together.
+            targets: `(T,)`, classes 1..K, or `ANY_CLASS`.
             closer: closer looks of the picture.
 
         Returns:
             Scalars.
         """
         overview = self.overview.gist
-        log_rates = _log_rates(model, overview, targets)
+        log_rates = model.rates(overview, targets)
         losses = [self.overview.loss(model, log_rates, targets)]
         for look in closer:
             before = _rates_before(overview, log_rates.detach(), look.gist)
-            losses.append(look.loss(model, _log_rates(model, look.gist, targets, before), targets))
+            losses.append(look.loss(model, model.rates(look.gist, targets, before), targets))
         return losses
 
-    def loss(self, model: Predictor, targets: Tensor | None) -> Tensor:
+    def loss(self, model: Rates, targets: Tensor) -> Tensor:
         """Average the losses of the overview and of a few closer looks, drawn at random."""
         closer = random.sample(self.closer, min(_CLOSER_LOOKS, len(self.closer)))
         return torch.stack(self.losses(model, targets, closer)).mean()
@@ -288,14 +289,6 @@ class ZoomExample(NamedTuple):
 def _drawn(values: Tensor, most: int) -> Tensor:
     """Draw at most so many of the values."""
     return values[torch.randperm(len(values))[:most]]
-
-
-def _log_rates(model: Predictor, look: Gist, targets: Tensor | None, before: Tensor | None = None) -> Tensor:
-    """Predict by evidence the objects of classes, or by a survey those of any class."""
-    if isinstance(model, Survey):
-        return model.rates(look, before=before)
-    assert targets is not None
-    return model.rates(look, targets, before)
 
 
 def fit_rates(model: GlimpseEvidence, examples: Sequence[ZoomExample], steps: int, batch: int = 4) -> None:
@@ -321,12 +314,12 @@ def fit_survey(survey: Survey, examples: Sequence[ZoomExample], steps: int, batc
         steps: number of training steps.
         batch: number of pictures in a step.
     """
-    loss_of = _loss_of_batch(survey, examples, batch, lambda _: None)
+    loss_of = _loss_of_batch(survey, examples, batch, lambda _: ANY_CLASS)
     descend(survey.parameters(), loss_of, steps, 2e-3, decay=0.1, title="learning the survey")
 
 
 def _loss_of_batch(
-    model: Predictor, examples: Sequence[ZoomExample], batch: int, targets_of: Callable[[ZoomExample], Tensor | None]
+    model: Rates, examples: Sequence[ZoomExample], batch: int, targets_of: Callable[[ZoomExample], Tensor]
 ) -> Callable[[int], Tensor]:
     """Make the loss of a training step, a mean over pictures drawn at random."""
 

@@ -6,7 +6,7 @@ from torch.nn import functional
 from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
-from semfov.fit.windows_evidence import LookCounts, WindowResult, ZoomExample, fit_survey
+from semfov.fit.windows_evidence import ANY_CLASS, LookCounts, WindowResult, ZoomExample, fit_survey
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.hint_maps import neighbourhood_mean, neighbourhood_peak, through
@@ -48,8 +48,10 @@ def looked_at(rule):
 
 
 def by_class(labels):
-    """The class of each object as 0 and 1."""
-    return functional.one_hot(labels - 1, CLASSES).float()
+    """The class of each object as 0 and 1, and 1 for any class first."""
+    classes = functional.one_hot(labels, CLASSES + 1).float()
+    classes[:, 0] = 1
+    return classes
 
 
 def example(rule):
@@ -121,7 +123,7 @@ def test_loss_equals_the_poisson_loss_window_by_window(survey, target):
         counted = closer.found if target is None else closer.found & (labels == target)
         terms.append(poisson_nll_loss(expected, counted.sum().double(), log_input=False, eps=0))
     known = LookCounts.of(overview.gist, looks, by_class(labels), overview.found)
-    targets = None if target is None else torch.tensor([target])
+    targets = ANY_CLASS if target is None else torch.tensor([target])
     torch.testing.assert_close(known.loss(survey, logs[None], targets), torch.stack(terms).mean())
 
 
@@ -129,10 +131,10 @@ def test_objects_that_were_seen_before_are_not_new():
     labels, looks = looked_at(lambda look, window: 3)
     for seen, new in ((0, 3), (2, 1), (12, 0)):
         counts = LookCounts.of(looks[0].gist, looks, by_class(labels), torch.arange(12) < seen).counts
-        assert {int(n) for _, _, numbers in counts.values() for n in numbers.sum(-1)} == {new}
+        assert {int(n) for _, _, numbers in counts.values() for n in numbers[:, 0]} == {new}
         # The first objects count, by their classes.
         expected = torch.bincount(labels[seen:3] - 1, minlength=CLASSES).float()
-        assert all(torch.equal(row, expected) for _, _, numbers in counts.values() for row in numbers)
+        assert all(torch.equal(row[1:], expected) for _, _, numbers in counts.values() for row in numbers)
 
 
 def test_fitting_improves_predictions_on_held_out_mosaics():
