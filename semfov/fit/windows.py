@@ -11,7 +11,7 @@ import torch
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import ChosenScenes, Scenes
-from semfov.errors import check
+from semfov.errors import DataError, check
 from semfov.fit.photographs import fit_photographs
 from semfov.fit.training import training_of
 from semfov.fit.windows_certainty import fit_certainty
@@ -153,8 +153,16 @@ class MosaicFit:
 
         Returns:
             The evidence, and lines of Markdown.
+
+        Raises:
+            DataError: mosaics are so small that one look shows all of them.
         """
         examples = self.look(self.looked(parts, model is None))
+        if not examples.get("judged", True):
+            raise DataError(
+                "data: expected photographs whose mosaics are larger than the detector's input, got a width of "
+                f"{self.config.tile} px for each; give larger ones"
+            )
         lines: list[str] = []
         if model is None:
             model = self.fit_prediction(examples)

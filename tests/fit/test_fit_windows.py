@@ -22,6 +22,7 @@ from semfov.fit.folder import FolderFit
 from semfov.fit.photographs import _explored, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification import verify
+from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_decisions import fit_closer_looks, search_pictures
 from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
@@ -49,6 +50,14 @@ from train.fit_fom import FitFomConfig, fit_fom
 from train.fit_zoom import fit_zoom
 from train.mosaic_samples import MosaicSampler
 from train.zoom_pictures import PICTURE_KINDS, FitZoomConfig, _compose_pictures
+
+
+def test_mosaics_that_one_look_shows_are_refused(monkeypatch):
+    monkeypatch.setattr(MosaicFit, "look", lambda fit, kinds: {kind: [] for kind in kinds})
+    fit = MosaicFit.__new__(MosaicFit)
+    fit.config = FitMosaicsConfig(tile=32)
+    with pytest.raises(DataError, match="mosaics are larger than the detector's input, got a width of 32 px for each"):
+        fit.fit()
 
 
 @pytest.mark.slow
