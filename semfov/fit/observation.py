@@ -17,7 +17,7 @@ from semfov.fit.detector_report import Difference, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
 from semfov.fit.samples import AnnotatedLooks, Samples, all_cells, annotated_looks
 from semfov.fit.training import split
-from semfov.metrics.calibration import calibration, surprisal
+from semfov.metrics.calibration import Calibration, calibration, surprisal
 from semfov.metrics.episodes import FloatArray
 from semfov.observation import DirichletStatistics, FovealObservationModel, MissCounts, fit_discriminative
 from semfov.viz import plot_reliability, save_figure
@@ -124,31 +124,12 @@ class ObservationFit(PartFit):
                 "raw": raw.calibrate(judged.scores, judged.distance),
                 "fitted": model.calibrate(judged.scores, judged.distance),
             }
-        gain = Difference.of(_mean_costs(posteriors["raw"], judged), _mean_costs(posteriors["fitted"], judged))
-        figures = {name: calibration(posterior, judged.labels) for name, posterior in posteriors.items()}
-        why = (
-            f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, with raw scores "
-            f"{figures['raw'].nll:.3f}; {gain.in_words('nats gained')}"
-        )
         diagram = plot_reliability({name: (posterior, judged.labels) for name, posterior in posteriors.items()})
         save_figure(diagram, self.config.out / "reliability.png")
-        rows = [["scores", "NLL", "Brier", "ECE", "accuracy"]]
-        for name, figure in figures.items():
-            measures = (figure.nll, figure.brier, figure.ece, figure.accuracy)
-            rows.append([name, *(f"{measure:.3f}" for measure in measures)])
-        report = section(
-            f"Predicted probability of the true class of a detection: fitted on {len(samples) - len(judged)} "
-            f"detections, evaluated on {len(judged)} detections in {len(judged.scene.unique())} held-out photographs.",
-            rows,
-        )
-        of_map = {
-            "scores": min(losses, key=losses.__getitem__),
-            "raw_cell": raw.log_cell.detach().exp().tolist(),
-            "why": f"negative log of what a cell holds {losses['calibrated']:.3f} with calibrated scores, "
-            f"{losses['raw']:.3f} with raw ones",
-        }
-        part = self.write("observation", model, gain.better, why, map=of_map)
-        return PartResult(part, report, ["reliability.png"])
+        figures = {name: calibration(posterior, judged.labels) for name, posterior in posteriors.items()}
+        gain, why = _compare(posteriors, figures, judged)
+        part = self.write("observation", model, gain.better, why, map=_map_settings(raw, losses))
+        return PartResult(part, _report(figures, len(samples) - len(judged), judged), ["reliability.png"])
 
     def _fit_maps(self, samples: Samples, models: Mapping[str, FovealObservationModel]) -> dict[str, float]:
         """Fit what looks say about cells with each model; returns the loss of its maps of held-out photographs."""
@@ -178,6 +159,40 @@ class ObservationFit(PartFit):
         misses = count_misses(run.scenes, samples, {*self.inputs.training}, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         return model
+
+
+def _compare(
+    posteriors: Mapping[str, Tensor], figures: Mapping[str, Calibration], judged: Samples
+) -> tuple[Difference, str]:
+    """Compare the costs of fitted and of raw posteriors; the difference, and the sentence about it."""
+    gain = Difference.of(_mean_costs(posteriors["raw"], judged), _mean_costs(posteriors["fitted"], judged))
+    return gain, (
+        f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, with raw scores "
+        f"{figures['raw'].nll:.3f}; {gain.in_words('nats gained')}"
+    )
+
+
+def _map_settings(raw: FovealObservationModel, losses: Mapping[str, float]) -> dict[str, object]:
+    """Say by which scores the agent maps, those with the lower loss, and what raw scores say about cells."""
+    return {
+        "scores": min(losses, key=losses.__getitem__),
+        "raw_cell": raw.log_cell.detach().exp().tolist(),
+        "why": f"negative log of what a cell holds {losses['calibrated']:.3f} with calibrated scores, "
+        f"{losses['raw']:.3f} with raw ones",
+    }
+
+
+def _report(figures: Mapping[str, Calibration], fitted: int, judged: Samples) -> str:
+    """Write the section about the posteriors, of a model that was fitted to so many detections."""
+    rows = [["scores", "NLL", "Brier", "ECE", "accuracy"]]
+    for name, figure in figures.items():
+        measures = (figure.nll, figure.brier, figure.ece, figure.accuracy)
+        rows.append([name, *(f"{measure:.3f}" for measure in measures)])
+    return section(
+        f"Predicted probability of the true class of a detection: fitted on {fitted} "
+        f"detections, evaluated on {len(judged)} detections in {len(judged.scene.unique())} held-out photographs.",
+        rows,
+    )
 
 
 def _mean_costs(posterior: Tensor, judged: Samples) -> FloatArray:

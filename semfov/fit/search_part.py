@@ -1,6 +1,6 @@
 """The part of a model folder that guides searches: an observation model fitted to them, compared with raw scores."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.presence import Presence
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
-from semfov.runs.protocols import episodes_of, run_episodes
+from semfov.runs.protocols import Trial, episodes_of, run_episodes
 from semfov.runs.seeds import noise_for
 from semfov.strategy import Strategy
 from semfov.viz.style import save_figure
@@ -103,20 +103,30 @@ class SearchFit(PartFit):
         for index in track(self.inputs.judged, "comparing", "scene"):
             targets = legal_targets(run.scenes.annotation(index), self.settings.max_target_area)
             episodes = episodes_of(run.scenes, index, *run.cells, protocol, targets)
-            if not episodes:
-                continue
-            grid = run.grid(index)
-            scene = run.scenes.ids[index]
-            looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
-            # All strategies break ties in the same way, so that their difference is paired.
-            noises = [noise_for(protocol, len(grid), scene, trial.target, trial.repetition) for trial in episodes]
-            noise = torch.stack(noises)  # (B, shifts + 1, X·Y)
-            for name, strategy in strategies.items():
-                with torch.inference_mode():
-                    ends = run_episodes(episodes, strategy, looks, noise, shifts=protocol.shifts, batch=protocol.batch)
-                found_at = np.array([shift for _, shift in ends])
-                curves[name].append(cumulative_performance(found_at, protocol.shifts))
+            if episodes:
+                for name, curve in self._search(index, episodes, strategies).items():
+                    curves[name].append(curve)
         return {name: np.array(rows).reshape(-1, protocol.shifts + 1) for name, rows in curves.items()}
+
+    @torch.inference_mode()
+    def _search(
+        self, index: int, episodes: Sequence[Trial], strategies: Mapping[str, Strategy]
+    ) -> dict[str, FloatArray]:
+        """Search a photograph by all strategies; returns cumulative performances `(shifts+1,)`."""
+        run = self.run
+        protocol = self.inputs.protocol
+        grid = run.grid(index)
+        scene = run.scenes.ids[index]
+        looks = StoredLooks(run.detections(index), grid, torch.tensor([episode.cue for episode in episodes]))
+        # All strategies break ties in the same way, so that their difference is paired.
+        noises = [noise_for(protocol, len(grid), scene, trial.target, trial.repetition) for trial in episodes]
+        noise = torch.stack(noises)  # (B, shifts + 1, X·Y)
+        curves = {}
+        for name, strategy in strategies.items():
+            ends = run_episodes(episodes, strategy, looks, noise, shifts=protocol.shifts, batch=protocol.batch)
+            found_at = np.array([shift for _, shift in ends])
+            curves[name] = cumulative_performance(found_at, protocol.shifts)
+        return curves
 
     def _compare(self, curves: Mapping[str, FloatArray]) -> tuple[Difference, str]:
         """Compare the fitted model with raw scores; the difference, and the sentence about it."""
