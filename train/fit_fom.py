@@ -288,13 +288,7 @@ def fit_fom(config: FitFomConfig) -> None:
     held_out = split(samples.scene, config.holdout)
     published = _published_fit(config, sampler)
     model = _fit_model(config, samples[~held_out], published)
-    misses = _count_misses(config, sampler, model)
-    model.miss_rate = misses.rates().to(model.edges)
-    if config.mosaics:
-        model.metadata["cells"] = misses.total.sum(1).tolist()
-    elif config.method in _TRAINED:
-        training = (looks for looks in _annotated(config, sampler) if looks.photograph % config.holdout)
-        fit_cells(model, [*islice(training, MOST_PHOTOGRAPHS)], seed=config.seed)
+    _describe_cells(config, sampler, model)
     saved = model
     landing = ""
     if config.method == "search":
@@ -332,13 +326,19 @@ def _annotated(config: FitFomConfig, sampler: Sampler) -> Iterator[AnnotatedLook
         yield from annotated_looks(sampler.scenes, looks, _CELLS, config.max_target_area)
 
 
-def _count_misses(config: FitFomConfig, sampler: Sampler, model: FovealObservationModel) -> MissCounts:
-    """Count cells without any detection in photographs that are not held out."""
+def _describe_cells(config: FitFomConfig, sampler: Sampler, model: FovealObservationModel) -> None:
+    """Set how often cells with an object have no detection, and fit what a look says about whole cells."""
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     counts = (
         count_misses(sampler.scenes, shard, fitted_on, model.edges, sampler.cells) for shard in sampler.by_shard()
     )
-    return MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
+    misses = MissCounts.merge(counts, len(model.classes) + 1, len(model.edges) + 1)
+    model.miss_rate = misses.rates().to(model.edges)
+    if config.mosaics:
+        model.metadata["cells"] = misses.total.sum(1).tolist()
+    elif config.method in _TRAINED:
+        training = (looks for looks in _annotated(config, sampler) if looks.photograph in fitted_on)
+        fit_cells(model, [*islice(training, MOST_PHOTOGRAPHS)], seed=config.seed)
 
 
 def _compared_models(
