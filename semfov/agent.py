@@ -5,7 +5,7 @@ from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Self
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from semfov.agents.fovea import FoveaAgent
 from semfov.agents.head import HeadAgent
@@ -250,10 +250,9 @@ class ActivePerception(MovableModule):
         except AttributeError:
             raise missing("an agent", name, AGENT, dir(type(self))) from None
 
-    def __call__(self, *arguments: object, **options: object) -> Any:
-        if type(self).forward is nn.Module.forward:
-            raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
-        return super().__call__(*arguments, **options)
+    def forward(self, *arguments: object, **options: object) -> Any:
+        """Refuse a call of the agent itself with the names of its methods."""
+        raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
 
     def __repr__(self) -> str:
         """Write the detector, the sensor and the parts that were fitted in one line."""

@@ -1,5 +1,7 @@
 """Active perception of a camera or a video: one look at every frame, and evidence that fades between frames."""
 
+import sys
+
 from numpy.typing import ArrayLike
 
 from semfov.agents.kinds import KINDS_OF_LOOK, AgentParts
@@ -10,7 +12,7 @@ from semfov.errors import check
 from semfov.motion import Motion
 from semfov.paths import Moment
 from semfov.settings import How, StreamSettings
-from semfov.words import LIVE, OtherWords
+from semfov.words import LIVE, OtherWords, Room
 
 __all__ = ["LivePerception"]
 
@@ -130,3 +132,6 @@ class LivePerception(OtherWords):
             "None for frames that are looked at by windows, or how='fovea'",
             self._start,
         )
+
+
+sys.modules[__name__].__class__ = Room

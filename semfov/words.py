@@ -6,7 +6,8 @@ Each table has our words, and beside them those of others, separated by blanks.
 import warnings
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, ClassVar
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 
 def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
@@ -100,6 +101,9 @@ _ADVICE = _by_word(
         "the page of detectors in the documentation has the call, under Export": "export onnx",
         "save the page as a picture first": "screenshot url webpage",
         "give all pictures to one command": "combine concat merge",
+        "nothing is logged elsewhere; a tracker takes the file that --out writes": (
+            "clearml comet mlflow tensorboard wandb"
+        ),
     }
 )
 
@@ -110,6 +114,7 @@ _ADVICE_FOR_OBJECTS = _by_word(
         ),
         "--out FILE.geojson has the coordinates of a GeoTIFF": "coordinates crs epsg gps latlon",
         "--out FILE.csv has all boxes, to choose by their size": "max_area max_size min_area min_size",
+        "--out FILE.csv has all objects, to sort by their scores": "best k max_det max_objects sort top top_k topk",
         "the agent has one; in a checkout `python -m eval.search --help` compares several": (
             "acquisition policies policy strategy"
         ),
@@ -122,6 +127,7 @@ _ADVICE_FOR_GAZE = _by_word(
         "the model is of adults without a task; `semfov fit --help` has that of your viewers": (
             "age audience gender persona"
         ),
+        "the places are printed by their shares, the largest first": "k peaks sort top top_k topk",
     }
 )
 
@@ -161,8 +167,10 @@ _OTHER_PLACES = _by_word(
             "perform_standard_pred slice slice_height slice_size slice_width slice_wh tile tile_size"
         ),
         "the record has what is to be written and shown: record.report(path), record.plot(), record.to_csv(path)": (
-            "csv export format html json out output plot project report save save_crop save_txt show visualize"
+            "csv export format html json out output plot project report save save_crop save_txt show tensorboard "
+            "visualize wandb"
         ),
+        "record.objects has all, to sort by their scores": "best k sort top top_k topk",
         "agent.live(target).step(frame) takes the frames of a stream": "stream video vid_stride",
         "leave it out, as nothing is printed; on_look= is called after each look": "progress quiet verbose",
         "a whole list is looked at by semfov.run(pictures, target, workers=)": "batch_size jobs num_workers workers",
@@ -224,7 +232,7 @@ PACKAGE = _by_word(
         ),
         "record.plot(), or semfov.viz": "plot show",
         "seed= of a search or an exploration, or torch.manual_seed": "manual_seed seed seed_everything set_seed",
-        "semfov.envs, whose environments gymnasium.make knows": "Env make",
+        "semfov.envs, whose environments gymnasium.make knows": "Env env environment environments make",
         "semfov.read_image": "imread open",
         "semfov.load_detector(name or file), or semfov.ActivePerception.recommended(name)": (
             "AutoDetectionModel AutoModel Detector YOLO from_pretrained get_model pipeline"
@@ -234,6 +242,11 @@ PACKAGE = _by_word(
         ),
         "semfov.ActivePerception.recommended().gaze(picture)": "DeepGaze DeepGazeIIE gaze heatmap saliency_map",
         "`semfov detectors` in a shell": "detectors list_detectors list_models models",
+        "semfov.fusion, or semfov.DirichletBelief": "kaplan kaplan_update update_belief",
+        "`semfov demo` in a shell": "demo",
+        "`semfov compare FOLDER --with sahi` in a shell": "benchmark compare evaluate",
+        "semfov.fit_detector(model, photographs, annotations)": "finetune fit train",
+        "semfov.data.fixations, which reads those of people": "fixations read_fixations",
     }
 )
 
@@ -261,11 +274,20 @@ AGENT = _by_word(
         "agent.live(target), whose step takes frames": "step stream update video watch webcam",
         "agent.classes[1:]": "class_names labels names",
         "agent.eye.detector": "detector model",
+        "next(agent.parameters()).device": "device",
         "semfov.fit_detector, which writes a folder of models, and semfov.ActivePerception.from_pretrained(folder)": (
             "export save save_model save_pretrained"
         ),
     }
 )
+
+CALLS = {
+    "semfov.gaze": "semfov.ActivePerception.recommended().gaze(picture)",
+    "semfov.live": "semfov.ActivePerception.recommended().live(target)",
+    "semfov.report": "record.report(path)",
+    "semfov.saliency": "semfov.ActivePerception.recommended().gaze(picture)",
+}
+"""What to call in place of a module, by its name."""
 
 DECISION = _by_word(
     {
@@ -290,7 +312,7 @@ OBJECTS = _by_word(
         ),
         "objects.above(score), or objects.of(name)": "filter select where",
         "(objects.boxes[:, :2] + objects.boxes[:, 2:]) / 2": "center centers centre centres centroids",
-        "objects[objects.scores.argsort(descending=True)]": "sort sorted",
+        "objects[objects.scores.argsort(descending=True)]": "best sort sorted top top_k topk",
         "objects.boxes, as the detector has no masks": "mask masks segmentation",
         "len(objects.of(name)), or record.expected with what was not seen": "count",
         "the objects as they are, as each has one box already": "nms with_nms with_nmm",
@@ -318,6 +340,7 @@ RECORD = _by_word(
         "record.looks": "history n_looks num_looks slices steps tiles windows",
         "record.objects.boxes, as the detector has no masks": "mask masks segmentation",
         "record.objects.above(score), or record.objects.of(name)": "filter select where",
+        "record.objects, to sort by their scores": "best sort sorted top top_k topk",
         "record.expected_error, and record.objects.scores": "std uncertainties uncertainty",
         "record.rows(), which has the value of each look": "gains reward rewards values",
         "record.plot()": "draw show visualize",
@@ -390,6 +413,13 @@ def _near(name: str, known: Iterable[str]) -> str:
         return ""
     similar = get_close_matches(name, [word for word in known if not word.startswith("_")], n=2, cutoff=0.7)
     return f"; did you mean {' or '.join(similar)}?" if similar else ""
+
+
+class Room(ModuleType):
+    """A module that answers a call with what is meant (`CALLS`)."""
+
+    def __call__(self, *arguments: object, **options: object) -> NoReturn:
+        raise TypeError(f"{self.__name__} is a module, which is not called; use {CALLS[self.__name__]}")
 
 
 class OtherWords:

@@ -234,11 +234,12 @@ class Record(Conversion):
 
         return animate(self, path, **options)
 
-    def report(self, path: str | PathLike[str], **options: Any) -> Path:
+    def report(self, path: str | PathLike[str], *, title: str | None = None, **options: Any) -> Path:
         """Write an HTML page of the looks and the objects, a single file that loads nothing from elsewhere.
 
         Args:
             path: the file.
+            title: heading of the page; None takes what was looked for.
             options: `picture`, the picture in full size, in which narrow windows are sharp; None takes the one that the
                 record keeps. `name`, the name of the picture on the page. `boxes`, `(M, 4)`, true boxes of the target.
 
@@ -251,7 +252,7 @@ class Record(Conversion):
         """
         from semfov.report.page import write_page
 
-        return write_page(Path(path), f"semfov: {self.words.task}", [self.page_data(**options)])
+        return write_page(Path(path), title or f"semfov: {self.words.task}", [self.page_data(**options)])
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> Values:
         """Collect the data of the record for a page (`semfov.report.zoom.zoom_data`, for a scanpath `episode_data`).

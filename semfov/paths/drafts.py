@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
-from semfov.errors import check
+from semfov.errors import check, checked_keywords
 from semfov.paths.areas import Area, AreasLike, percent, read_areas
 from semfov.paths.gaze import GazePrediction
 
@@ -163,11 +163,13 @@ class Drafts:
 
         return plot_drafts(self, areas=areas)
 
-    def report(self, path: str | PathLike[str], *, areas: AreasLike | None = None) -> Path:
+    @checked_keywords
+    def report(self, path: str | PathLike[str], *, title: str | None = None, areas: AreasLike | None = None) -> Path:
         """Write an HTML page with both maps on one scale, what differs, and the shares of areas.
 
         Args:
             path: the file.
+            title: heading of the page; None says that two drafts are compared.
             areas: as for `shares`.
 
         Returns:
@@ -186,5 +188,5 @@ class Drafts:
         parts = [gaze_part(draft, draft.scanpaths(), these) for draft, these in zip(drafts, boxes, strict=True)]
         for part, name in zip(parts, self.names, strict=True):
             part["picture"]["name"] = name
-        title = "semfov: where people look in two drafts"
-        return write_html(Path(path), gaze_page_html(title, parts, drafts_section(self, areas)))
+        heading = title or "semfov: where people look in two drafts"
+        return write_html(Path(path), gaze_page_html(heading, parts, drafts_section(self, areas)))

@@ -459,10 +459,12 @@ class GazePrediction(OtherWords):
 
         return animate_gaze(self, path, **options)
 
+    @checked_keywords
     def report(
         self,
         path: str | PathLike[str],
         *,
+        title: str | None = None,
         people: int = 15,
         seconds: float = 3.0,
         seed: int = 0,
@@ -472,6 +474,7 @@ class GazePrediction(OtherWords):
 
         Args:
             path: the file.
+            title: heading of the page; None takes the name of the picture.
             people: number of viewers whose scanpaths are drawn.
             seconds: time for which each views the picture.
             seed: seed of all draws.
@@ -488,7 +491,8 @@ class GazePrediction(OtherWords):
         from semfov.report.template import write_html
 
         part = gaze_part(self, self.scanpaths(people, seconds=seconds, seed=seed), areas, seconds)
-        return write_html(Path(path), gaze_page_html(f"semfov: where people look in {self.name}", [part]))
+        heading = title or f"semfov: where people look in {self.name}"
+        return write_html(Path(path), gaze_page_html(heading, [part]))
 
     def to_csv(self, path: str | PathLike[str], *, people: int = 15, seconds: float = 3.0, seed: int = 0) -> None:
         """Write drawn scanpaths as a table that `semfov.data.fixations.read_table` reads.

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.placement import resize
+from semfov.errors import checked_keywords
 from semfov.io.compatibility import Settings
 from semfov.io.files import MADE_HERE
 from semfov.paths import Record, Scanpath
@@ -64,6 +65,7 @@ def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(jpeg(image, quality)).decode()
 
 
+@checked_keywords
 def episode_data(
     scanpath: Scanpath,
     image: Tensor | None,

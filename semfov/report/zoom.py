@@ -12,7 +12,7 @@ from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
-from semfov.errors import check
+from semfov.errors import check, checked_keywords
 from semfov.paths import Record, RecordedLook
 from semfov.paths.look import CONFIDENT, LookView, read_region
 from semfov.report.episode import Data, jpeg_uri, object_data, tagged
@@ -21,6 +21,7 @@ from semfov.viz.drawing import photograph_of
 _MOST_DETECTIONS = 15  # largest number of detections of a look that are drawn and listed
 
 
+@checked_keywords
 def zoom_data(
     path: Record,
     picture: LargePicture | ImageLike | None,

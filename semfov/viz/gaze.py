@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from semfov.belief.grid import Grid
 from semfov.data.classes import amount
 from semfov.data.fixations import Fixations
-from semfov.errors import check
+from semfov.errors import check, checked_keywords
 from semfov.paths.areas import AreasLike, percent, shares_around
 from semfov.paths.gaze import GazePrediction
 from semfov.viz.animation import Film, render
@@ -38,6 +38,7 @@ _LABELS = 20  # names of areas that find room below each other in a picture
 _FINER = 8  # points of a band for a cell along each side
 
 
+@checked_keywords
 @styled
 def plot_gaze(
     prediction: GazePrediction,

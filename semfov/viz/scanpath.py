@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.data.fixations import Fixations
 from semfov.data.inputs import ImageLike
-from semfov.errors import check
+from semfov.errors import check, checked_keywords
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
 from semfov.viz.belief import draw_belief
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
 
 
+@checked_keywords
 @styled
 def plot_scanpath(
     scanpath: Record | Fixations,

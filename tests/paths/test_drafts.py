@@ -105,8 +105,9 @@ def test_the_figure_and_the_page_have_both_maps_and_what_differs(tmp_path):
     assert titles[2].startswith("35 % of the fixations move")
     texts = [[text.get_text() for text in axes.texts] for axes in figure.axes[:2]]
     assert [each[0].rpartition(" %")[0].rpartition(" ")[2] for each in texts] == ["40", "75"]
-    path = drafts.report(tmp_path / "drafts.html", areas=areas)
+    path = drafts.report(tmp_path / "drafts.html", title="Two posters", areas=areas)
     page = path.read_text(encoding="utf-8")
+    assert "<h1>Two posters</h1>" in page
     assert "35 % of the fixations move between the drafts" in page
     difference = 100 * drafts.shares({"right": RIGHT})["right"].difference
     assert f'<th scope="row">&lt;right&gt;</th><td>40 %</td><td>75 %</td><td>+{difference:.1f}</td>' in page

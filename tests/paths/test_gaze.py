@@ -133,10 +133,17 @@ def test_visits_of_areas_are_those_of_drawn_viewers(gaze):
         refused("seconds", gaze.visits, areas, seconds=seconds)
 
 
+def test_a_page_has_the_heading_that_it_is_given(gaze, tmp_path):
+    path = gaze.report(tmp_path / "page.html", title="Draft < 2", people=2)
+    assert "<h1>Draft &lt; 2</h1>" in path.read_text(encoding="utf-8")
+    refused("titel", gaze.report, path, titel="Draft 2")
+
+
 def test_a_page_counts_viewers_in_the_time_that_is_asked_for(gaze, tmp_path):
     areas = {"left": (0, 0, 52, 78)}
     for seconds in (0.2, 2.0):
         page = gaze.report(tmp_path / "page.html", people=2, seconds=seconds, areas=areas).read_text(encoding="utf-8")
+        assert "<h1>semfov: where people look in " in page
         assert f">{100 * gaze.visits(areas, seconds=seconds)['left'].viewers:.0f} %<" in page
 
 

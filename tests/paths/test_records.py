@@ -540,8 +540,9 @@ def test_every_record_draws_itself_on_its_picture(make, tmp_path):
     film = record.animate(tmp_path / "film.gif")
     with Image.open(film) as frames:
         assert frames.n_frames == len(list(record))
-    page = record.report(tmp_path / "page.html").read_text(encoding="utf-8")
+    page = record.report(tmp_path / "page.html", title="Cups & mugs").read_text(encoding="utf-8")
     assert "data:image/jpeg" in page
+    assert "<h1>Cups &amp; mugs</h1>" in page
     shown = record._repr_html_()
     assert "data:image/jpeg" in shown
     if make is not scanpath:

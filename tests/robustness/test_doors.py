@@ -392,6 +392,17 @@ def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
         (lambda agent: type(agent)("yolox-nano"), "ActivePerception: missing a .*'search'; .*recommended.. makes one"),
         (lambda agent: agent.eye.detector(PIXELS), r"images: .*got a \w+; give semfov.as_image"),
         (lambda agent: agent(PIXELS), "an agent is not called itself: it has search, find_all, explore"),
+        (lambda agent: agent.forward(PIXELS), "an agent is not called itself: it has search, find_all, explore"),
+        (lambda agent: semfov.gaze(PIXELS), r"semfov.gaze is a module, .*; use .*recommended\(\).gaze\(picture\)$"),
+        (lambda agent: semfov.saliency(PIXELS), "semfov.saliency is a module, which is not called; use"),
+        (lambda agent: semfov.report(PIXELS), r"semfov.report is a module, .*; use record.report\(path\)$"),
+        (lambda agent: semfov.live("cup"), r"semfov.live is a module, .*recommended\(\).live\(target\)$"),
+        (lambda agent: semfov.demo, "semfov has no attribute 'demo'; use `semfov demo` in a shell$"),
+        (lambda agent: agent.device, r"an agent has .* 'device'; use next\(agent.parameters\(\)\).device$"),
+        (lambda agent: agent.find_all(PIXELS, top=3), "top: .*; record.objects has all, to sort by their scores$"),
+        (lambda agent: agent.find_all(PIXELS).objects.top, r"Objects has .*; use objects\[objects.scores.argsort"),
+        (lambda agent: agent.explore(PIXELS).plot(cmap="hot"), "cmap: expected an option of plot_scanpath, got an"),
+        (lambda agent: agent.explore(PIXELS).report("a.html", width_px=9), "width_px: expected an option of .*_data"),
         (lambda agent: agent.track, "an agent has no attribute 'track'; use search, find_all, explore, gaze and live"),
         (
             lambda agent: agent.explore(PIXELS, target="cup"),
@@ -449,7 +460,7 @@ def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
     ],
 )
 def test_what_others_call_it_and_other_forms_of_a_call_are_refused_with_ours(call, said, agent):
-    with pytest.raises((SemfovError, AttributeError), match=f"^{said}"):
+    with pytest.raises((SemfovError, AttributeError, TypeError), match=f"^{said}"):
         call(agent)
 
 
