@@ -81,12 +81,12 @@ class WindowWords(Words):
         "windows": "No window is left that can show more.",
         "detection": "A detection shows the target.",
         "found": "The probability is high enough, and a detection shows the target.",
-        "absent": "No remaining look is worth a pass, and the target is probably absent.",
+        "absent": "No remaining look is worth a pass.",
         "undecided": "No remaining look is worth a pass, but the target is too probable to call it absent.",
-        "unseen": "No look shows anything like it: the probability that is left is that the detector missed it.",
+        "unseen": "No look shows anything like it; what is left is the chance that the detector missed it.",
         "first found": "The first look shows the target closely enough.",
         "closer found": "A closer look confirmed the target.",
-        "closer absent": "No closer look was sure enough, and the target is probably absent.",
+        "closer absent": "No closer look was sure enough.",
         "closer undecided": "The target is too probable to call it absent.",
     }
 

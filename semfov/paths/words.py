@@ -43,7 +43,7 @@ class Words(ABC):
         "seconds": "The time was over.",
         "stopped": "It was stopped.",
         "found": "The target is probable enough, and was looked at closely enough.",
-        "absent": "No remaining cell is worth a look, and the target is probably absent.",
+        "absent": "No remaining cell is worth a look.",
         "undecided": "No remaining cell is worth a look, but the target is too probable to call it absent.",
         "closer found": "A closer look confirmed the target.",
         "closer undecided": "The target is too probable to call it absent.",

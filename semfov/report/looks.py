@@ -12,6 +12,11 @@ from semfov.viz.labels import LabelBox, place_labels, place_within
 
 _NAMED = 12  # largest number of objects whose names are shown at first; more would cover the picture
 
+_STEPS = (
+    "The keys ← and → step through the looks. Home and End go to the first and the last one. "
+    "Click on the number or the border of a {view} to choose its look, or on a row of the list."
+)
+
 
 def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str], *, is_named: bool = True) -> str:
     """Make the article of a record: the picture with its objects and windows, the list of the objects, and all looks.
@@ -37,14 +42,13 @@ def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str],
     )
     legend = "".join(f'<li><i class="of-{kind}"></i> {text}</li>' for kind, text in _legend(data))
     unseen = "" if is_named else ' class="unseen"'
+    steps = f'<p class="hint keys">{_STEPS.format(view=view)}</p>' if len(data["looks"]) > 1 else ""
     return (
         f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name"{unseen}>{name}</h3>'
         f'{noscript}<div class="panes"><figure class="overview"><figcaption><ul class="key">{legend}</ul>{switches}'
         f'</figcaption>{_overview(data, place)}</figure><section class="found-objects" '
         f'aria-labelledby="{place}-objects"><h4 id="{place}-objects">Objects</h4>{objects}</section></div>'
-        f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
-        f"Click on the number or the border of a {view} to choose its look, or on a row of the list.</p>"
-        f'<div class="looks">{looks}</div>'
+        f'{steps}<div class="looks">{looks}</div>'
         f'<p class="hint">{data["values"]}</p></article>'
     )
 

@@ -223,6 +223,7 @@ def test_an_undecided_search_has_the_best_place_of_the_record_on_its_page(zoom_p
     nothing = page_html("t", [data | {"objects": [], "count": 0, "looks": data["looks"][:1]}])
     entries = [re.findall(r'<i class="of-(\w+)">', text) for text in (page, nothing)]
     assert "No objects were found. The best place, not sure enough, is dashed." in nothing
+    assert ["The keys ← and → step through the looks." in text for text in (page, nothing)] == [True, False]
     assert entries == [["best", "windows", "now"], ["best"]]
     (dashed,) = re.findall(r"<rect [^>]*stroke-dasharray[^>]*><title>([^<]*)</title>", path._repr_html_())
     assert dashed == f"best place {path.best_place[1]:.2f}"
