@@ -37,7 +37,7 @@ VERDICTS = {
     "holds in part": "some differences have the sign, and none the opposite one",
     "not overtaken": "ahead at some shifts, and behind at none",
     "level": "every difference is within two standard errors of zero",
-    "open": "some difference is beyond two standard errors, and none stands the correction",
+    "open": "some difference is beyond two standard errors, and none survives the correction",
     "differs": "the finding is that there is no difference, and there is one",
     "reversed in part": "some differences have the opposite sign, and none that of the finding",
     "reversed": "every difference has the opposite sign, or behind from the first shift on and never ahead",
