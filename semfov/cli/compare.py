@@ -70,6 +70,8 @@ def compare(options: CompareOptions) -> int:
 
 def _check_options(options: CompareOptions) -> None:
     """Raise an error for options that cannot be followed, before anything is loaded."""
+    is_folder = not options.out.suffix or options.out.is_dir()
+    check(is_folder, "out", "a folder, for compare.html, compare.csv and compare.png", options.out)
     check_writable(options.out, folder=True)
     check(bool(options.with_), "with", "sahi, ranked, or both", "none")
     has_reference = options.annotations is not None or "sahi" in options.with_

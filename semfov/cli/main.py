@@ -249,7 +249,7 @@ def _refusal(command: str, option: str) -> str | None:
     if _means_positional(option, positional):
         return _without_option(command, option, positional)
     # The parser lists all options of the other subcommands, which have few.
-    is_advised = command in (*_LOOKING, "gaze", "app")
+    is_advised = command in (*_LOOKING, "gaze", "app", "compare")
     return _meant_instead(command, option) if is_advised else None
 
 
@@ -272,11 +272,11 @@ def _meant_instead(command: str, option: str) -> str | None:
     meant = meant_options(option, _option_names(command))
     if meant:
         return f"{unknown}; did you mean --{dashed(meant[0])}?"
-    having = [f"`semfov {name}`" for name in _LOOKING if option in _option_names(name)]
-    if having:
-        return f"{unknown}; it is one of {' and '.join(having)}"
     advice = ADVICE_OF.get(command, {}).get(option)
-    return f"{unknown}; {advice}" if advice else None
+    if advice:
+        return f"{unknown}; {advice}"
+    having = [f"`semfov {name}`" for name in _LOOKING if option in _option_names(name)]
+    return f"{unknown}; it is one of {' and '.join(having)}" if having else None
 
 
 _RENAME = "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too)"

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 _FIGURE = "AP50 over seconds; the numbers at the points are passes of the detector"
 _COLUMNS = (
-    "Passes and seconds are means of a picture. AP50 counts all boxes by their scores; listed are those from the score "
-    "on from which semfov lists objects, right are those of them that the reference has, and the last column counts "
-    "the objects of the reference."
+    "Passes and seconds are means over the pictures. AP50 counts all boxes by their scores. Listed are those that "
+    "semfov's score threshold keeps. Right are the listed ones that the reference has, too; the last column counts all "
+    "objects of the reference."
 )
 
 

@@ -56,6 +56,6 @@ def plot_comparison(points: Sequence[ComparedPoint], measure: str = "AP50") -> F
                 color=colour,
                 fontsize=7,
             )
-    axes.set(xlabel="seconds a picture", ylabel=measure, xlim=(0, None), ylim=(0, 1.05))
+    axes.set(xlabel="seconds a picture", ylabel=measure, xlim=(0, None), ylim=(0, 1.1))
     axes.legend(loc="lower right")
     return figure
