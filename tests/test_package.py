@@ -1,8 +1,10 @@
 """The package as a whole: its public names, the cost of importing it, and the direction of imports."""
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Iterable
 from functools import cache
@@ -117,6 +119,43 @@ def imports(source: str) -> list[tuple[str, str]]:
         elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("import_module", "__import__"):
             raise ValueError(f"line {node.lineno}: expected a statement, got {ast.unparse(node)}")
     return found
+
+
+ALONE = """
+import sys
+from importlib.abc import MetaPathFinder
+
+class Refusal(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in REFUSED:
+            raise ImportError(f"{name} is not installed")
+
+sys.meta_path.insert(0, Refusal())
+import torch
+import semfov
+from semfov.sensor import LogPolar
+
+image, fixation, grid = torch.rand(1, 3, 64, 64), torch.tensor([[32.0, 32.0]]), semfov.Grid(4, 4, (64, 64))
+views = semfov.Foveation(10.0)(image, fixation), LogPolar(9.0)(image, fixation)
+model = semfov.FovealObservationModel.from_pretrained("yolox-nano").requires_grad_(False)
+observer = semfov.observers.Semantic(81, model)
+seen = semfov.Detections(torch.tensor([[[9.0, 9, 30, 30]]]), torch.full((1, 1, 81), 1 / 81), torch.tensor([[True]]))
+belief = observer(observer.start(1, grid, fixation), seen, fixation, grid)
+visited = torch.zeros(1, 16, dtype=torch.bool)
+for acquisition in (semfov.acquisition.TargetPosterior(1), semfov.acquisition.KLDivergence(model, grid)):
+    print(acquisition(belief, visited).shape)
+"""
+
+
+def test_the_modules_alone_need_four_packages(fresh):
+    """Those of docs/install.md, with the packages that torch itself needs."""
+    few = ["torch", "numpy", "lazy-loader", "safetensors"]
+    assert f"pip install {' '.join(few)}\n" in (ROOT / "docs/install.md").read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = {re.split(r"[<>=\[]", each)[0] for each in project["dependencies"]}
+    refused = needed - {*few, "filelock", "pillow", "pyyaml"} | {"PIL", "yaml"}  # torch needs filelock
+    names = sorted(name.replace("-", "_") for name in refused)
+    assert fresh(f"REFUSED = {names}\n{ALONE}") == "torch.Size([1, 16])\n" * 2
 
 
 def modules_of(folder: Path) -> dict[str, Path]:
