@@ -13,7 +13,9 @@ function stepper({ last, show, word, pause, first = 1 }) {
     document.querySelector(".controls").hidden = last() === 0;
     find("fixation").max = last();
     find("fixation").value = steps.at;
-    const number = `${steps.at + first} of ${last() + first}`;
+    // Before the first step all are shown together.
+    const place = steps.at + first;
+    const number = place > 0 ? `${place} of ${last() + first}` : `1 to ${last()}`;
     find("fixation").setAttribute("aria-valuetext", `${word()} ${number}`);
     find("number").textContent = number;
     find("back").disabled = steps.at === 0;
