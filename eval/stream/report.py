@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,6 +14,7 @@ from torch import Tensor
 from eval.bootstrap import Bootstrap
 from eval.comparison.summary import announce, write_summary
 from eval.stream.identity import IdentityCounts
+from eval.stream.misses import ERRORS, MissCounts, miss_rows
 from eval.stream.run import FILM, StreamConfig, StreamOutcome, StreamRun
 from eval.stream.ways import CANDIDATES, SLICES
 from eval.zoom.objects import average_precision
@@ -100,6 +102,7 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         "",
         *reliability_table(by, config.after),
         *identity_table(outcomes),
+        *miss_tables(outcomes),
     ]
 
 
@@ -142,6 +145,24 @@ def identity_table(outcomes: Sequence[StreamOutcome]) -> list[str]:
         *table(rows),
         "",
     ]
+
+
+def miss_tables(outcomes: Sequence[StreamOutcome]) -> list[str]:
+    """Tables of what becomes of objects in the lists of the agent; empty where their numbers are not known."""
+    lines: list[str] = []
+    for way in outcomes[0].misses:
+        counts = reduce(MissCounts.joined, (outcome.misses[way] for outcome in outcomes))
+        if not counts.objects:
+            continue
+        errors = ", ".join(f"{counts.errors[kind]} {kind}" for kind in ERRORS)
+        lines += [
+            f"Why boxes of objects are not listed ({way}), as shares in all frames. Listed boxes that are wrong: "
+            f"{errors}.",
+            "",
+            *table([["", "of all boxes", "of objects that move"], *miss_rows(counts)]),
+            "",
+        ]
+    return lines
 
 
 def by_way(records: Sequence[ResultRecord]) -> _By:

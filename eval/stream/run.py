@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import process_time
+from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple, cast
 
 import torch
@@ -12,6 +13,7 @@ import torch
 from eval.stream.drift import Drift
 from eval.stream.flights import COURSES, CourseName, Frame, film, flight, mot_film, within
 from eval.stream.identity import Identities, IdentityCounts
+from eval.stream.misses import MissCounts
 from eval.stream.plain import PlainRule
 from eval.stream.ways import AllSlices, Live, Oracle, RoundRobin, TrackedSlices, Way, WholeFrame
 from semfov.agents.window_episode import LIKELY
@@ -91,7 +93,8 @@ class Cost(NamedTuple):
 class StreamOutcome(NamedTuple):
     """What each way of looking knows at the judged frames of a stream, what it takes, and the drift of the motion.
 
-    `identities` has the ways that tell numbers of objects, in all frames after `StreamConfig.after`.
+    `identities` has the ways that tell numbers of objects, in all frames after `StreamConfig.after`, and `misses` what
+    the agent does not list of them.
     """
 
     course: str
@@ -99,6 +102,7 @@ class StreamOutcome(NamedTuple):
     costs: Mapping[str, Cost]
     drift: Drift
     identities: Mapping[str, IdentityCounts]
+    misses: Mapping[str, MissCounts] = MappingProxyType({})
 
     @property
     def title(self) -> str:
@@ -181,6 +185,8 @@ class StreamRun:
                 began = process_time()
                 known = way.step(frame)
                 took = process_time() - began
+                if isinstance(way, Live):
+                    way.find_misses(frame, counts=number > self.config.after)
                 for row, objects in known.items():
                     if number > self.config.after and objects.track_ids is not None and frame.identities is not None:
                         compare_identities(identities.setdefault(row, Identities()), objects, frame, self.target)
@@ -192,7 +198,8 @@ class StreamRun:
                         records.append({**where, **judged_objects(objects, frame, self.target)})
         costs = {row: Cost(passes[row], 1000 * seconds[row] / steps[row]) for row in passes}
         counts = {row: each.counts() for row, each in identities.items()}
-        return StreamOutcome(course, records, costs, drift, counts)
+        misses = {way.name: way.misses.counts for way in ways if isinstance(way, Live)}
+        return StreamOutcome(course, records, costs, drift, counts, misses)
 
 
 def compare_identities(identities: Identities, objects: Objects, frame: Frame, target: int) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from eval.stream.bytetrack import ByteTrack
 from eval.stream.flights import Frame
+from eval.stream.misses import Misses
 from eval.zoom.objects import suppressed
 from semfov.agents.window_episode import LIKELY, WindowStream
 from semfov.agents.window_objects import seen_by
@@ -17,6 +18,7 @@ from semfov.data.inputs import FRAME
 from semfov.detection.objects import Objects
 from semfov.motion import CameraMotion, CameraStep
 from semfov.observation.matching import box_iou, inside_frame
+from semfov.paths import WindowMoment
 from semfov.tracking import Tracker
 from semfov.zoom.episode import KeptLook, carry_along
 from semfov.zoom.eye import WindowEye
@@ -119,20 +121,49 @@ class RoundRobin(Way):
 
 
 class Live(Way):
-    """The agent, for all objects of the class: those that it lists, and all candidates."""
+    """The agent, for all objects of the class: those that it lists, and all candidates.
+
+    Attributes:
+        name: of the row of what it lists.
+        misses: why it does not list objects.
+    """
 
     def __init__(self, eye: WindowEye, target: int, episode: WindowStream, *, poses: bool = False) -> None:
         super().__init__(eye, target)
         self.episode, self.poses = episode, poses
         self.passes = episode.passes_of_frame
+        self._known = ", pose known" if poses else ""
+        self._known += f", {self.passes} passes" if self.passes > 1 else ""
+        self.name = LIVE + self._known
+        self.misses = Misses()
+        self._moment: WindowMoment | None = None  # of the present frame
 
     def step(self, frame: Frame) -> Mapping[str, Objects]:
-        moment = self.episode.step(frame.pixels, pose=frame.pose if self.poses else None)
-        known = ", pose known" if self.poses else ""
-        known += f", {self.passes} passes" if self.passes > 1 else ""
+        self._moment = moment = self.episode.step(frame.pixels, pose=frame.pose if self.poses else None)
         # All candidates are too many for numbers to be told of them.
         candidates = replace(moment.candidates, track_ids=None)
-        return {LIVE + known: moment.objects, CANDIDATES + known: candidates}
+        return {self.name: moment.objects, CANDIDATES + self._known: candidates}
+
+    def find_misses(self, frame: Frame, *, counts: bool) -> None:
+        """Find out which objects of the present frame are not listed, where their numbers are known.
+
+        Args:
+            frame: the frame.
+            counts: whether the frame counts, or is only remembered.
+        """
+        if frame.identities is None or self._moment is None:
+            return
+        annotation = frame.annotation
+        chosen = annotation.labels == self.target
+        self.misses.step(
+            frame.identities[chosen],
+            annotation.boxes[chosen],
+            self._moment.tracks,
+            [look.region for look in self._moment.looks[-self.passes :]],
+            annotation.size,
+            moving=None if frame.moving is None else frame.moving[chosen],
+            counts=counts,
+        )
 
 
 class Oracle(Way):

@@ -1,5 +1,6 @@
 """Flights over pictures, ways of looking at their frames, and the tables about them."""
 
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -10,6 +11,7 @@ import torch
 from eval.stream import main
 from eval.stream.drift import Drift
 from eval.stream.flights import COURSES, Course, Frame, flight, mot_film, poses
+from eval.stream.misses import CAUSES, LISTED, Misses, miss_rows
 from eval.stream.plain import PlainRule
 from eval.stream.report import (
     by_way,
@@ -25,6 +27,9 @@ from eval.stream.ways import AllSlices, Oracle, RoundRobin, WholeFrame, whole_an
 from semfov import WindowEye
 from semfov.data.scene import Annotation, Scene
 from semfov.detection.objects import Objects
+from semfov.tracking import Tracks
+from semfov.tracking.kalman import Kinematics
+from semfov.tracking.tracks import no_trail
 from semfov.zoom.lattice import Lattice
 from tests.small import Coloured, iou
 
@@ -266,3 +271,54 @@ def test_a_small_run_writes_its_tables(tmp_path, capsys):
 def test_a_film_that_ends_before_a_judged_frame_is_refused(tmp_path, capsys):
     assert main(["--data.limit", "2", "--successive", "--ways", "[whole]", "--out", str(tmp_path)]) == 1
     assert "lower every and after" in capsys.readouterr().err
+
+
+def tracks_at(*boxes, odds=2.0, variance=1.0):
+    """Objects that move, at boxes that are right within a pixel, with log odds."""
+    corners = np.array(boxes, float).reshape(-1, 4)
+    count = len(corners)
+    fixed = Kinematics.at((corners[:, :2] + corners[:, 2:]) / 2, np.full(count, variance), np.full(count, 5.0))
+    moving = replace(fixed, velocity=np.full((count, 2), 90.0))
+    columns = {name: np.zeros(count) for name in ("size_variance", "missed_odds", "unseen", "magnification")}
+    return Tracks(
+        track_ids=1 + np.arange(count),
+        labels=np.ones(count, int),
+        kinematics=moving,
+        speed=np.full(count, 50.0),
+        log_size=np.log(corners[:, 2:] - corners[:, :2]),
+        shown_odds=np.full(count, odds),
+        passes=np.zeros(count, int),
+        trail=no_trail(count),
+        **columns,
+    )
+
+
+@pytest.mark.parametrize(
+    ("tracks", "fate", "errors"),
+    [
+        (tracks_at((100, 100, 140, 140), (102, 100, 142, 140)), LISTED, {"double": 1}),
+        (tracks_at((100, 100, 140, 140), odds=-1.0), "improbable", {}),
+        (tracks_at((100, 100, 140, 140), variance=1e4), "place uncertain", {}),
+        (tracks_at((125, 100, 165, 140)), "wrong place", {"beside an object": 1}),
+        (tracks_at((300, 300, 340, 340))[1:], "forgotten", {}),
+        (tracks_at((900, 300, 940, 340)), "wrong place", {}),  # its track has left the frame
+    ],
+)
+def test_why_an_object_is_missed_after_it_was_found(tracks, fate, errors):
+    """The object is found in one frame, and each cause is made in the next one."""
+    misses, number, box = Misses(), torch.tensor([7]), torch.tensor([[100.0, 100, 140, 140]])
+    misses.step(number, box, tracks_at((100, 100, 140, 140)), [], FRAME, counts=False)
+    misses.step(number, box, tracks, [], FRAME, moving=torch.tensor([True]))
+    assert misses.counts.objects == misses.counts.moving == {fate: 1}
+    assert +misses.counts.errors == errors
+    rows = {row[0]: row[1:] for row in miss_rows(misses.counts)}
+    assert rows[fate] == ["1.000", "1.000"]
+    assert [*rows] == [LISTED, *CAUSES]
+
+
+def test_an_object_is_not_detected_once_a_look_has_shown_all_of_it():
+    misses, number, box = Misses(), torch.tensor([7]), torch.tensor([[100.0, 100, 140, 140]])
+    misses.step(number, box, tracks_at(), [(0.0, 0.0, 120.0, 480.0)], FRAME)
+    misses.step(number, box, tracks_at((300, 300, 340, 340)), [(90.0, 90.0, 150.0, 150.0)], FRAME)
+    assert misses.counts.objects == {"not looked at": 1, "not detected": 1}
+    assert +misses.counts.errors == {"nothing there": 1}
