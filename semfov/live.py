@@ -24,8 +24,9 @@ class LivePerception(OtherWords):
     detector's input where the agent has no evidence for photographs, or where a first cell is given.
 
     Looks at windows follow a camera that moves: what they showed is carried along. Where a frame fits none before it,
-    after a cut or in the dark, the moment is `lost`, and only what that frame shows is listed, until the scene is found
-    again. The scene is taken to be flat or far away. A fovea does not follow the camera.
+    after a cut or in the dark, what was known is set aside, and only what is seen from that frame on is listed. The
+    moment is `lost` until the scene is found again or given up, after twelve frames. The scene is taken to be flat or
+    far away. A fovea does not follow the camera.
 
     Args:
         parts: the agent, whose parts look by a fovea and at windows.

@@ -474,7 +474,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
         self._camera = _Camera(follows=follows)
         self._session: WindowSession | None = None  # from the first frame on
         self._frames = 0  # number of frames so far
-        self._is_lost = False  # whether the present frame fits none before it
+        self._is_lost = False  # whether what was known of an earlier scene is set aside
 
     @property
     def looks(self) -> tuple[LookAtWindow, ...]:
@@ -514,7 +514,8 @@ class WindowStream(StreamEpisode[WindowMoment]):
             session.source.show(view, passed)
             return
         session.source.show(view, passed, camera)
-        self._is_lost = camera.motion is None and camera.recovered is None
+        # What was known is set aside from a frame that fits none before it, until its scene is found again or given up.
+        self._is_lost = camera.recovered is None and (camera.motion is None or camera.waits)
         if not camera.is_still:
             session.follow(camera)
 

@@ -493,7 +493,8 @@ class WindowMoment(ZoomPath, Moment):
     Attributes:
         tracks: the objects that are known, of all frames so far, with those that are hidden or have left the frame.
         next_window: the window to look at in the next frame, unless the camera loses the scene, or finds it again.
-        lost: whether the frame fits none before it, after a cut or in the dark; then nothing of earlier frames counts.
+        lost: whether what was known of a scene is set aside: from a frame that fits none before it, as after a cut or
+            in the dark, until the scene is found again or given up.
 
     Example::
 

@@ -68,8 +68,9 @@ def test_a_scene_that_was_given_up_does_not_come_back_with_another(live, ground)
     search(live, ground, 0)
     cut = live.moment().looks[-1].seconds
     other = part(scene(9) // 2 + 40, 0)
-    for _ in range(14):
-        live.step(other)
+    is_lost = [live.step(other).lost for _ in range(14)]
+    assert is_lost == sorted(is_lost, reverse=True)
+    assert sum(is_lost) == 11  # the twelfth frame is the last that is compared with the old scene
     live.step(DARK)
     moment = live.step(other)
     assert not moment.lost  # the other scene is found again
