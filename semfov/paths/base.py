@@ -24,7 +24,7 @@ from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, InputError, check
 from semfov.paths.conversion import Conversion, Values
-from semfov.paths.files import Format, SharedFields
+from semfov.paths.files import PLAIN, Format, SharedFields
 from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
 from semfov.paths.regions import Region
 
@@ -311,7 +311,8 @@ class Record(Conversion):
         """
         try:
             tensors, record, shared = cls._format.read(path)
-            fields = {**shared, **cls._fields(tensors, record, shared)}
+            plain = {name: record.get(name) for name in PLAIN}
+            fields = {**plain, **shared, **cls._fields(tensors, record, shared)}
         except InputError as error:
             got = " ".join(str(error).split())
             raise DataError(f"{path}: expected a complete {cls._format.kind}, got: {got}") from None

@@ -77,8 +77,8 @@ _SHARED = {
     "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
     "closer": Array(Object(_CLOSER, None, tuple(_CLOSER))),
 }
-_PLAIN = ("target", "found", "prior", "assumed", "score_threshold", "source", "shown", "detector", "ending")
-"""Attributes that are JSON values."""
+PLAIN = ("target", "found", "prior", "assumed", "score_threshold", "source", "shown", "detector", "ending")
+"""Attributes that are JSON values of a file by their own names; those of `SharedFields` are made of several values."""
 
 
 _OTHERS = {
@@ -112,22 +112,13 @@ class _Shared(Protocol):
 
 
 class SharedFields(TypedDict):
-    """Attributes that all records have, by name, as the file of a record gives them."""
+    """Attributes that all records have beside the plain ones, by name, as the file of a record gives them."""
 
     classes: tuple[str, ...]
-    target: int | None
     targets: tuple[int, ...]
-    found: bool
     detections: tuple[Detections, ...]
     decision: Decision | None
     closer: tuple[CloseUp, ...]
-    prior: float | None
-    assumed: float | None
-    score_threshold: float
-    source: str | None
-    shown: dict[str, Any] | None
-    detector: str | None
-    ending: Ending | None
     photograph: Tensor | None
 
 
@@ -174,7 +165,7 @@ class Format:
             "version": __version__,
             "classes": list(outcome.classes),
             "lengths": [look.mask.shape[-1] for look in outcome.detections],
-            **{name: getattr(outcome, name) for name in _PLAIN},
+            **{name: getattr(outcome, name) for name in PLAIN},
             "targets": list(outcome.targets),
             "decision": None if decision is None else _decision_values(decision),
             "closer": [{name: getattr(look, name) for name in _CLOSER} for look in outcome.closer],
@@ -189,7 +180,7 @@ class Format:
             path: the file.
 
         Returns:
-            Its tensors, its JSON values, and the attributes of all records by their names.
+            Its tensors, its JSON values, and the attributes of all records that are made of these.
 
         Raises:
             InputError: a value is missing, or does not suit the others.
@@ -210,25 +201,16 @@ def _decision_values(decision: Decision) -> dict[str, Any]:
 
 
 def _shared_fields(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> SharedFields:
-    """Make the attributes that all records have from the checked tensors and JSON values of a file."""
+    """Make the attributes that all records have beside the plain ones from the checked content of a file."""
     decision = record.get("decision")
     closer_boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
     close_ups = zip(record["closer"], closer_boxes, strict=True)
     return {
         "classes": tuple(record["classes"]),
-        "target": record.get("target"),
         "targets": tuple(record["targets"]),
-        "found": record["found"],
         "detections": _separated(tensors, record["lengths"]),
         "decision": None if decision is None else Decision(**decision, box=tensors.get("box")),
         "closer": tuple(CloseUp(**values, box=box) for values, box in close_ups),
-        "prior": record.get("prior"),
-        "assumed": record.get("assumed"),
-        "score_threshold": record["score_threshold"],
-        "source": record.get("source"),
-        "shown": record.get("shown"),
-        "detector": record.get("detector"),
-        "ending": record.get("ending"),
         "photograph": tensors.get("photograph"),
     }
 
