@@ -200,13 +200,11 @@ class _Reading(NamedTuple):
     def _records(self, reader: _Reader, path: Path) -> list[Fixations]:
         """Read the records of a file; of one picture of several, those that were made in it."""
         picture = self.arguments.get("picture")
-        takes_picture = reader is not read_table and "picture" in signature(reader).parameters
-        is_said_by_name = takes_picture and self.sizes is None
-        if picture is None or is_said_by_name:
+        if picture is None or self._names_pictures(reader):
             return self._in_frames(reader, path, self.arguments)
-        other_arguments = {name: value for name, value in self.arguments.items() if name != "picture"}
+        without_picture = {name: value for name, value in self.arguments.items() if name != "picture"}
         try:
-            records = self._in_frames(reader, path, other_arguments)
+            records = self._in_frames(reader, path, without_picture)
         except PictureError:
             # The file names no picture, so this is the one.
             return self._in_frames(reader, path, self.arguments)
@@ -214,6 +212,12 @@ class _Reading(NamedTuple):
             raise InputError(f"picture: expected a picture or folder that exists, got {picture}")
         # A file with other names is compared as it is, and the report says that their pictures are not there.
         return [record for record in records if record.picture in self.sizes] or records
+
+    def _names_pictures(self, reader: _Reader) -> bool:
+        """Tell whether `picture` is a name that the reader gives to fixations without one, and no file."""
+        # Tables are tried without it first: those of several pictures have a column of their names.
+        takes_name = reader is not read_table and "picture" in signature(reader).parameters
+        return takes_name and self.sizes is None
 
     def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> list[Fixations]:
         """Read the records of a file; where it has no frames, they are the pictures."""
@@ -229,20 +233,28 @@ def _content(records: list[Fixations], usual: str) -> str:
     """Say what is in the records, in a line; `usual` is said of frames that the file does not tell."""
     if not records:
         return "no fixations"
-    people = {record.subject for record in records}
-    pictures = {record.picture for record in records}
-    words = [
-        amount(sum(map(len, records)), "fixation"),
-        amount(len(records), "scanpath"),
-        amount(len(people), "person"),
-        amount(len(pictures), "picture"),
-    ]
+    counts = {
+        "fixation": sum(map(len, records)),
+        "scanpath": len(records),
+        "person": len({record.subject for record in records}),
+        "picture": len({record.picture for record in records}),
+    }
+    amounts = ", ".join(amount(count, noun) for noun, count in counts.items())
+    return f"{amounts}, frames of {_frames_text(records)}{usual}; {_durations_text(records)}"
+
+
+def _frames_text(records: Sequence[Fixations]) -> str:
+    """List the sizes of the frames, of many the smallest."""
     sizes = sorted({record.size for record in records})
-    frames = [f"{width} × {height}" for width, height in sizes[:_FRAMES_NAMED]]
+    texts = [f"{width} × {height}" for width, height in sizes[:_FRAMES_NAMED]]
     if len(sizes) > _FRAMES_NAMED:
-        frames.append("…")
-    durations = "without durations"
-    times = [record.durations for record in records if record.durations is not None]
-    if times:
-        durations = f"they take {np.median(np.concatenate(times)):g} ms in the median"
-    return f"{', '.join(words)}, frames of {', '.join(frames)}{usual}; {durations}"
+        texts.append("…")
+    return ", ".join(texts)
+
+
+def _durations_text(records: Sequence[Fixations]) -> str:
+    """Say how long the fixations take, as far as it is known."""
+    durations = [record.durations for record in records if record.durations is not None]
+    if not durations:
+        return "without durations"
+    return f"they take {np.median(np.concatenate(durations)):g} ms in the median"

@@ -83,12 +83,16 @@ def _shares_as_read(points: _Array, frame: _Array, picture: _Array) -> _Array:
 
 def _shares_y_upwards(points: _Array, frame: _Array, picture: _Array) -> _Array:
     """Count y from the lower border of the frame."""
-    return _shares_as_read(np.stack([points[:, 0], frame[1] - 1 - points[:, 1]], 1), frame, picture)
+    x, y = points.T
+    upwards = np.stack([x, frame[1] - 1 - y], 1)
+    return _shares_as_read(upwards, frame, picture)
 
 
 def _shares_mirrored(points: _Array, frame: _Array, picture: _Array) -> _Array:
     """Count x from the right border of the frame."""
-    return _shares_as_read(np.stack([frame[0] - 1 - points[:, 0], points[:, 1]], 1), frame, picture)
+    x, y = points.T
+    mirrored = np.stack([frame[0] - 1 - x, y], 1)
+    return _shares_as_read(mirrored, frame, picture)
 
 
 def _shares_half_turned(points: _Array, frame: _Array, picture: _Array) -> _Array:
@@ -183,13 +187,13 @@ def content_suspicions(
     names = sorted({record.picture for record in records})
     if len(names) < FEWEST_PICTURES or sum(map(len, records)) < _FEWEST_FIXATIONS:
         return []
-    evidence = _Evidence(records, {name: sizes[name] for name in names}, _particular_densities(names, densities))
+    evidence = _Evidence(records, sizes, _particular_densities(names, densities))
     shift = _shift_of(evidence, records, "all fixations", _LEAST_SHIFT)
     reading = _better_reading(evidence)
-    findings = [finding for finding in (shift, reading) if finding is not None]
-    if findings:
-        # A shift and another size of the frame look alike where few fixations lie at the borders.
-        return [max(findings, key=lambda finding: finding.fit).line]
+    # A shift and another size of the frame look alike where few fixations lie at the borders.
+    best = max(filter(None, (shift, reading)), key=lambda finding: finding.fit, default=None)
+    if best is not None:
+        return [best.line]
     # A drift may be so large that the later fixations do not fit their pictures.
     return _wrong_names(evidence) or _misfit(evidence) or _shifts_of_some(evidence)
 
@@ -407,32 +411,35 @@ def _exchanged(names: Sequence[str], fits: _Array) -> list[str]:
 
 
 def _shifts_of_some(evidence: _Evidence) -> list[str]:
-    """Find shifts of some people's fixations, or of those that were made later."""
+    """Find shifts of some people's fixations; where there are none, one of those that were made later."""
+    by_person = _by_person(evidence.records)
+    lines = []
+    if len(by_person) > 1:  # the shift of a single person is that of all fixations
+        for person, records in by_person.items():
+            shift = _shift_of(evidence, records, f"the fixations of person {person}", _LEAST_SHIFT_OF_SOME)
+            if shift is not None:
+                lines.append(shift.line)
+    if lines:
+        return lines
+    drift = _drift(evidence)
+    return [] if drift is None else [drift.line]
+
+
+def _by_person(records: Sequence[Fixations]) -> dict[str, list[Fixations]]:
+    """Group records by person, those of each in the order in which they were made."""
     by_person: dict[str, list[Fixations]] = defaultdict(list)
-    for record in evidence.records:
+    for record in records:
         by_person[record.subject].append(record)
-    findings = []
-    if len(by_person) > 1:
-        findings = [
-            _shift_of(evidence, records, f"the fixations of person {person}", _LEAST_SHIFT_OF_SOME)
-            for person, records in by_person.items()
-        ]
-    if not any(findings):
-        findings = [_drift(evidence)]
-    return [finding.line for finding in findings if finding is not None]
+    return by_person
 
 
 def _drift(evidence: _Evidence) -> _Finding | None:
     """Find a shift of later fixations: a tracker drifts while a person looks at one picture after the other."""
-    by_person: dict[str, list[Fixations]] = defaultdict(list)
-    for record in evidence.records:
-        by_person[record.subject].append(record)
     second_halves: list[Fixations] = []
-    for records in by_person.values():
+    for records in _by_person(evidence.records).values():
         second_halves += records[len(records) // 2 :]
-    return _shift_of(
-        evidence, second_halves, "fixations in the second half of each person's pictures", _LEAST_SHIFT_OF_SOME
-    )
+    label = "fixations in the second half of each person's pictures"
+    return _shift_of(evidence, second_halves, label, _LEAST_SHIFT_OF_SOME)
 
 
 def _shift_of(evidence: _Evidence, records: Sequence[Fixations], label: str, least_shift: float) -> _Finding | None:
