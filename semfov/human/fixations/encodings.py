@@ -32,6 +32,11 @@ def read_recording(path: str | PathLike[str]) -> tuple[str, str]:
     return text, encoding
 
 
+def file_name(path: str) -> str:
+    """Take the name of a file from a path of Windows or Unix, perhaps in quotes, as messages have it."""
+    return path.strip('"').replace("\\", "/").rpartition("/")[2]
+
+
 def warn_of_letters(source: str | PathLike[str], encoding: str, fixations: list[Fixations]) -> list[Fixations]:
     """Warn of names whose letters are right only if the encoding is that of the file.
 
@@ -45,7 +50,9 @@ def warn_of_letters(source: str | PathLike[str], encoding: str, fixations: list[
     """
     if encoding != WINDOWS:
         return fixations
-    names = [name for record in fixations for name in (record.picture, record.subject, record.target or "")]
+    names: list[str] = []
+    for record in fixations:
+        names += [record.picture, record.subject, record.target or ""]
     # Letters of ASCII are the same in all encodings that are read.
     uncertain = [name for name in names if not name.isascii()]
     if uncertain:

@@ -15,6 +15,7 @@ from semfov.human.fixations.columns import LOST, DataFrame, Row, Table, table_of
 from semfov.human.fixations.encodings import warn_of_letters
 from semfov.human.fixations.programs import LENGTHS, PROGRAMS, TIMES, Column, Origin, Program, Units, program_of
 from semfov.human.fixations.table import (
+    SCANPATH,
     Coordinates,
     FrameError,
     PictureError,
@@ -27,10 +28,7 @@ from semfov.human.fixations.table import (
 )
 from semfov.human.fixations.unfolding import unfolded
 
-_SCANPATH = ("picture", "subject", "target", "trial")
-"""Our names of the fields that the fixations of a scanpath share."""
-
-_NAMED = (*_SCANPATH, "duration")  # fields whose columns a user may name
+_NAMED = (*SCANPATH, "duration")  # fields whose columns a user may name
 _OTHERS = ("width", "height", "found", "x1", "y1", "x2", "y2")  # fields that `read_table` has, and few programs
 _EYE_KEYS = ("eye", "eyeused", "eyereported", "eyelr")
 _EYES = {"21": "left", "l": "left", "left": "left", "22": "right", "r": "right", "right": "right"}
@@ -115,8 +113,8 @@ def read_export(
     rows = _of_one_eye(_viewings(rows), eye)
     check_data(bool(rows), table.name, f"fixations of the {eye} eye", "those of the other one")
     rows = _with_picture(rows, layout, table.name)
-    sides = [row.fields[side] for row in rows for side in ("width", "height")]
-    if size is None and "" in sides:
+    lacks_frame = any("" in (row.fields["width"], row.fields["height"]) for row in rows)
+    if size is None and lacks_frame:
         expected = f"the size of the frame, which {program.name} does not give"
         raise FrameError(f"{table.name}: expected {expected}; give size=")
     coordinates = Coordinates(units or layout.units, origin or program.origin)
@@ -273,7 +271,7 @@ def _viewings(rows: Sequence[Row]) -> list[Row]:
     viewing = 0
     previous = None
     for place, row in enumerate(rows):
-        scanpath = tuple(row.fields[name] for name in _SCANPATH)
+        scanpath = tuple(row.fields[name] for name in SCANPATH)
         viewing += scanpath != previous
         previous = scanpath
         row.fields["trial"] = f"{row.fields['trial']} {viewing}"
@@ -285,13 +283,17 @@ def _viewings(rows: Sequence[Row]) -> list[Row]:
 def _of_one_eye(rows: Sequence[Row], eye: str | None) -> list[Row]:
     """Take the rows of an eye, of the right one in viewings of both; rows that name no eye, or both, stay."""
     sides = [_side(row.fields.pop("eye")) for row in rows]
-    trials = [row.fields["trial"] for row in rows]
-    eye_of_trial = dict.fromkeys(trials, eye or "left")
-    if eye is None:
-        seen_by_right = [trial for trial, side in zip(trials, sides, strict=True) if side == "right"]
-        eye_of_trial |= dict.fromkeys(seen_by_right, "right")
-    # Samples of both eyes would count each fixation twice.
-    return [row for row, side in zip(rows, sides, strict=True) if side in ("", eye_of_trial[row.fields["trial"]])]
+    trials_of_right_eye = set()
+    for row, side in zip(rows, sides, strict=True):
+        if side == "right":
+            trials_of_right_eye.add(row.fields["trial"])
+    rows_of_eye = []
+    for row, side in zip(rows, sides, strict=True):
+        usual_eye = "right" if row.fields["trial"] in trials_of_right_eye else "left"
+        # Samples of both eyes would count each fixation twice.
+        if side in ("", eye or usual_eye):
+            rows_of_eye.append(row)
+    return rows_of_eye
 
 
 def _side(text: str) -> str:

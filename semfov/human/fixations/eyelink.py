@@ -13,7 +13,7 @@ import numpy as np
 
 from semfov.data.fixations.record import Fixations
 from semfov.errors import DataError, check, check_data
-from semfov.human.fixations.encodings import WINDOWS, warn_of_letters
+from semfov.human.fixations.encodings import WINDOWS, file_name, warn_of_letters
 from semfov.human.fixations.suspicions import warn_of_frames
 from semfov.io.files import read_encoded
 
@@ -132,7 +132,9 @@ def read_eyelink(
     text, encoding = read_encoded(path, WINDOWS)
     lines = text.splitlines()
     trials, fixations = _events(path, lines)
-    views = [view for trial in trials for view in trial.viewed()]
+    views: list[_View] = []
+    for trial in trials:
+        views += trial.viewed()
     _share_out(fixations, views)
     viewed = [view for view in views if view.fixations]
     check_data(bool(viewed), path, "lines EFIX after a message TRIALID", _lack_of_fixations(trials, lines))
@@ -237,7 +239,7 @@ def _read_message(text: str, time: float, trials: list[_Trial]) -> None:
         picture, place = _loaded(load[1].upper(), load[2])
         trial.show(picture, time, place)
     elif variable := _VARIABLE.match(text):
-        trial.name = _file_name(variable[1])
+        trial.name = file_name(variable[1])
 
 
 def _loaded(mode: str, rest: str) -> tuple[str, _Place | None]:
@@ -253,9 +255,9 @@ def _loaded(mode: str, rest: str) -> tuple[str, _Place | None]:
     placed = _PLACED.match(rest)
     # A name may end in numbers, too, and a picture that fills the screen has no place in its message.
     if placed is None or mode == "FILL":
-        return _file_name(rest), None
+        return file_name(rest), None
     name, *numbers = placed.groups()
-    return _file_name(name), None if None in numbers else _place(mode, *map(float, numbers))
+    return file_name(name), None if None in numbers else _place(mode, *map(float, numbers))
 
 
 def _place(mode: str, x: float, y: float, width: float, height: float) -> _Place | None:
@@ -265,11 +267,6 @@ def _place(mode: str, x: float, y: float, width: float, height: float) -> _Place
     if mode == "CENTER":  # x and y are those of the middle
         return x - width / 2, y - height / 2, width, height
     return x, y, width, height
-
-
-def _file_name(path: str) -> str:
-    """Take the name of a file from a path of Windows or Unix, perhaps in quotes."""
-    return path.strip('"').replace("\\", "/").rpartition("/")[2]
 
 
 def _share_out(fixations: Iterable[_Fixation], views: Sequence[_View]) -> None:

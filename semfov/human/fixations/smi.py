@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from semfov.data.sources import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, check_data
+from semfov.human.fixations.encodings import file_name
 
 # The first lines have the names of the columns of each kind of event, and then the events follow. The converter of the
 # same program begins lines that are no events with two signs.
@@ -129,8 +130,7 @@ def _views(fields: list[str], separator: str, place: str) -> list[_View]:
     message = _MESSAGE.match(separator.join(fields[len(_FIRST_FIELDS) :]))
     if message is None or not message[1].lower().endswith((*PHOTOGRAPHS, *VIDEOS)):
         return []
-    picture = message[1].strip('"').replace("\\", "/").rpartition("/")[2]
-    return [_View(_time(fields[3], place), fields[1], picture)]
+    return [_View(_time(fields[3], place), fields[1], file_name(message[1]))]
 
 
 def _picture_at(start: float, trial: str, views: list[_View]) -> str:

@@ -28,7 +28,8 @@ _MORE = ("target", "duration", *_EDGES, "found", "trial")
 """Further columns that a table may have; their fields may be empty."""
 
 _FIELDS = (*_COLUMNS, *_SIZE, *_MORE)
-_SCANPATH = ("picture", "subject", "target", "trial")  # fields that tell scanpaths apart
+SCANPATH = ("picture", "subject", "target", "trial")
+"""Fields that tell scanpaths apart."""
 
 _FOUND = {"true": True, "false": False, "1": True, "0": False, "": None}
 
@@ -238,18 +239,19 @@ def _check_columns(table: Table, names: Mapping[str, str], needed: Sequence[str]
     missing = [field for field in needed if names[field] not in table.columns]
     if not missing:
         return
+    error = next((kind for field, kind in _ERRORS.items() if field in missing), DataError)
+    got = f"none named {', '.join(names[field] for field in missing)}"
     among = ", ".join(map(repr, table.columns))[:300]
-    remedies = ["name them by columns={…}"]
-    # A side that is missing and another one have the same remedy.
-    arguments = dict.fromkeys(_ARGUMENTS[field] for field in missing if field in _ARGUMENTS)
-    if arguments:
-        remedies.append(f"give {', '.join(arguments)}")
-    errors = [kind for field, kind in _ERRORS.items() if field in missing]
-    error = errors[0] if errors else DataError
-    raise error(
-        f"{table.name}: expected the columns {', '.join(needed)}, got none named "
-        f"{', '.join(names[field] for field in missing)} among {among}; {' or '.join(remedies)}"
-    )
+    remedy = _remedy_of_missing(missing)
+    raise error(f"{table.name}: expected the columns {', '.join(needed)}, got {got} among {among}; {remedy}")
+
+
+def _remedy_of_missing(fields: Sequence[str]) -> str:
+    """Say what to do for fields whose columns are missing."""
+    remedy = "name them by columns={…}"
+    # Width and height have the same argument.
+    arguments = dict.fromkeys(_ARGUMENTS[field] for field in fields if field in _ARGUMENTS)
+    return f"{remedy} or give {', '.join(arguments)}" if arguments else remedy
 
 
 def name_pictures(rows: Sequence[Row], picture: str, table: str) -> None:
@@ -329,7 +331,7 @@ def records_of(table: str, rows: Sequence[Row], size: Size | None, coordinates: 
     previous = None
     for row in rows:
         fields = row.fields
-        scanpath = tuple(fields[name] for name in _SCANPATH)
+        scanpath = tuple(fields[name] for name in SCANPATH)
         begins_again = scanpath in groups and scanpath != previous
         # Without a trial, two viewings of a picture by one person would be taken for one.
         if begins_again and not fields["trial"]:

@@ -78,5 +78,7 @@ def _with_snapshots(table: Table) -> Table:
     viewed = [snapshot for snapshot in snapshots.values() if any(map(snapshot.has_fixation, table.rows))]
     if not viewed:
         return table
-    rows = [snapshot.row(row) for snapshot in viewed for row in table.rows]
+    rows: list[Row] = []
+    for snapshot in viewed:
+        rows += map(snapshot.row, table.rows)
     return table._replace(columns=[*table.columns, *_SNAPSHOT], rows=rows)
