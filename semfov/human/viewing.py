@@ -1,6 +1,7 @@
 """People who view pictures: their fixations, and the maps of the pictures, each looked at once."""
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -70,10 +71,11 @@ class ViewingData(Settings):
     @property
     def fingerprint(self) -> list[str]:
         """sha256 of the pictures and of the fixations in them, for each data set."""
-        return [
-            digest_of([Pictures(root, self.people(number), ()).fingerprint, sha256(self.fixations[number])])
-            for number, root in enumerate(self.pictures)
-        ]
+        digests = []
+        for number, root in enumerate(self.pictures):
+            pictures = Pictures(root, self.people(number), ())
+            digests.append(digest_of([pictures.fingerprint, sha256(self.fixations[number])]))
+        return digests
 
     def people(self, number: int) -> dict[str, list[Fixations]]:
         """Read the scanpaths of more than one fixation of a data set, by picture."""
@@ -114,20 +116,24 @@ class Viewed:
     @cached_property
     def paths(self) -> list[list[Tensor]]:
         """For each picture the first fixations of each person, `(n, 2)` in pixels of it."""
-        return [
-            [torch.from_numpy(scanpath.points[:LONGEST]).float() for scanpath in scanpaths] for scanpaths in self.people
-        ]
+        return [[*map(_first_points, scanpaths)] for scanpaths in self.people]
 
     def some(self, pictures: Sequence[int]) -> FeatureMaps:
         """Select the feature maps of some pictures, in single precision."""
         numbers = torch.as_tensor(pictures)
-        return replace(self.features, maps={name: maps[numbers].float() for name, maps in self.features.maps.items()})
+        chosen = {name: maps[numbers].float() for name, maps in self.features.maps.items()}
+        return replace(self.features, maps=chosen)
 
     @cached_property
     def counts(self) -> Tensor:
         """Numbers of fixations, without the first of each path, in the cells of each picture, `(P, rows, columns)`."""
         rows, columns = cells_of(self.size)
         return torch.stack([counted(paths, self.size, (rows, columns)).sum(0) for paths in self.paths])
+
+
+def _first_points(scanpath: Fixations) -> Tensor:
+    """Take the first fixations of a person, at most `LONGEST`, `(n, 2)`."""
+    return torch.from_numpy(scanpath.points[:LONGEST]).float()
 
 
 def counted(paths: Sequence[Tensor], size: tuple[int, int], cells: tuple[int, int]) -> Tensor:
@@ -270,20 +276,28 @@ def _unpack(tensors: Mapping[str, Tensor], layers: Sequence[str]) -> FeatureMaps
 
 def _grouped(looks: Iterable[_ViewedPicture], seconds: float = _SECONDS, source: int = 0) -> list[Viewed]:
     """Collect the pictures of one data set with the scanpaths in them, by the size of the pictures."""
-    by_size: dict[tuple[Placement, tuple[int, int]], list[_ViewedPicture]] = {}
+    features_by_size: dict[tuple[Placement, tuple[int, int]], list[FeatureMaps]] = defaultdict(list)
+    people_by_size: dict[tuple[Placement, tuple[int, int]], list[tuple[Fixations, ...]]] = defaultdict(list)
     with torch.inference_mode():
         for features, people in looks:
+            key = (features.placement, features.canvas)
+            features_by_size[key].append(features)
             # Fixations may be in pixels of another frame than the picture's.
             size = features.placement.size
-            scanpaths = tuple(scanpath.resized(size) for scanpath in people)
-            by_size.setdefault((features.placement, features.canvas), []).append((features, scanpaths))
+            people_by_size[key].append(tuple(scanpath.resized(size) for scanpath in people))
     groups = []
-    for pictures in by_size.values():
-        first, _ = pictures[0]
-        maps = {name: torch.cat([features.maps[name].half() for features, _ in pictures]) for name in first.maps}
-        features = replace(first, maps=maps, detections=Detections.empty(0, 0))
-        groups.append(Viewed(features, tuple(tuple(people) for _, people in pictures), seconds, source))
+    for key, features_of_pictures in features_by_size.items():
+        groups.append(Viewed(_joined(features_of_pictures), tuple(people_by_size[key]), seconds, source))
     return groups
+
+
+def _joined(features: Sequence[FeatureMaps]) -> FeatureMaps:
+    """Join the maps of several pictures of one size to a batch, in half precision."""
+    first = features[0]
+    maps = {}
+    for name in first.maps:
+        maps[name] = torch.cat([picture.maps[name].half() for picture in features])
+    return replace(first, maps=maps, detections=Detections.empty(0, 0))
 
 
 class Events(NamedTuple):

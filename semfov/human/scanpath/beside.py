@@ -22,6 +22,8 @@ _CELLS = 8  # rows and columns of the grid whose cells are the words of a scanpa
 _LONGEST = 64  # pixels along the longer side of a map of fixations
 _BLUR = 0.03  # standard deviation of the Gaussian around a fixation, in longer sides of the picture
 
+_DIMENSIONS = ("shape", "direction", "length", "position")  # of MultiMatch, those that need no durations
+
 _Points = NDArray[np.float64]
 _Measure = Callable[[_Points, Sequence[_Points]], float]
 """Compares the fixations of one scanpath with those of others."""
@@ -206,10 +208,8 @@ class _Measures:
 
     def by_name(self) -> dict[str, _Measure]:
         """List the measures by name, in the order of the table."""
-        return {
-            **{
-                f"MultiMatch {name}": self._multimatch_of(name) for name in ("shape", "direction", "length", "position")
-            },
+        of_multimatch = {f"MultiMatch {name}": self._multimatch_of(name) for name in _DIMENSIONS}
+        return of_multimatch | {
             "sequence score": _averaged(_unless_empty(sequence_score, self._words)),
             "edit distance": _averaged(_unless_empty(_share_of_edits, self._words)),
             "ScanMatch": _averaged(_unless_empty(self._scanmatch, self._inside)),
@@ -292,7 +292,7 @@ def _unless_empty(
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Average the finite ones of some values; NaN where there are none."""
+    """Average those of some values that are finite; NaN where there are none."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else float("nan")
 
