@@ -14,6 +14,7 @@ from semfov.data.vrt import open_raster
 from semfov.data.windowed import RASTERS
 from semfov.errors import DataError, needing
 from semfov.io.files import check_regular
+from semfov.paths.look import shorter_way
 
 PlaceOnEarth = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Longitude and latitude `(N, 2)` of points `(N, 2)` in pixels."""
@@ -153,10 +154,8 @@ def polygon_on_earth(ring: NDArray[np.float64], every: int = 1) -> Geometry:
 
 def _unwrapped(longitudes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Follow the longitudes of a ring of N corners without a jump of 360 degrees, back to the first one, `(N + 1,)`."""
-    steps = np.diff(longitudes, append=longitudes[0])
-    # A step from one corner to the next is the shorter way round the globe.
-    shorter_steps = (steps + 180) % 360 - 180
-    return longitudes[0] + np.concatenate([[0.0], np.cumsum(shorter_steps)])
+    steps = shorter_way(np.diff(longitudes, append=longitudes[0]), 360)
+    return longitudes[0] + np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _signed_area(corners: NDArray[np.float64]) -> float:

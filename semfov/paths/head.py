@@ -24,8 +24,16 @@ from semfov.kinds import HEAD
 from semfov.paths.base import Record
 from semfov.paths.conversion import COLUMNS, Values
 from semfov.paths.files import POSITIVE, Format, SharedFields, check_decided_cell
-from semfov.paths.look import LookView, RecordedLook, cell_columns, finite_or_none, read_region, whole_pixels
-from semfov.paths.merging import distances_to, merge_fixations
+from semfov.paths.look import (
+    LookView,
+    RecordedLook,
+    cell_columns,
+    finite_or_none,
+    pixels_in,
+    read_region,
+    shorter_way,
+)
+from semfov.paths.merging import FixationBoxes, distances_to, merge_fixations
 from semfov.paths.stimulus import LONGEST
 from semfov.paths.words import Words
 from semfov.sensor.sphere import Boxes, Regions, panorama_directions
@@ -164,11 +172,8 @@ def head_looks(
 ) -> tuple[HeadLook, ...]:
     """Make the looks of a head from their columns (`head_look`); values that are not known are infinite."""
     values = values or [math.inf] * len(actions)
-    columns = zip(actions, in_views, maps, seconds, values, strict=True)
-    return tuple(
-        head_look(views, action, in_view, map_after, number, time, value)
-        for number, (action, in_view, map_after, time, value) in enumerate(columns)
-    )
+    columns = zip(actions, in_views, maps, range(len(actions)), seconds, values, strict=True)
+    return tuple(head_look(views, *look) for look in columns)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
@@ -234,13 +239,11 @@ class HeadPath(Record):
         the picture and ends beyond its right border. Of several boxes of one object, one that no border of the view
         cuts is kept, and of these the box of the nearest fixation.
         """
-        return merge_fixations(
-            [look.detections for look in self.looks],
-            [self._distances_to_gaze(look) for look in self.looks],
-            self.closer,
-            cut=[self._cut_by_border(look) for look in self.looks],
-            around=self.around,
-        )
+        fixations = []
+        for look in self.looks:
+            distances = self._distances_to_gaze(look)
+            fixations.append(FixationBoxes(look.detections, distances, look.index, self._cut_by_border(look)))
+        return merge_fixations(fixations, self.closer, around=self.around)
 
     def _distances_to_gaze(self, look: HeadLook) -> Tensor:
         """Compute the distance in degrees from the gaze to the boxes of a look, `(L,)`."""
@@ -376,11 +379,7 @@ class HeadPath(Record):
         """Cut the view of a look out of a flat picture `(3, H, W)` in any size, at the size of a view."""
         height, width = image.shape[-2:]
         # Regions are in pixels of the picture that was looked at.
-        scale_x = width / self.size[0]
-        scale_y = height / self.size[1]
-        x1, y1, x2, y2 = look.region
-        region = (x1 * scale_x, y1 * scale_y, x2 * scale_x, y2 * scale_y)
-        left, top, right, bottom = whole_pixels(region, (width, height))
+        left, top, right, bottom = pixels_in((width, height), look.region, self.size)
         window = image[None, :, top:bottom, left:right]
         return resize(window, self.views.world.size)[0].clamp(0, 1)
 
@@ -419,8 +418,8 @@ class HeadPath(Record):
 
 def _unwrapped(x: Tensor, around: float) -> Tensor:
     """Join the columns `(P,)` of a closed line, each the shorter way round from the one before, across the seam."""
-    step = (x.diff() + around / 2) % around - around / 2  # (P - 1,), from -around / 2 to around / 2
-    return torch.cat([x[:1], x[:1] + step.cumsum(0)])
+    steps = shorter_way(x.diff(), around)  # (P - 1,)
+    return torch.cat([x[:1], x[:1] + steps.cumsum(0)])
 
 
 def _views_of_file(record: Values) -> Views:

@@ -3,8 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.belief.grid import Grid
@@ -14,6 +16,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import box_text
 
 Box = tuple[float, float, float, float]  # `(x1, y1, x2, y2)`
+_Steps = TypeVar("_Steps", Tensor, NDArray[np.float64])
 CONFIDENT = 0.1  # score from which on the detections of a look are counted, named and drawn
 
 
@@ -98,13 +101,37 @@ def read_region(source: LargePicture, region: Sequence[float], size: tuple[int, 
     Returns:
         `(3, h, w)` in [0, 1].
     """
-    x1, y1, x2, y2 = region
-    width, height = source.size
-    scale_x = width / size[0]
-    scale_y = height / size[1]
-    frame = whole_pixels((x1 * scale_x, y1 * scale_y, x2 * scale_x, y2 * scale_y), source.size)
+    frame = pixels_in(source.size, region, size)
     left, _, right, _ = frame
     return source.read(frame, reduction_for((right - left) // across)).float() / 255
+
+
+def pixels_in(
+    size: tuple[int, int], region: Sequence[float], size_of_record: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Find the whole pixels of a picture that a region covers, which is in pixels of the same picture in another size.
+
+    Args:
+        size: `(width, height)` of the picture.
+        region: `(x1, y1, x2, y2)`.
+        size_of_record: `(width, height)` of the picture that the region is in.
+
+    Returns:
+        Left, top, right and bottom edge.
+    """
+    x1, y1, x2, y2 = region
+    scale_x = size[0] / size_of_record[0]
+    scale_y = size[1] / size_of_record[1]
+    return whole_pixels((x1 * scale_x, y1 * scale_y, x2 * scale_x, y2 * scale_y), size)
+
+
+def shorter_way(steps: _Steps, around: float) -> _Steps:
+    """Take the shorter way round a closed line: steps from -around / 2 to around / 2 that lead to the same place.
+
+    >>> shorter_way(np.array([350.0, -10.0]), 360).tolist()
+    [-10.0, -10.0]
+    """
+    return (steps + around / 2) % around - around / 2
 
 
 def cell_columns(grid: Grid, cell: int, belief: Tensor | None) -> dict[str, float | None]:
@@ -153,13 +180,13 @@ def detections_in_words(
     scores = confident.confidence[0].tolist()
     names = [f"{classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
     if target is not None and bool(detections.mask.any()):
-        target_scores = detections.class_scores[0, :, target - 1]
+        target_scores = detections.class_scores[0, :, target - 1]  # (L,)
         best = int(target_scores.argmax())
         name = f"{classes[target]} {target_scores[best]:.2f}"
+        # It is named with its box, and not again among the others.
         if name in names:
-            # It is named with its box below, and not again among the others.
             names.remove(name)
-        names.insert(0, f"{name} in {box_text(detections.boxes[0, best].tolist())}")
+        names = [f"{name} in {box_text(detections.boxes[0, best].tolist())}", *names]
     if not names:
         return "nothing"
     named = ", ".join(names[:most])

@@ -1,6 +1,7 @@
 """Objects of a record, merged from the detections of its looks."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,14 +11,24 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import FAINTEST, Objects, merge_looks
 
 
+class FixationBoxes(NamedTuple):
+    """The detections of a fixation, as they are merged.
+
+    Attributes:
+        detections: a batch of one, of L boxes.
+        distances: `(L,)`, distances of the fixation to the boxes.
+        look: index of the look.
+        cut: `(L,)` boolean, boxes that the border of the view cuts; None for none.
+    """
+
+    detections: Detections
+    distances: Tensor
+    look: int
+    cut: Tensor | None = None
+
+
 def merge_fixations(
-    looks: Sequence[Detections],
-    distances: Sequence[Tensor],
-    closer: Sequence[CloseUp] = (),
-    *,
-    cut: Sequence[Tensor] | None = None,
-    around: float | None = None,
-    numbers: Sequence[int] | None = None,
+    fixations: Iterable[FixationBoxes], closer: Sequence[CloseUp] = (), *, around: float | None = None
 ) -> Objects:
     """Merge the detections of fixations and of closer looks into objects.
 
@@ -25,22 +36,14 @@ def merge_fixations(
     looks are sharper still.
 
     Args:
-        looks: detections of each look, batches of one.
-        distances: `(L,)` for each look, distances of the fixation to the boxes.
+        fixations: the detections of each.
         closer: closer looks.
-        cut: `(L,)` boolean for each look, boxes that the border of the view cuts; None for none.
         around: width in pixels after which the picture repeats; None for other pictures.
-        numbers: number of each of the looks; None for 0 to n - 1.
 
     Returns:
         The objects from score 0.05 on, most confident first.
     """
-    if numbers is None:
-        numbers = range(len(looks))
-    if cut is None:
-        cut = [torch.zeros_like(detections.mask[0]) for detections in looks]
-    columns = zip(looks, distances, cut, numbers, strict=True)
-    rows = [_columns_of_fixation(*fixation) for fixation in columns]
+    rows = [_columns_of_fixation(fixation) for fixation in fixations]
     rows += [_columns_of_closer_look(look) for look in closer]
     if not rows:
         return Objects.none()
@@ -48,13 +51,15 @@ def merge_fixations(
     return merge_looks(*merged, score=0.0, around=around).above(FAINTEST)
 
 
-def _columns_of_fixation(detections: Detections, distances: Tensor, cut: Tensor, number: int) -> list[Tensor]:
+def _columns_of_fixation(fixation: FixationBoxes) -> list[Tensor]:
     """Make the columns that `merge_looks` takes of the detections of a fixation, the nearer the sharper."""
+    detections = fixation.detections
     confidence = detections.confidence[0]  # (L,), as all columns but the boxes
     chosen = detections.mask[0] & (confidence >= FAINTEST)
-    numbers = torch.full_like(chosen, number, dtype=torch.int64)
+    looks = torch.full_like(chosen, fixation.look, dtype=torch.int64)
+    cut = torch.zeros_like(chosen) if fixation.cut is None else fixation.cut
     # The last one is the sharpness: a fovea shows most where it looks.
-    columns = (detections.boxes[0], confidence, detections.labels[0], numbers, cut, -distances)
+    columns = (detections.boxes[0], confidence, detections.labels[0], looks, cut, -fixation.distances)
     return [column[chosen].detach().cpu() for column in columns]
 
 

@@ -22,7 +22,7 @@ from semfov.kinds import LookKind
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
-from semfov.paths.merging import distances_to, merge_fixations
+from semfov.paths.merging import FixationBoxes, distances_to, merge_fixations
 
 _DOUBTFUL = 0.1  # probability from which on an absent target is only probably absent
 _CONFIRMING = 0.5  # probability from which on a closer look confirms that the target is there
@@ -113,7 +113,8 @@ class Outcome(ABC):
     @property
     def seconds(self) -> tuple[Any, ...]:
         """Time at the end of each look, on the clock of the episode; empty if the times are not known."""
-        return () if any(look.seconds is None for look in self.looks) else tuple(look.seconds for look in self.looks)
+        times = tuple(look.seconds for look in self.looks)
+        return () if None in times else times
 
     def __iter__(self) -> Iterator[RecordedLook]:
         """Go through the looks in their order."""
@@ -129,11 +130,9 @@ class Outcome(ABC):
             return self.looks[index]
         remedy = ""
         if isinstance(index, str):
-            is_attribute = hasattr(type(self), index) or index in vars(self)
-            named = (
-                f"it is record.{index}" if is_attribute else f"its objects of a class are record.objects.of({index!r})"
-            )
-            remedy = f"; {named}"
+            remedy = f"; its objects of a class are record.objects.of({index!r})"
+            if hasattr(type(self), index) or index in vars(self):
+                remedy = f"; it is record.{index}"
         raise InputError(f"record: expected the place of a look, from 0, got {index!r}{remedy}")
 
     def _place(self, index: int, argument: str = "index") -> int:
@@ -215,10 +214,12 @@ class Outcome(ABC):
 
         A closer look is nearer still; its score is the probability that the target is there.
         """
-        looks = [look.detections for look in self.fixated]
-        points = [torch.tensor(look.fixation, dtype=torch.float64) for look in self.fixated]
-        distances = [distances_to(look.boxes[0], point) for look, point in zip(looks, points, strict=True)]
-        return merge_fixations(looks, distances, self.closer, numbers=[look.index for look in self.fixated])
+        fixations = []
+        for look in self.fixated:
+            point = torch.tensor(look.fixation, dtype=torch.float64)
+            distances = distances_to(look.detections.boxes[0], point)
+            fixations.append(FixationBoxes(look.detections, distances, look.index))
+        return merge_fixations(fixations, self.closer)
 
     @property
     def objects(self) -> Objects:
@@ -242,13 +243,8 @@ class Outcome(ABC):
     @property
     def refuted(self) -> list[CloseUp]:
         """The closer looks that did not confirm that the target is there."""
-        boxes = [place.box for place in self._confirmed_places]
-        refuted = []
-        for look in self.closer:
-            is_confirmed = any(look.box.equal(box) for box in boxes)
-            if not is_confirmed:
-                refuted.append(look)
-        return refuted
+        confirmed = [place.box for place in self._confirmed_places]
+        return [look for look in self.closer if not any(map(look.box.equal, confirmed))]
 
     @property
     def expected(self) -> dict[str, float]:

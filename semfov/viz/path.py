@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.paths import Record
-from semfov.paths.look import Box
+from semfov.paths import Record, RecordedLook
+from semfov.paths.look import Box, shorter_way
 from semfov.viz.drawing import lightness, per_point
 from semfov.viz.labels import LabelBox, place_numbers
 from semfov.viz.style import FOUND, GAZE, TIME
@@ -37,22 +37,26 @@ class LookPath:
         self.number_boxes: list[LabelBox] = []
         self._outlines: list[tuple[int, Line2D]] = []
         self._numbers: list[tuple[int, Text]] = []
-        width = record.around
         if record.kind.path:
             points = np.array([look.fixation for look in record]).reshape(-1, 2)  # also without a look
-            self.gaze = GazePath(axes, points, record.size, found=record.found, around=width)
+            self.gaze = GazePath(axes, points, record.size, found=record.found, around=record.around)
             self.number_boxes = self.gaze.number_boxes
         for look in record:
-            border = record.outline(look)
-            if border is None:
-                continue
-            x, y = border.numpy().T
-            # The picture of a panorama repeats, so that an outline over its seam is drawn at both ends.
-            for shift in (0.0,) if width is None else (-width, 0.0, width):
-                (line,) = axes.plot(x + shift, y, color=GAZE, linewidth=0.8, scalex=False, scaley=False)
-                self._outlines.append((look.index, line))
+            self._draw_outline(axes, record, look)
         if self.gaze is None:
             self._write_numbers(axes, record)
+
+    def _draw_outline(self, axes: Axes, record: Record, look: RecordedLook) -> None:
+        """Draw the border of what a look shows, unless it shows the whole picture."""
+        border = record.outline(look)
+        if border is None:
+            return
+        x, y = border.numpy().T
+        # The picture of a panorama repeats, so that an outline over its seam is drawn at both ends.
+        shifts = (0.0,) if record.around is None else (-record.around, 0.0, record.around)
+        for shift in shifts:
+            (line,) = axes.plot(x + shift, y, color=GAZE, linewidth=0.8, scalex=False, scaley=False)
+            self._outlines.append((look.index, line))
 
     def _write_numbers(self, axes: Axes, record: Record) -> None:
         """Write the number of each look that shows a part of the picture into its outline."""
@@ -237,5 +241,5 @@ def _saccades(path: NDArray[np.float64], around: float | None) -> list[NDArray[n
     if around is None:
         return [np.stack([starts, ends], 1)]
     steps = ends - starts
-    steps[:, 0] = (steps[:, 0] + around / 2) % around - around / 2
+    steps[:, 0] = shorter_way(steps[:, 0], around)
     return [np.stack([starts, starts + steps], 1), np.stack([ends - steps, ends], 1)]
