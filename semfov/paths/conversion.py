@@ -363,9 +363,8 @@ class Conversion(Outcome, OtherWords):
         """
         width, height = self.size
         lines = []
-        for label, (x1, y1, x2, y2) in zip(
-            self.objects.labels.tolist(), self._boxes_inside(self.objects.boxes), strict=True
-        ):
+        boxes = self._boxes_inside(self.objects.boxes)
+        for label, (x1, y1, x2, y2) in zip(self.objects.labels.tolist(), boxes, strict=True):
             middle = f"{(x1 + x2) / 2 / width:.6f} {(y1 + y2) / 2 / height:.6f}"
             extent = f"{(x2 - x1) / width:.6f} {(y2 - y1) / height:.6f}"
             lines.append(f"{label - 1} {middle} {extent}\n")

@@ -66,11 +66,9 @@ class FoveaLooks:
             The look.
         """
         x, y = point
-        width, height = (int(side) for side in self.grid.extent)
-        whole_picture = (0.0, 0.0, float(width), float(height))
         self._probability = probability
         self._presence = presence
-        return self._add((x, y), whole_picture, detections, stages, value, cell, is_closer=False)
+        return self._add((x, y), _whole_picture(self.grid), detections, stages, value, cell, is_closer=False)
 
     def look_closely(
         self, cell: int, region: Sequence[float], detections: Detections, stages: Mapping[str, float], value: float
@@ -119,6 +117,12 @@ class FoveaLooks:
         return look
 
 
+def _whole_picture(grid: Grid) -> Box:
+    """Find the region of the whole picture, all of which a fovea shows, in whole pixels."""
+    width, height = (int(side) for side in grid.extent)
+    return 0.0, 0.0, float(width), float(height)
+
+
 def moment_look(
     grid: Grid, number: int, cell: int, detections: Detections, probability: Tensor, stages: Mapping[str, float]
 ) -> FoveaLook:
@@ -133,11 +137,10 @@ def moment_look(
         stages: seconds by stage.
     """
     x, y = grid.centres[cell].tolist()
-    width, height = (int(side) for side in grid.extent)
     return FoveaLook(
         index=0,
         fixation=(x, y),
-        region=(0.0, 0.0, float(width), float(height)),
+        region=_whole_picture(grid),
         detections=detections,
         seconds=sum(stages.values()),
         more={"frame": number, **cell_columns(grid, cell, probability)},

@@ -26,6 +26,7 @@ class MadeWhenRead:
             if self._default is _NONE:
                 raise AttributeError(self._name)
             return self._default
+        # The function, until it was called, and what it made stand under one name.
         values = vars(record)
         if callable(values[self._name]):
             values[self._name] = values[self._name]()

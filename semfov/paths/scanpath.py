@@ -354,6 +354,7 @@ class Scanpath(_CellRecord):
         if closer:
             tensors["closer_regions"] = torch.tensor([look.region for look in closer], dtype=torch.float64)
             tensors["closer_values"] = torch.tensor([look.value for look in closer], dtype=torch.float64)
+        # Files of records without the photograph have these values, too.
         record |= {"placement": None, "settings": None}
         if self.stimulus is not None:
             tensors["canvas"] = self.stimulus.canvas

@@ -69,10 +69,10 @@ class Words(ABC):
     def task(self) -> str:
         """What was asked, in a few words, such as `search for “cup”`."""
         record = self.record
-        names = ", ".join(f"“{record.classes[label]}”" for label in record.sought)
-        if not names:
+        if not record.sought:
             return "what is where"
-        return f"search for {names}" if record.target is not None and not record.targets else f"all objects: {names}"
+        names = ", ".join(f"“{record.classes[label]}”" for label in record.sought)
+        return f"all objects: {names}" if record.targets else f"search for {names}"
 
     @property
     def measure(self) -> str:
@@ -151,8 +151,9 @@ class Words(ABC):
     def _is_seen_clearly(self) -> bool:
         """Whether a candidate or a closer look has at least one half for the target."""
         record = self.record
-        places = [look.place for look in record.closer]
-        return max([*record.candidates.of(record.sought).scores.tolist(), *places], default=0.0) >= _CLEAR
+        chances = [look.place for look in record.closer]
+        chances += record.candidates.of(record.sought).scores.tolist()
+        return max(chances, default=0.0) >= _CLEAR
 
     @property
     def best_place(self) -> str:
