@@ -20,9 +20,9 @@ from semfov.viz.drawing import (
     draw_cross,
     draw_grey,
     draw_scale,
-    rows_and_columns,
+    make_panels,
 )
-from semfov.viz.style import PROBABILITY, make_figure, root, styled
+from semfov.viz.style import PROBABILITY, root, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,26 +92,23 @@ def plot_belief(
         save_figure(plot_belief(scanpath, None, most=4, columns=2), "beliefs.pdf")
     """
     check_foveal(scanpath)
-    check(columns >= 1, "columns", "at least 1", columns)
     if fixation is None:
         fixations = choose_fixations(scanpath, most)
     else:
         fixations = [check_fixation(len(scanpath.fixated), fixation)]
+
+    def size(rows: int, columns: int) -> tuple[float, float]:
+        return _inches_of_panels(scanpath, rows, columns) if fixation is None else (5.6, 4.6)
+
     photograph = scanpath.image if image is None else image
-    rows, columns = rows_and_columns(len(fixations), columns, axes)
-    width, height = (5.6, 4.6) if fixation is not None else _inches_of_panels(scanpath, rows, columns)
-    figure, panels = make_figure(rows, columns, width=width, height=height, layout="compressed", axes=axes)
-    used = panels[: len(fixations)]
-    for panel, number in zip(used, fixations, strict=True):
+    panels = make_panels(len(fixations), columns, size, axes)
+    for panel, number in zip(panels, fixations, strict=True):
         drawn = draw_belief(panel, scanpath, number, target, photograph)
         if fixation is None:
             panel.set_title(f"fixation {number + 1}: {panel.get_title()}", parse_math=False)
     _, name = class_posterior(scanpath, target)
-    draw_scale(used, drawn, f"probability of {name}")
-    unused = panels[len(fixations) :]  # the end of the last row
-    for panel in unused:
-        panel.remove()
-    return figure
+    draw_scale(panels, drawn, f"probability of {name}")
+    return root(panels[0])
 
 
 def _inches_of_panels(scanpath: Scanpath, rows: int, columns: int) -> tuple[float, float]:

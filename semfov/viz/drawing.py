@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +18,7 @@ from semfov.detection.detections import Detections
 from semfov.errors import InputError, check, check_shape
 from semfov.paths import Record
 from semfov.viz.labels import LabelBox, place_labels
-from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours, root
+from semfov.viz.style import GAZE, OTHER, TARGET, make_figure, overlay_colours, root
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -102,11 +102,31 @@ def draw_grey(axes: Axes, image: Tensor | None, grid: Grid) -> None:
         draw_image(axes, image, grid, grey=True)
 
 
-def rows_and_columns(count: int, columns: int, axes: Sequence[Axes] | None) -> tuple[int, int]:
-    """Arrange panels in rows of at most so many columns; given axes count as one row."""
+def make_panels(
+    count: int, columns: int, size: Callable[[int, int], tuple[float, float]], axes: Sequence[Axes] | None
+) -> list[Axes]:
+    """Make a figure with panels in rows of some columns, or use the given axes.
+
+    Args:
+        count: number of panels.
+        columns: largest number of panels in a row; given axes count as one row.
+        size: computes `(width, height)` of the figure in inches from the numbers of rows and columns.
+        axes: axes to use, one for each panel; None makes them.
+
+    Returns:
+        The panels, row by row.
+
+    Raises:
+        InputError: there is no column, or there are too few or too many axes.
+    """
+    check(columns >= 1, "columns", "at least 1", columns)
     columns = count if axes is not None else min(columns, count)
     rows = -(-count // columns)  # rounded up
-    return rows, columns
+    width, height = size(rows, columns)
+    _, panels = make_figure(rows, columns, width, height, layout="compressed", axes=axes)
+    for panel in panels[count:]:  # the end of the last row
+        panel.remove()
+    return panels[:count]
 
 
 def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = None, **style: Any) -> AxesImage:

@@ -14,7 +14,7 @@ from semfov.errors import check, checked_keywords
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import LookView
 from semfov.viz.belief import draw_belief
-from semfov.viz.drawing import check_foveal, choose_fixations, draw_image, draw_scale, photograph_of, rows_and_columns
+from semfov.viz.drawing import check_foveal, choose_fixations, draw_image, draw_scale, make_panels, photograph_of
 from semfov.viz.look import draw_view
 from semfov.viz.objects import (
     LegendEntry,
@@ -149,20 +149,18 @@ def plot_foveated_strip(
         save_figure(plot_foveated_strip(scanpath, most=4), "views.png")
     """
     views = _views(scanpath, views)
-    check(columns >= 1, "columns", "at least 1", columns)
     fixations = choose_fixations(scanpath, most)
-    rows, columns = rows_and_columns(len(fixations), columns, axes)
     aspect = views[0].shape[-2] / views[0].shape[-1]
-    height = rows * (2.6 * aspect + 0.3)
-    figure, panels = make_figure(rows, columns, width=2.6 * columns, height=height, layout="compressed", axes=axes)
-    for panel, fixation in zip(panels, fixations, strict=False):
+
+    def size(rows: int, columns: int) -> tuple[float, float]:
+        return 2.6 * columns, rows * (2.6 * aspect + 0.3)
+
+    panels = make_panels(len(fixations), columns, size, axes)
+    for panel, fixation in zip(panels, fixations, strict=True):
         draw_image(panel, views[fixation], scanpath.grid)
         panel.set_title(f"fixation {fixation + 1}")
-    unused = panels[len(fixations) :]
-    for panel in unused:
-        panel.remove()
     _label_views(panels, scanpath, fixations, views)
-    return figure
+    return root(panels[0])
 
 
 @styled
@@ -240,7 +238,7 @@ def _views(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tenso
 def _label_views(panels: Sequence[Axes], scanpath: Scanpath, fixations: Sequence[int], views: Sequence[Tensor]) -> None:
     """Draw gaze and detections into views, after the layout of the figure, on which the positions of labels depend."""
     lay_out(root(panels[0]))
-    for axes, fixation in zip(panels, fixations, strict=False):
+    for axes, fixation in zip(panels, fixations, strict=True):
         look = scanpath.fixated[fixation]
         view = LookView(views[fixation], scanpath.size, look.detections.boxes[0], look.fixation)
         draw_view(axes, scanpath, look, view, most=6)
