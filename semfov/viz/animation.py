@@ -62,6 +62,10 @@ class Film:
             return [path]
         return [path, _save_mp4(ffmpeg, self.frames, path.with_suffix(".mp4"), self.seconds, self.hold)]
 
+    def saved(self, path: str | PathLike[str] | None) -> Path | Film:
+        """Write the film, and return the path of the GIF; without a path return the film itself."""
+        return self if path is None else self.save(path)[0]
+
     def _repr_html_(self) -> str:
         """Show the film in a notebook."""
         from html import escape
@@ -115,8 +119,7 @@ def animate(
     with rc_context(STYLE):
         figure = LookFigure(scanpath, picture, shown[0], boxes)  # one for all frames
         frames = render(figure.show(number, view) for number, view in enumerate(shown))
-    film = Film(frames, seconds, hold, scanpath.describe())
-    return film if path is None else film.save(path)[0]
+    return Film(frames, seconds, hold, scanpath.describe()).saved(path)
 
 
 def render(figures: Iterable[Figure], dpi: int = 90) -> list[_Frame]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 from semfov.viz.style import COLOURS, make_figure, styled
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _MARKERS = ("o", "s", "^")
@@ -38,24 +39,33 @@ def plot_comparison(points: Sequence[ComparedPoint], measure: str = "AP50") -> F
         The figure.
     """
     figure, (axes,) = make_figure(1, 1, 5.2, 3.4, layout="constrained")
-    ways = dict.fromkeys(point.way for point in points)
-    for number, way in enumerate(ways):
-        judged = [point for point in points if point.way == way and point.ap50 is not None]
-        seconds = [point.seconds for point in judged]
-        heights = [point.ap50 or 0.0 for point in judged]
-        colour = COLOURS[number % len(COLOURS)]
-        axes.plot(seconds, heights, marker=_MARKERS[number % len(_MARKERS)], color=colour, label=way)
-        for point, x, y in zip(judged, seconds, heights, strict=True):
-            # A little above the point.
-            axes.annotate(
-                f"{point.passes:.3g}",
-                (x, y),
-                xytext=(0, 5),
-                textcoords="offset points",
-                ha="center",
-                color=colour,
-                fontsize=7,
-            )
+    points_of_way: dict[str, list[ComparedPoint]] = {}
+    for point in points:
+        points_of_way.setdefault(point.way, []).append(point)
+    for number, (way, points_in_order) in enumerate(points_of_way.items()):
+        marker = _MARKERS[number % len(_MARKERS)]
+        _draw_way(axes, way, points_in_order, COLOURS[number % len(COLOURS)], marker)
     axes.set(xlabel="seconds a picture", ylabel=measure, xlim=(0, None), ylim=(0, 1.1))
     axes.legend(loc="lower right")
     return figure
+
+
+def _draw_way(axes: Axes, way: str, points: Sequence[ComparedPoint], colour: str, marker: str) -> None:
+    """Draw the points of a way of looking, those without a precision left out, with a line from one to the next."""
+    seconds = []
+    precisions = []
+    for point in points:
+        if point.ap50 is None:
+            continue
+        seconds.append(point.seconds)
+        precisions.append(point.ap50)
+        axes.annotate(
+            f"{point.passes:.3g}",
+            (point.seconds, point.ap50),
+            xytext=(0, 5),  # a little above the point
+            textcoords="offset points",
+            ha="center",
+            color=colour,
+            fontsize=7,
+        )
+    axes.plot(seconds, precisions, marker=marker, color=colour, label=way)

@@ -71,15 +71,21 @@ def plot_gaze(
         axes.plot(*points.T, "-o", color=line_style(order, len(scanpaths))["color"], markersize=3, linewidth=1)
     if areas is not None:
         draw_areas(axes, prediction, areas)
-    lines = [f"Where people look in {prediction.name}: {BORDERS}"]
     if cells is None:
         draw_first_fixations(axes, prediction)
-        lines.append(f"1 to {_FIRST}: the first fixations, in order")
-    if prediction.caution is not None:
-        lines.append(f"Caution: {prediction.caution}")
     if title:
-        axes.set_title("\n".join(fill(line, 84) for line in lines), parse_math=False)
+        axes.set_title(_title_of(prediction, has_numbers=cells is None), parse_math=False)
     return figure
+
+
+def _title_of(prediction: GazePrediction, *, has_numbers: bool) -> str:
+    """Say in lines what is drawn, also by numbers, and what speaks against the prediction."""
+    sentences = [f"Where people look in {prediction.name}: {BORDERS}"]
+    if has_numbers:
+        sentences.append(f"1 to {_FIRST}: the first fixations, in order")
+    if prediction.caution is not None:
+        sentences.append(f"Caution: {prediction.caution}")
+    return "\n".join(fill(sentence, 84) for sentence in sentences)
 
 
 def draw_gaze(axes: Axes, prediction: GazePrediction, cells: Tensor) -> None:
@@ -192,5 +198,4 @@ def animate_gaze(
         return figure
 
     frames = render(frame(number) for number in range(max(map(len, viewers)) + 1))
-    film = Film(frames, seconds, hold, prediction.describe())
-    return film if path is None else film.save(path)[0]
+    return Film(frames, seconds, hold, prediction.describe()).saved(path)

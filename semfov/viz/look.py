@@ -140,34 +140,40 @@ class LookFigure:
         boxes: Tensor | None = None,
         axes: Sequence[Axes] | None = None,
     ) -> None:
+        self.record = record
+        # An exploration with a fovea has a map of all classes, in which regions are named.
+        self._names_regions = record.kind.grid and record.target is None
         believed = record.belief_map(0)
         panels = 2 if believed is None else 3
-        aspect = image.shape[-2] / image.shape[-1]
-        width = 4.2 * min(max(1.0, 0.7 / aspect), 2.0)  # inches; panels of panoramas are wider, not flat
-        height = max(width * aspect / 1.05 + 0.3, 3.4)  # the view keeps its height beside a flat panorama
-        self.record = record
-        self.figure, self.axes = make_figure(1, panels, width * panels, height, layout="compressed", axes=axes)
-        if axes is None:
-            # Hidden axes save the layout of ticks, a tenth of the time.
-            for panel in self.axes:
-                panel.xaxis.set_visible(False)
-                panel.yaxis.set_visible(False)
+        self.figure, self.axes = self._open(panels, image.shape[-2] / image.shape[-1], axes)
         path_axes, view_axes = self.axes[:2]
         draw_place(path_axes, record, image, boxes)
         draw_legend(path_axes, annotation_entries(record, boxes))
         path_axes.set_title("look 1")
         self.view = view_axes.imshow(picture_array(view.pixels), interpolation="bilinear")
         view_axes.set(xticks=[], yticks=[], title="what the eye sees")
-        # An exploration with a fovea has a map of all classes, in which regions are named.
-        self._names_regions = record.kind.grid and record.target is None
         if believed is not None:
             self._draw_belief(image, *believed)
+        # Numbers and labels are placed by the size of the axes.
         lay_out(self.figure)
         if axes is None:
             # The layout does not change any more, and computing it again takes as long as drawing.
             self.figure.set_layout_engine("none")
         self.path = LookPath(path_axes, record)
         self.changing: list[Artist] = []
+
+    @staticmethod
+    def _open(panels: int, aspect: float, axes: Sequence[Axes] | None) -> tuple[Figure, list[Axes]]:
+        """Make a figure with panels in a row for a picture of some height over width, or use the given axes."""
+        width = 4.2 * min(max(1.0, 0.7 / aspect), 2.0)  # inches; panels of panoramas are wider, not flat
+        height = max(width * aspect / 1.05 + 0.3, 3.4)  # the view keeps its height beside a flat panorama
+        figure, opened = make_figure(1, panels, width * panels, height, layout="compressed", axes=axes)
+        if axes is None:
+            # Hidden axes save the layout of ticks, a tenth of the time.
+            for panel in opened:
+                panel.xaxis.set_visible(False)
+                panel.yaxis.set_visible(False)
+        return figure, opened
 
     def _draw_belief(self, image: Tensor, grid: Grid, chances: Tensor) -> None:
         """Draw the belief over the grey picture, with the scale of its colours."""

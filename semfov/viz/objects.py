@@ -134,18 +134,23 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
     """
     if last is None:
         last = len(record)
-    marks = [Mark(_corners(look.box), FOUND, ":", 1.6) for look in record.refuted if look.index_of_look <= last]
+    refuted = [look.box for look in record.refuted if look.index_of_look <= last]
+    marks = [Mark(_corners(box), FOUND, ":", 1.6) for box in refuted]
     rows = [row for row in record.object_rows() if row["look"] - 1 <= last]
     many = len(rows) > _NAMED
     for row in reversed(rows):
         marks += _marks_of_object(row, record, many=many)
-    is_over = last >= len(record) - 1
-    if record.best_place is not None and is_over:
-        best, chance = record.best_place
-        has_label = bool((record.objects.boxes == best).all(-1).any())
-        text = None if has_label else f"best place {chance:.2f}"
-        marks.append(Mark(_corners(best), FOUND, "--", 2.4, text))
+    # Before the last look nothing is decided, so that no place is the best one.
+    if record.best_place is not None and last >= len(record) - 1:
+        marks.append(_mark_of_best_place(record, *record.best_place))
     return marks
+
+
+def _mark_of_best_place(record: Record, box: Tensor, chance: float) -> Mark:
+    """Make the box of the best place, without a label where an object with the same box has one."""
+    has_label = bool((record.objects.boxes == box).all(-1).any())
+    text = None if has_label else f"best place {chance:.2f}"
+    return Mark(_corners(box), FOUND, "--", 2.4, text)
 
 
 def _marks_of_object(row: Values, record: Record, *, many: bool) -> list[Mark]:

@@ -107,6 +107,9 @@ def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tens
     return drawn
 
 
+_Line = list[tuple[float, float]]
+
+
 def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artist]:
     """Draw borders and names of regions, each name on a cell where it covers no other.
 
@@ -121,7 +124,9 @@ def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artis
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
-    sides = [side for region in regions for side in _borders(grid, region.cells)]
+    sides: list[_Line] = []
+    for region in regions:
+        sides += _borders(grid, region.cells)
     borders = LineCollection(sides, colors="white")
     borders.set(linewidths=1.3, zorder=3)
     drawn: list[Artist] = [axes.add_collection(borders, autolim=False)]
@@ -147,25 +152,19 @@ def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artis
     return drawn
 
 
-_Line = list[tuple[float, float]]
-
-
 def _borders(grid: Grid, region: Sequence[int]) -> list[_Line]:
     """List the sides of cells that bound a region."""
-    cells = set(region)
+    places = {divmod(cell, grid.columns) for cell in region}  # rows and columns
     edges = grid.edges.tolist()
-    lines = []
+    lines: list[_Line] = []
     for cell in region:
-        column = cell % grid.columns
+        row, column = divmod(cell, grid.columns)
         x1, y1, x2, y2 = edges[cell]
-        is_first = column == 0
-        is_last = column == grid.columns - 1
-        # Beyond the ends of a row are cells of other rows; above and below the grid are numbers that no cell has.
-        neighbours: list[tuple[int | None, _Line]] = [
-            (None if is_first else cell - 1, [(x1, y1), (x1, y2)]),
-            (None if is_last else cell + 1, [(x2, y1), (x2, y2)]),
-            (cell - grid.columns, [(x1, y1), (x2, y1)]),
-            (cell + grid.columns, [(x1, y2), (x2, y2)]),
-        ]
-        lines += [side for neighbour, side in neighbours if neighbour not in cells]
+        side_towards: dict[tuple[int, int], _Line] = {
+            (row, column - 1): [(x1, y1), (x1, y2)],
+            (row, column + 1): [(x2, y1), (x2, y2)],
+            (row - 1, column): [(x1, y1), (x2, y1)],
+            (row + 1, column): [(x1, y2), (x2, y2)],
+        }
+        lines += [side for neighbour, side in side_towards.items() if neighbour not in places]
     return lines
