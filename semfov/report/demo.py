@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, NamedTuple
 
 from semfov.report.episode import Data
+from semfov.report.markup import data_uri
 from semfov.report.page import page_html
 from semfov.viz.animation import write_webp
 
@@ -84,11 +84,7 @@ def film_html(frames: Sequence[PillowImage], seconds: float, label: str) -> str:
     write_webp(frames, film, [seconds] * (len(frames) - 1) + [_HOLD], _QUALITY)
     still = io.BytesIO()
     frames[-1].save(still, "JPEG", quality=80)
-    moving = picture_html(_uri("webp", film), label)
-    source = f'<source media="(prefers-reduced-motion: reduce)" srcset="{_uri("jpeg", still)}">'
+    moving = picture_html(data_uri("webp", film.getvalue()), label)
+    still_uri = data_uri("jpeg", still.getvalue())
+    source = f'<source media="(prefers-reduced-motion: reduce)" srcset="{still_uri}">'
     return f"<picture>{source}{moving}</picture>"
-
-
-def _uri(kind: str, file: io.BytesIO) -> str:
-    """Encode a picture of some kind as a data URI."""
-    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -6,7 +6,7 @@ from html import escape
 
 from semfov.paths.areas import AreasLike, percent, percentage_points
 from semfov.paths.drafts import Drafts
-from semfov.report.markup import figure_html
+from semfov.report.markup import figure_html, scrollable
 from semfov.viz.drafts import plot_difference
 from semfov.viz.gaze import BORDERS, plot_gaze
 
@@ -55,15 +55,15 @@ def _table(drafts: Drafts, areas: AreasLike | None) -> str:
     """Make the table of the shares of areas; nothing without areas."""
     if areas is None:
         return ""
-    rows = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td>{percent(shares.first)}</td><td>{percent(shares.second)}</td>'
-        f"<td>{percentage_points(shares.difference)}</td></tr>"
-        for name, shares in drafts.shares(areas).items()
+    rows = ""
+    for name, shares in drafts.shares(areas).items():
+        cells = (percent(shares.first), percent(shares.second), percentage_points(shares.difference))
+        numbers = "".join(f"<td>{cell}</td>" for cell in cells)
+        rows += f'<tr><th scope="row">{escape(name)}</th>{numbers}</tr>'
+    headings = "".join(f'<th scope="col">{escape(text)}</th>' for text in ("Area", *drafts.names, "Change"))
+    caption = "Share of all fixations in each area; the change is in percentage points"
+    table = (
+        f'<table class="wraps"><caption>{caption}</caption>'
+        f"<thead><tr>{headings}</tr></thead><tbody>{rows}</tbody></table>"
     )
-    first, second = (escape(name) for name in drafts.names)
-    return (
-        '<div class="wide" tabindex="0" role="region" aria-label="Areas"><table class="wraps">'
-        "<caption>Share of all fixations in each area; the change is in percentage points</caption>"
-        f'<thead><tr><th scope="col">Area</th><th scope="col">{first}</th><th scope="col">{second}</th>'
-        f'<th scope="col">Change</th></tr></thead><tbody>{rows}</tbody></table></div>'
-    )
+    return scrollable(table, "Areas")

@@ -18,6 +18,7 @@ from semfov.io.compatibility import Settings
 from semfov.io.files import MADE_HERE
 from semfov.paths import Record, Scanpath
 from semfov.paths.look import confident_detections
+from semfov.report.markup import data_uri
 from semfov.viz.belief import class_posterior
 from semfov.viz.labels import LabelBox, place_labels
 from semfov.viz.semantic import cell_entropy
@@ -60,9 +61,11 @@ def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
     Returns:
         The URI.
     """
-    if image.shape[-1] > width:
-        image = resize(image[None], (width, max(1, round(width * image.shape[-2] / image.shape[-1]))))[0]
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg(image, quality)).decode()
+    rows, columns = image.shape[-2:]
+    if columns > width:
+        height = max(1, round(width * rows / columns))
+        image = resize(image[None], (width, height))[0]
+    return data_uri("jpeg", jpeg(image, quality))
 
 
 @checked_keywords
@@ -95,16 +98,20 @@ def episode_data(
         The data, for `semfov.report.write_page`.
     """
     grid = scanpath.grid
+    photograph = None if image is None else jpeg_uri(image, width * 3 // 2, quality)
+    presence = None
+    if scanpath.presence is not None:
+        presence = [rounded(chance, 9) for chance in scanpath.presence.tolist()]
     return {
         "name": name,
         **object_data(scanpath),
         **_about_data(scanpath, settings),
         "summary": scanpath.describe(),
         "outcome": _outcome_data(scanpath),
-        "presence": None if scanpath.presence is None else [rounded(p, 9) for p in scanpath.presence.tolist()],
+        "presence": presence,
         "size": grid.extent.tolist(),
         "grid": [grid.columns, grid.rows],
-        "image": None if image is None else jpeg_uri(image, width * 3 // 2, quality),
+        "image": photograph,
         "target": scanpath.target_name,
         "found": scanpath.found,
         "truth": [] if boxes is None else boxes.tolist(),
@@ -238,7 +245,7 @@ def _detection_data(scanpath: Scanpath, fixation: int) -> list[Data]:
         detections.append({"box": [round(x, 1) for x in box.tolist()], "label": names[0], "scores": classes})
     width, height = scanpath.grid.extent.tolist()
     texts = [f"{number} {detection['label']}" for number, detection in enumerate(detections, 1)]
-    # No label covers the mark of the gaze.
+    # No label covers the mark of the gaze. Pixel centres are at integers, and in the page edges of pixels are.
     x, y = (scanpath.fixations[fixation] + 0.5).tolist()
     reach = 14 * width / 640
     mark = (x - reach, y - reach, x + reach, y + reach)

@@ -28,6 +28,16 @@ def picture(uri: str, size: Sequence[float], name: str) -> str:
     return f'<image id="{name}" href="{uri}" width="{size[0]}" height="{size[1]}" preserveAspectRatio="none"/>'
 
 
+def data_uri(kind: str, content: bytes) -> str:
+    """Encode the file of a picture, of a kind such as `png`, as a URI that a page holds in place of a link."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def scrollable(table: str, label: str) -> str:
+    """Put a table into a region that scrolls on a narrow screen, also by keys; its label is plain text."""
+    return f'<div class="wide" tabindex="0" role="region" aria-label="{escape(label)}">{table}</div>'
+
+
 def facts_html(facts: Mapping[str, str]) -> str:
     """List facts by their names."""
     return "".join(f"<div><dt>{name}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts.items())
@@ -59,19 +69,15 @@ def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
     head = f'<th scope="col">{escape(first_heading)}</th>'
     head += "".join(f'<th scope="col" class="number">{escape(heading)}</th>' for heading in headings)
     body = "".join(f"<tr>{_row(name, numbers)}</tr>" for name, *numbers in body_rows)
-    label = escape(caption)
-    return (
-        f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'
-        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-    )
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f"<p>{escape(caption)}</p>{scrollable(table, caption)}"
 
 
 def figure_html(caption: str, figure: Figure) -> str:
     """Embed a figure of matplotlib with its caption, plain text."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=130, bbox_inches="tight", pad_inches=0.02)
-    encoded = base64.b64encode(content.getvalue()).decode()
-    source = f"data:image/png;base64,{encoded}"
+    source = data_uri("png", content.getvalue())
     return f'<figure><figcaption>{escape(caption)}</figcaption><img src="{source}" alt="{escape(caption)}"></figure>'
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from semfov.data.classes import counted
 from semfov.io.files import MADE_HERE
 from semfov.report.episode import Data
+from semfov.report.markup import data_uri, scrollable
 
 _SIDE = 160  # longest side in pixels of a small picture, twice that on the screen
 _ORDER = ("found", "undecided", "absent")  # verdicts, those that a reader looks for first
@@ -60,18 +61,20 @@ def overview_section(
     Returns:
         HTML.
     """
-    heads = "".join(
-        f'<th scope="col" class="{column.kind}"><button type="button" class="sort">{escape(column.head)}</button></th>'
-        for column in (OverviewColumn("picture"), *columns)
-    )
+    heads = "".join(map(_head_html, (OverviewColumn("picture"), *columns)))
     lines = "".join(_row_html(row, columns) for row in rows)
+    # The first column, of small pictures, has no head and cannot be sorted by.
+    head = f"<thead><tr><td></td>{heads}</tr></thead>"
+    table = scrollable(f'<table class="objects">{head}<tbody>{lines}</tbody></table>', "All pictures")
+    title = f'<h2 id="overview-title">{escape(headline)}</h2>'
     numbers = f"<p>In all: {escape(total)}.</p>" if total else ""
-    return (
-        f'<section id="overview" aria-labelledby="overview-title"><h2 id="overview-title">{escape(headline)}</h2>'
-        f"{numbers}"
-        f'<div class="wide" tabindex="0" role="region" aria-label="All pictures"><table class="objects">'
-        f"<thead><tr><td></td>{heads}</tr></thead><tbody>{lines}</tbody></table></div></section>\n"
-    )
+    return f'<section id="overview" aria-labelledby="overview-title">{title}{numbers}{table}</section>\n'
+
+
+def _head_html(column: OverviewColumn) -> str:
+    """Make the head of a column, a button that sorts the rows by it."""
+    button = f'<button type="button" class="sort">{escape(column.head)}</button>'
+    return f'<th scope="col" class="{column.kind}">{button}</th>'
 
 
 def overview_html(episodes: Sequence[Data], places: Sequence[str], total: str = "") -> str:
@@ -113,8 +116,7 @@ def small_picture(uri: str | None, marks: str = "") -> str:
         width, height = picture.size
         file = io.BytesIO()
         picture.save(file, "JPEG", quality=70, comment=MADE_HERE)
-    source = f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
-    image = f'<image href="{source}" width="{width}" height="{height}"/>'
+    image = f'<image href="{data_uri("jpeg", file.getvalue())}" width="{width}" height="{height}"/>'
     over = f'<g transform="scale({width} {height})">{marks}</g>' if marks else ""
     return f'<svg class="small" viewBox="0 0 {width} {height}" aria-hidden="true">{image}{over}</svg>'
 
@@ -127,10 +129,10 @@ def _row_of_episode(episode: Data, place: str) -> OverviewRow:
 
 def _row_html(row: OverviewRow, columns: Sequence[OverviewColumn]) -> str:
     """Make a row, whose link leads to the part of the picture."""
-    cells = "".join(
-        f'<td class="{column.kind}">{escape(cell)}</td>' if column.kind else f"<td>{escape(cell)}</td>"
-        for cell, column in zip(row.cells, columns, strict=True)
-    )
+    cells = ""
+    for text, column in zip(row.cells, columns, strict=True):
+        css_class = f' class="{column.kind}"' if column.kind else ""
+        cells += f"<td{css_class}>{escape(text)}</td>"
     return (
         f'<tr class="{row.kind}"><td>{row.small_picture}</td>'
         f'<th scope="row"><a href="#{row.place}">{escape(row.name)}</a></th>{cells}</tr>'

@@ -13,7 +13,7 @@ from semfov.paths.look import CONFIDENT
 from semfov.report.episode import Data
 from semfov.report.markup import hidden_unless
 from semfov.report.overview import overview_html
-from semfov.report.parts import ABOUT, EpisodePart, Part, part_of
+from semfov.report.parts import ABOUT, Part, part_of
 from semfov.report.template import colour_steps, filled, write_html
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 
@@ -62,12 +62,12 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "", total
     ('<!DOCTYPE html>', True)
     """
     parts = [part_of(episode, number) for number, episode in enumerate(episodes)]
+    if len(episodes) > 1 and not sections:
+        sections = overview_html(episodes, [part.article for part in parts], total)
     # A single episode begins with its outcome, and one of several has it where it is chosen.
     is_single = len(episodes) == 1 and not sections
     contents = _of_single(episodes[0]) if is_single else _of_several(episodes)
-    if len(episodes) > 1 and not sections:
-        sections = overview_html(episodes, [part.article for part in parts], total)
-    has_fixations = not parts or any(isinstance(part, EpisodePart) for part in parts)
+    has_fixations = not parts or any(part.is_drawn_by_script for part in parts)
     contents |= {
         "title": escape(title),
         "sections": sections,
@@ -103,17 +103,18 @@ def _of_single(episode: Data) -> dict[str, str]:
         "outcome": _outcome_html(episode),
         "heading": ' class="unseen"',
         "of_episode": "",
-        "details": _details_html(episode),
+        "details": _details_html([episode], _known_details(episode)),
     }
 
 
 def _of_several(episodes: Sequence[Data]) -> dict[str, str]:
     """Fill them for several episodes, of which one is chosen; the script tells each place of that one."""
-    if not episodes:
-        return {"outcome": "", "heading": "", "of_episode": "", "details": ""}
-    facts = [fact for fact in ABOUT if fact != "decision"]
-    details = f"<h3>Details</h3>{_facts_html(episodes, facts)}\n"
-    return {"outcome": "", "heading": "", "of_episode": _outcome_html(episodes[0]), "details": details}
+    of_episode = ""
+    details = ""
+    if episodes:
+        of_episode = _outcome_html(episodes[0])
+        details = _details_html(episodes, _DETAILS)
+    return {"outcome": "", "heading": "", "of_episode": of_episode, "details": details}
 
 
 def _outcome_html(episode: Data) -> str:
@@ -122,15 +123,17 @@ def _outcome_html(episode: Data) -> str:
     return f'<div{hidden_unless(fact)}><p class="outcome" data-about="decision">{fact}</p></div>'
 
 
-def _details_html(episode: Data) -> str:
-    """List the facts about a single episode, at the end of its page."""
-    # A picture without a file is named by its size.
+_DETAILS = tuple(fact for fact in ABOUT if fact != "decision")
+"""Facts at the end of a page; the decision is at its beginning."""
+
+
+def _known_details(episode: Data) -> list[str]:
+    """Choose the details of a single episode; a picture without a file is named by its size, which is one of them."""
     is_named = episode.get("name") != episode.get("pixels")
-    facts = [fact for fact in ABOUT if fact != "decision" and (is_named or fact != "name")]
-    return f"<h3>Details</h3>{_facts_html([episode], facts)}\n"
+    return [fact for fact in _DETAILS if is_named or fact != "name"]
 
 
-def _facts_html(episodes: Sequence[Data], facts: Iterable[str]) -> str:
+def _details_html(episodes: Sequence[Data], facts: Iterable[str]) -> str:
     """List facts about the first episode, which the script updates; those that only others have are hidden."""
     rows = []
     for key in facts:
@@ -138,4 +141,4 @@ def _facts_html(episodes: Sequence[Data], facts: Iterable[str]) -> str:
             fact = escape(episodes[0].get(key) or "")
             definition = f'<dt>{ABOUT[key]}</dt><dd data-about="{key}">{fact}</dd>'
             rows.append(f"<div{hidden_unless(fact)}>{definition}</div>")
-    return f'<dl id="about" class="facts">{"".join(rows)}</dl>'
+    return f'<h3>Details</h3><dl id="about" class="facts">{"".join(rows)}</dl>\n'

@@ -9,11 +9,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from html import escape
+from typing import ClassVar
 
 from semfov.detection.objects import box_text
 from semfov.report.episode import Data
 from semfov.report.looks import article_html
-from semfov.report.markup import left_out
+from semfov.report.markup import left_out, scrollable
 
 ABOUT = {
     "name": "Photograph",
@@ -46,6 +47,9 @@ class Part(ABC):
         data: the data of the record.
         number: number of the part in the page.
     """
+
+    is_drawn_by_script: ClassVar[bool]
+    """Whether its looks, which then are fixations, are not in the markup."""
 
     look: str
     """What a look is called."""
@@ -106,19 +110,24 @@ class Part(ABC):
         if not self.data["count"]:
             doubt = " The best place, not sure enough, is dashed." if self.data["best"] else ""
             return f"<p>No objects were found.{doubt}</p>"
-        heads = ["#", "", "class", "score", self.look, "box"]
-        if self.data["turns"]:
-            heads.insert(heads.index(self.look), "pan, tilt")
-        if self.data["confirmable"]:
-            heads.insert(heads.index("box"), "confirmed")
-        titles = "".join(map(_sortable_head, heads))
+        titles = "".join(map(_sortable_head, self._object_heads()))
         rows = "".join(self._object_row(order, found) for order, found in enumerate(objects, 1))
         label = f"Objects with boxes x1,y1–x2,y2 in picture pixels and the {self.nearest}"
-        return (
-            f'<div class="wide" tabindex="0" role="region" aria-label="{label}"><table class="objects" '
-            f'aria-label="{label}"><thead><tr>{titles}</tr></thead><tbody>{rows}</tbody></table></div>'
-            f"{left_out(self.data['count'] - len(objects), 'object')}"
+        table = (
+            f'<table class="objects" aria-label="{label}"><thead><tr>{titles}</tr></thead><tbody>{rows}</tbody></table>'
         )
+        return f"{scrollable(table, label)}{left_out(self.data['count'] - len(objects), 'object')}"
+
+    def _object_heads(self) -> list[str]:
+        """Name the columns of the list, in the order of the cells of `_object_row`; that of the crops has no name."""
+        heads = ["#", "", "class", "score"]
+        if self.data["turns"]:
+            heads.append("pan, tilt")
+        heads.append(self.look)
+        if self.data["confirmable"]:
+            heads.append("confirmed")
+        heads.append("box")
+        return heads
 
     def _object_row(self, order: int, found: Data) -> str:
         """Make the row of an object in the list."""
@@ -158,6 +167,7 @@ def _sortable_head(title: str) -> str:
 class EpisodePart(Part):
     """Part of a page that the script draws: an episode of a fovea (`semfov.report.episode.episode_data`)."""
 
+    is_drawn_by_script = True
     look = "fixation"
     nearest = "nearest fixation"
 
@@ -202,6 +212,7 @@ class EpisodePart(Part):
 class LooksPart(Part):
     """Part of a page that is complete in the markup (`semfov.report.zoom.zoom_data`); the script chooses a look."""
 
+    is_drawn_by_script = False
     look = "look"
     nearest = "sharpest look"
 
