@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from itertools import takewhile
 
 from tqdm import tqdm
 
@@ -15,7 +14,7 @@ from semfov.cli.sources import PictureSource, example_source, picture_sources
 from semfov.cli.truth import Truth
 from semfov.data.classes import amount
 from semfov.data.large import open_large
-from semfov.errors import SemfovError, check
+from semfov.errors import check
 from semfov.io.files import check_writable, write_text
 from semfov.io.tables import csv_text, digits
 from semfov.report.compare import comparison_page
@@ -97,24 +96,24 @@ def _look_at_all(
     skipped = 0
     for source in tqdm(sources, desc="pictures", leave=False, disable=quiet or not sys.stderr.isatty()):
         try:
-            _look(source, eye, ways, scores, several=len(sources) > 1)
-        except SemfovError as error:
+            _look(source, eye, ways, scores)
+        except Exception as error:
+            # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
+            fault = source.fault(error, several=len(sources) > 1)
             if len(sources) == 1:
-                raise
-            print(f"skipped {source.name}: {error}", file=sys.stderr)
+                raise fault from error
+            source.tell_skipped(fault)
             skipped += 1
     return skipped
 
 
-def _look(source: PictureSource, eye: WindowEye, ways: dict[str, Way], scores: Scores, *, several: bool) -> None:
-    """Look at a picture in all ways; what fails at one picture of several is raised as an error of that picture."""
-    try:
-        picture = open_large(source.picture())
-        image = scores.image_of(source.name, picture.size, source.file)
-        warm_up(eye, picture)
-        scores.add(image, picture.size, {name: way(picture) for name, way in ways.items()})
-    except Exception as error:
-        raise source.fault(error, several=several) from error
+def _look(source: PictureSource, eye: WindowEye, ways: dict[str, Way], scores: Scores) -> None:
+    """Look at a picture in all ways, and add what they find to the scores."""
+    picture = open_large(source.picture())
+    image = scores.image_of(source.name, picture.size, source.file)
+    warm_up(eye, picture)
+    findings = {name: way(picture) for name, way in ways.items()}
+    scores.add(image, picture.size, findings)
 
 
 def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
@@ -128,15 +127,16 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
         The sentences.
     """
     ours = [point for point in points if point.way == SEMFOV]
-    slices = next((point for point in points if point.way == ALL_SLICES), None)
+    of_slices = [point for point in points if point.way == ALL_SLICES]
     last = ours[-1]
-    if slices is None:
-        return [f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s."]
+    result = f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s"
+    if not of_slices:
+        return [f"{result}."]
+    slices = of_slices[0]  # the only one: they are looked at together
     if not is_truth:
         return _agreement(last, slices)
     sentences = [
-        f"After {_passes(last)} semfov has {_precision(last)} in {last.seconds:.2f} s; all slices have "
-        f"{_precision(slices)} in {slices.seconds:.2f} s ({_passes(slices)})."
+        f"{result}; all slices have {_precision(slices)} in {slices.seconds:.2f} s ({_passes(slices)}).",
     ]
     level = _level_from(ours, slices)
     if level is not None:
@@ -146,11 +146,15 @@ def conclusion(points: Sequence[Point], *, is_truth: bool) -> list[str]:
 
 def _level_from(ours: Sequence[Point], slices: Point) -> Point | None:
     """Find the point from which on semfov is at least as good as all slices; None where they find nothing."""
-    least = slices.ap50 or 0
-    if least == 0:  # with which all points would be level
+    least = slices.ap50
+    if not least:  # with 0 all points would be level
         return None
-    level = [*takewhile(lambda point: (point.ap50 or 0) >= least, reversed(ours))]
-    return level[-1] if level else None
+    level = None
+    for point in reversed(ours):
+        if (point.ap50 or 0) < least:
+            break
+        level = point
+    return level
 
 
 def _agreement(last: Point, slices: Point) -> list[str]:

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from semfov.agents.picture import OpenedPicture
 from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import DEFAULT_DETECTOR, GazeOptions
-from semfov.cli.results import held_outputs, tell_written, unfinished
+from semfov.cli.results import held_outputs, tell_continuing, tell_written, unfinished
 from semfov.cli.sources import example_source, picture_sources
 from semfov.data.examples import EXAMPLES
 from semfov.data.fixations import Fixations
@@ -24,13 +24,12 @@ from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.files import check_apart, check_writable, plain_name, write_text
 from semfov.io.tables import csv_text, digits
-from semfov.paths.areas import AreasLike, boxes_of, percent
+from semfov.paths.areas import boxes_of, percent
 from semfov.paths.drafts import Drafts
 from semfov.paths.gaze import GazePrediction
-from semfov.paths.viewers import AreaVisits
 from semfov.report.drafts import drafts_section
 from semfov.report.episode import Data
-from semfov.report.gaze import gaze_page_html, gaze_part
+from semfov.report.gaze import ViewedArea, gaze_page_html, gaze_part, viewed_areas
 from semfov.report.template import page_path, write_html
 from semfov.runs.results import SceneResults
 from semfov.viz.style import save_figure
@@ -121,9 +120,10 @@ class _GazeJob:
         self.options = options
         self.sources = picture_sources(options)
         self.several = len(self.sources) > 1
-        if options.compare:
-            remedy = "; without it the page of several pictures has the shares side by side"
-            check(len(self.sources) == 2, "compare", "two pictures", f"{len(self.sources)}{remedy}")
+        # The cheap checks come first: a mistake is told before the detector is loaded.
+        remedy = "without it the page of several pictures has the shares side by side"
+        are_drafts = not options.compare or len(self.sources) == 2
+        check(are_drafts, "compare", "two pictures", f"{len(self.sources)}; {remedy}")
         self.outputs = _Outputs.of(options.out, several=self.several, compared=options.compare)
         check_apart(options.out, [source.file for source in self.sources])
         self.areas = None if options.areas is None else boxes_of(options.areas)
@@ -133,7 +133,7 @@ class _GazeJob:
         self.detector, self.model = _load(options)
         if not self.sources:
             self.sources = [example_source(EXAMPLES[0])]
-            print(f"no picture was given: looking at {self.sources[0].name}, which comes with semfov")
+            self.sources[0].tell_example()
         self.predictions: dict[int, GazePrediction] = {}
         self.outcomes: dict[int, _Outcome] = {}
         self.finished: SceneResults | None = None
@@ -168,13 +168,14 @@ class _GazeJob:
             panorama=options.panorama,
         )  # fmt: skip
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
-        areas = {} if self.areas is None else _area_facts(prediction, self.areas, options.seconds)
+        areas = {} if self.areas is None else viewed_areas(prediction, self.areas, options.seconds)
+        part = None if self.report is None else gaze_part(prediction, paths, self.areas, options.seconds)
         outcome: _Outcome = {
             "text": _text(source.name, prediction, paths, areas),
             "size": prediction.size,
             "viewers": [_viewer(path) for path in paths],
             "facts": _facts(prediction, areas),
-            "part": None if self.report is None else gaze_part(prediction, paths, self.areas, options.seconds),
+            "part": part,
         }
         density = self._density_path(number)
         if density is not None:
@@ -205,22 +206,20 @@ class _GazeJob:
     def write(self, *, complete: bool) -> None:
         """Write scanpaths, table of pictures and page of the pictures so far, and list all files."""
         outcomes = dict(sorted(self.outcomes.items()))
-        written: list[object] = []
-        if outcomes:
-            written += self._write_tables(outcomes)
-        written += [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
         drafts = Drafts(*self.predictions.values()) if len(self.predictions) == 2 else None
-        if drafts is not None:
-            written += self._write_comparison(drafts)
-        # Where one of two drafts cannot be read, an earlier comparison is not replaced by half of one.
-        lacks_draft = self.options.compare and drafts is None
-        if self.report is not None and outcomes and not lacks_draft:
-            written.append(self._write_page(self.report, outcomes, drafts))
+        written = [
+            *self._write_tables(outcomes),
+            *_densities(outcomes),
+            *self._write_comparison(drafts),
+            *self._write_page(outcomes, drafts),
+        ]
         progress = None if complete else f"{len(outcomes)} of {len(self.sources)}"
         tell_written(written, self.finished, progress)
 
-    def _write_comparison(self, drafts: Drafts) -> list[Path]:
-        """Say how two drafts differ, and draw it if a figure is written."""
+    def _write_comparison(self, drafts: Drafts | None) -> list[Path]:
+        """Say how two drafts differ, if there are two, and draw it if a figure is written."""
+        if drafts is None:
+            return []
         print(drafts.describe(self.areas))
         if self.outputs.figure is None:
             return []
@@ -232,7 +231,7 @@ class _GazeJob:
 
         table = self.outputs.table
         pictures = self.outputs.pictures
-        if table is None or pictures is None:
+        if table is None or pictures is None or not outcomes:
             return []
         names = self._names()
         paths: list[Fixations] = []
@@ -243,8 +242,12 @@ class _GazeJob:
         write_text(pictures, _table_of_pictures(facts))
         return [table, pictures]
 
-    def _write_page(self, report: Path, outcomes: Mapping[int, _Outcome], drafts: Drafts | None) -> Path:
-        """Write the page of all pictures, which begins with the comparison of two drafts where there are some."""
+    def _write_page(self, outcomes: Mapping[int, _Outcome], drafts: Drafts | None) -> list[Path]:
+        """Write the page of all pictures, if it is wanted; it begins with the comparison of two drafts."""
+        # Where one of two drafts cannot be read, an earlier comparison is not replaced by half of one.
+        lacks_draft = self.options.compare and drafts is None
+        if self.report is None or not outcomes or lacks_draft:
+            return []
         names = self._names()
         parts = []
         for number, outcome in outcomes.items():
@@ -253,14 +256,22 @@ class _GazeJob:
             part["picture"]["name"] = names[number]
             parts.append(part)
         before = "" if drafts is None else drafts_section(drafts, self.areas)
-        return write_html(report, gaze_page_html("semfov: where people look", parts, before))
+        return [write_html(self.report, gaze_page_html("semfov: where people look", parts, before))]
 
     def _names(self) -> list[str]:
         """Name the pictures as in their folder, or as they were named where two would have the same."""
-        names = [Path(source.name).name for source in self.sources]
-        count = Counter(name.lower() for name in names)
-        pairs = zip(names, self.sources, strict=True)
-        return [name if count[name.lower()] == 1 else source.name for name, source in pairs]
+        counts = Counter(Path(source.name).name.lower() for source in self.sources)
+        names = []
+        for source in self.sources:
+            name = Path(source.name).name
+            is_only_one = counts[name.lower()] == 1
+            names.append(name if is_only_one else source.name)
+        return names
+
+
+def _densities(outcomes: Mapping[int, _Outcome]) -> list[Path]:
+    """List the files of the densities that were written."""
+    return [Path(outcome["density"]) for outcome in outcomes.values() if "density" in outcome]
 
 
 def _page_of(options: GazeOptions) -> Path | None:
@@ -283,19 +294,11 @@ def _load(options: GazeOptions) -> tuple[Detector, FixationDensity]:
     return detector, FixationDensity.for_detector(detector) if stated_model is None else stated_model
 
 
-def _area_facts(prediction: GazePrediction, areas: AreasLike, seconds: float) -> dict[str, tuple[float, AreaVisits]]:
-    """Compute the share of all fixations in each area, and how many viewers see it when."""
-    visits = prediction.visits(areas, seconds=seconds)
-    return {name: (share, visits[name]) for name, share in prediction.share(areas).items()}
-
-
-def _text(
-    name: str, prediction: GazePrediction, paths: Sequence[Fixations], areas: Mapping[str, tuple[float, AreaVisits]]
-) -> str:
+def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], areas: Mapping[str, ViewedArea]) -> str:
     """Say what is known of a prediction and the viewers that are drawn from it."""
     lines = [f"{name}: {prediction.describe()}"]
-    for area, (share, visits) in areas.items():
-        lines.append(f"  {area}: {percent(share)} of all fixations, {visits}")
+    for area_name, area in areas.items():
+        lines.append(f"  {area_name}: {percent(area.share)} of all fixations, {area.visits}")
     places = []
     for number, peak in enumerate(prediction.peaks(), 1):
         places.append(f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %")
@@ -307,7 +310,7 @@ def _text(
     return "\n".join(lines)
 
 
-def _facts(prediction: GazePrediction, areas: Mapping[str, tuple[float, AreaVisits]]) -> dict[str, object]:
+def _facts(prediction: GazePrediction, areas: Mapping[str, ViewedArea]) -> dict[str, object]:
     """List what the table of pictures says of a prediction."""
     width, height = prediction.size
     facts: dict[str, object] = {
@@ -321,10 +324,10 @@ def _facts(prediction: GazePrediction, areas: Mapping[str, tuple[float, AreaVisi
         facts[f"x {number}"] = place["x"]
         facts[f"y {number}"] = place["y"]
         facts[f"viewers {number}"] = place["share"]
-    for area, (share, visits) in areas.items():
-        facts[f"share of {area}"] = digits(share)
-        facts[f"viewers of {area}"] = visits.viewers
-        facts[f"seconds to {area}"] = visits.seconds
+    for name, area in areas.items():
+        facts[f"share of {name}"] = digits(area.share)
+        facts[f"viewers of {name}"] = area.visits.viewers
+        facts[f"seconds to {name}"] = area.visits.seconds
     return facts
 
 
@@ -356,8 +359,7 @@ def _look_at_pictures(job: _GazeJob) -> int:
     """Predict where people look in the pictures that are left; a command that is stopped has written those so far."""
     options = job.options
     sources = job.sources
-    if job.outcomes:
-        print(f"continuing: {len(job.outcomes)} of {len(sources)} pictures were looked at before")
+    tell_continuing(len(job.outcomes), len(sources))
     numbers = [number for number in range(len(sources)) if number not in job.outcomes]
     hidden = not job.several or options.quiet or not sys.stderr.isatty()
     complete = False
@@ -380,7 +382,7 @@ def _look_at_picture(job: _GazeJob, number: int) -> None:
         fault = source.fault(error, several=job.several)
         if not job.several:
             raise
-        tqdm.write(f"skipped {source.name}: {fault}", file=sys.stderr)
+        source.tell_skipped(fault)
     else:
         job.keep(number)
         tqdm.write(job.outcomes[number]["text"], file=sys.stdout)

@@ -108,6 +108,7 @@ class ResultsFile:
         """Write the file, atomically."""
         if self.form.grows:
             return
+        # The more pictures there are, the longer a file takes that is written anew, and the later it is due again.
         began = time.monotonic()
         write_text(self.path, self.form.text(self._in_order()))
         took = time.monotonic() - began
@@ -126,10 +127,15 @@ class ResultsFile:
 
 def held_outputs(options: object) -> AbstractContextManager[None]:
     """Hold all that the options name to write, in a block that is refused while another command writes any of it."""
-    named = [getattr(options, name, None) for name in ("out", "report", "crops", "labels")]
-    outputs = [path for path in named if path is not None and path != STDOUT]
-    folders = [path for path in outputs if path.is_dir() or not path.suffix]
-    return written_alone([path for path in outputs if path not in folders], folders)
+    files: list[Path] = []
+    folders: list[Path] = []
+    for name in ("out", "report", "crops", "labels"):
+        path = getattr(options, name, None)  # not all commands have all of them
+        if path in (None, STDOUT):
+            continue
+        is_folder = path.is_dir() or not path.suffix
+        (folders if is_folder else files).append(path)
+    return written_alone(files, folders)
 
 
 def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[PictureSource]) -> SceneResults:
@@ -146,6 +152,7 @@ def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[P
     Raises:
         DataError: another command was stopped, and what it has finished is kept there (`check_nothing_kept`).
     """
+    # Half of a sha256 is enough to tell commands apart, and leaves room in the name of a file.
     key = digest_of([depends_on, package_digest()])[:32]
     versions = [json.dumps(source.version()) for source in sources]
     finished = SceneResults(_kept_folder(file), key, versions.__getitem__)
@@ -177,6 +184,12 @@ def check_nothing_kept(file: Path, own: Path | None = None) -> None:
 def _kept_folder(file: Path) -> Path:
     """Name the folder beside a file of results in which a command keeps what it has finished."""
     return file.with_name(f"{file.name}.unfinished")
+
+
+def tell_continuing(done: int, total: int) -> None:
+    """Say how many of all pictures an interrupted command has looked at; nothing if none."""
+    if done:
+        print(f"continuing: {done} of {total} pictures were looked at before")
 
 
 def tell_written(files: Sequence[object], finished: SceneResults | None, part: str | None) -> None:

@@ -10,7 +10,7 @@ from contextlib import nullcontext, redirect_stdout
 from dataclasses import fields, replace
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Literal, TextIO, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TextIO, get_args, get_type_hints
 
 from tqdm import tqdm
 
@@ -19,7 +19,7 @@ from semfov.cli.agent import detector_classes, note_of_detector, several_classes
 from semfov.cli.jobs import ExploreJob, FindJob, PictureJob, SearchJob, make_again
 from semfov.cli.options import AgentKind, ExploreOptions, FindOptions, PictureOptions, SearchOptions
 from semfov.cli.outcome import PictureOutcome
-from semfov.cli.results import held_outputs
+from semfov.cli.results import held_outputs, tell_continuing
 from semfov.cli.sources import EXAMPLE
 from semfov.cli.totals import found_in_all
 from semfov.cli.written import PictureFiles
@@ -27,8 +27,6 @@ from semfov.errors import InputError, SemfovError, check, check_options, lookup,
 from semfov.paths.conversion import Values
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
-
-_Value = TypeVar("_Value")
 
 _TASKS: dict[str, tuple[type[PictureOptions], type[PictureJob[PictureOptions]]]] = {
     "search": (SearchOptions, SearchJob),
@@ -125,8 +123,8 @@ def run(
     names_of_options = [setting.name for setting in fields(kind) if setting.name not in (*positional, *kind.unused)]
     rename_former(options, names_of_options)
     check_options(options, names_of_options, f"semfov {task}")
-    check(task != "search" or target is not None, "target", "a class to search for; task='find' finds all objects",
-          target)  # fmt: skip
+    has_target = task != "search" or target is not None
+    check(has_target, "target", "a class to search for; task='find' finds all objects", target)
     values = _as_settings(options, kind)
     made_agent = agent if isinstance(agent, ActivePerception) else None
     if made_agent is None:
@@ -198,37 +196,41 @@ def _look_at_pictures(job: PictureJob[PictureOptions], stream: TextIO) -> list[V
 
 def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Values]:
     """Look at all pictures, and write what is known of those so far, whenever the command ends."""
-    count = len(job.sources)
     if not job.options.pictures:
-        print(f"no picture was given: looking at {job.sources[0].name}, which comes with semfov")
+        job.sources[0].tell_example()
     print(note_of_detector(job.options), end="")
     files = PictureFiles(job, stream)
     before = files.finished_before()
-    if before:
-        print(f"continuing: {len(before)} of {count} pictures were looked at before")
+    tell_continuing(len(before), len(job.sources))
     endings = Counter[str]()
     faults = list[SemfovError]()
     complete = False
     try:
         for number, outcome in _outcomes(job, before):
-            outcome = files.write_figures(number, outcome)
-            if isinstance(outcome, SemfovError):
-                _skip(job, files, number, outcome)
-                faults.append(outcome)
-                continue
-            files.add(number, outcome, before=number in before)
-            endings[outcome.ended] += 1
-            if number not in before:
-                tqdm.write(outcome.text, file=sys.stdout)
+            written = files.write_figures(number, outcome)
+            if isinstance(written, SemfovError):
+                _skip(job, files, number, written)
+                faults.append(written)
+            else:
+                _add(files, number, written, before=number in before)
+                endings[written.ended] += 1
         complete = True
     finally:
+        # Also after Ctrl-C: the results so far are written, and the same command continues.
         if files.rows:
             files.finish(complete=complete)
     if not endings and all(isinstance(fault, InputError) for fault in faults):
         raise faults[0]  # what no picture can be looked at with is a wrong argument
     if job.several:
         print(_totals(files, endings, len(faults)), end="")
-    return [files.rows[number] for number in range(count)]
+    return [files.rows[number] for number in range(len(job.sources))]
+
+
+def _add(files: PictureFiles, number: int, outcome: PictureOutcome, *, before: bool) -> None:
+    """Add the outcome of a picture to the files, and print it, unless an earlier command did `before`."""
+    files.add(number, outcome, before=before)
+    if not before:
+        tqdm.write(outcome.text, file=sys.stdout)
 
 
 def _totals(files: PictureFiles, endings: Counter[str], skipped: int) -> str:
@@ -242,16 +244,12 @@ def _totals(files: PictureFiles, endings: Counter[str], skipped: int) -> str:
     return f"{len(files.job.sources)} pictures: {'; '.join(filter(None, totals))}\n{_assumed_in_all(files)}"
 
 
-def _only(values: set[_Value]) -> _Value | None:
-    """Take the only one of some values; None where there are others, or none."""
-    return next(iter(values)) if len(values) == 1 else None
-
-
 def _assumed_in_all(files: PictureFiles) -> str:
     """Say how many pictures the probabilities of searches assume to hold the target; empty where it is not known."""
-    share = _only({row["assumed"] for row in files.rows.values() if row.get("assumed") is not None})
-    if share is None:
+    shares = {row["assumed"] for row in files.rows.values() if row.get("assumed") is not None}
+    if len(shares) != 1:
         return ""
+    (share,) = shares
     how_many = "half" if share == 0.5 else f"{100 * share:.3g} %"
     options = files.job.options
     is_given = isinstance(options, SearchOptions) and options.prior is not None
@@ -263,7 +261,7 @@ def _skip(job: PictureJob[PictureOptions], files: PictureFiles, number: int, fau
     """Leave out one picture of several, and say why; the fault of a single picture is raised."""
     if not job.several:
         raise fault
-    tqdm.write(f"skipped {job.sources[number].name}: {fault}", file=sys.stderr)
+    job.sources[number].tell_skipped(fault)
     files.skip(number, str(fault))
 
 
@@ -303,5 +301,6 @@ def _worth_starting(processes: int | None, tasks: int, seconds: float, start: fl
     most = min(available_cores() if processes is None else processes, tasks)
     if most <= 1:
         return 1
+    # Alone the tasks take `tasks * seconds`, and shared out the `most`-th part of it.
     seconds_saved = tasks * seconds * (1 - 1 / most)
     return most if seconds_saved > start else 1

@@ -1,6 +1,7 @@
 """Pictures that a command names: files, those of folders, or examples that come with the package."""
 
 import os
+import sys
 import traceback
 from collections.abc import Iterable, Sequence
 from glob import glob
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple, TypedDict, cast
 
 from torch import Tensor
+from tqdm import tqdm
 
 from semfov.agents.picture import PictureLike
 from semfov.cli.options import CompareOptions, GazeOptions, PictureOptions, white_of
@@ -86,6 +88,14 @@ class PictureSource(NamedTuple):
         except OSError:  # a link to nothing is skipped when it is opened
             return [self.name]
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
+
+    def tell_example(self) -> None:
+        """Say that this picture, which comes with the package, stands for those that were not given."""
+        print(f"no picture was given: looking at {self.name}, which comes with semfov")
+
+    def tell_skipped(self, fault: Exception) -> None:
+        """Say why this picture is left out, beside the progress bar of the others."""
+        tqdm.write(f"skipped {self.name}: {fault}", file=sys.stderr)
 
     def fault(self, error: Exception, *, several: bool) -> SemfovError:
         """Say what is wrong with this picture.

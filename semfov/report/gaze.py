@@ -4,6 +4,7 @@ import base64
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,11 @@ from torch import Tensor
 
 from semfov.data.classes import counted
 from semfov.data.fixations import Fixations
-from semfov.paths.areas import AreasLike, border_of, percent, shares_around
+from semfov.paths.areas import Area, AreasLike, border_of, percent, shares_around
 from semfov.paths.gaze import GazePrediction
 from semfov.paths.viewers import AreaVisits
 from semfov.report.episode import Data, jpeg_uri
+from semfov.report.markup import scrollable
 from semfov.report.overview import OverviewColumn, OverviewRow, overview_section, small_picture
 from semfov.report.template import colour_steps, filled
 from semfov.viz.gaze import BORDERS
@@ -24,6 +26,37 @@ _WIDTH = 960  # of the picture in pixels
 _QUALITY = 80  # of the picture as JPEG
 _MOST_STEPS = 12  # largest number of fixations of the slider
 _RADII = (0.09, 0.06, 0.04)  # of the first fixations over a small picture, in shares of its longer side
+
+
+class ViewedArea(NamedTuple):
+    """Area of interest in a picture.
+
+    Attributes:
+        box: left, top, right and bottom edge, in pixels.
+        share: of all fixations, from 0 to 1.
+        visits: how many viewers see it, and when.
+    """
+
+    box: Area
+    share: float
+    visits: AreaVisits
+
+
+def viewed_areas(prediction: GazePrediction, areas: AreasLike, seconds: float) -> dict[str, ViewedArea]:
+    """Compute what is known of areas of interest.
+
+    Args:
+        prediction: the prediction for the picture.
+        areas: as for `GazePrediction.share`.
+        seconds: time for which each viewer views the picture.
+
+    Returns:
+        The areas by name.
+    """
+    shares = prediction.share(areas)
+    visits = prediction.visits(areas, seconds=seconds)
+    boxes = prediction.areas(areas)
+    return {name: ViewedArea(box, shares[name], visits[name]) for name, box in boxes.items()}
 
 
 def gaze_part(
@@ -47,12 +80,12 @@ def gaze_part(
     # The slider begins before the first fixation, with the map of all, and has a step for each fixation that is seen.
     longest = max(map(len, scanpaths))
     steps = min(longest, _MOST_STEPS)
-    densities = [prediction.cells, *(prediction.given(scanpaths, number) for number in range(1, steps + 1))]
-    boxes = {} if areas is None else prediction.areas(areas)
-    shares = {} if areas is None else prediction.share(areas)
+    densities = [prediction.cells]
+    densities += [prediction.given(scanpaths, number) for number in range(1, steps + 1)]
+    viewed = {} if areas is None else viewed_areas(prediction, areas, seconds)
     picture = {
         "name": prediction.name,
-        "lead": _lead(prediction, shares),
+        "lead": _lead(prediction, viewed),
         "size": list(prediction.size),
         "image": jpeg_uri(prediction.image, _WIDTH, _QUALITY),
         "cells": list(prediction.cells.shape),
@@ -60,12 +93,12 @@ def gaze_part(
         "borders": [_borders(density, prediction.size) for density in densities],
         "paths": [_rounded_points(scanpath) for scanpath in scanpaths],
         "first": [[place["x"], place["y"]] for place in prediction.first_fixations()],
-        "areas": [[f"{name} {percent(shares[name])}", *box] for name, box in boxes.items()],
+        "areas": [[f"{name} {percent(area.share)}", *area.box] for name, area in viewed.items()],
     }
     return {
         "picture": picture,
-        "facts": _facts(prediction, shares, {} if areas is None else prediction.visits(areas, seconds=seconds)),
-        "shares": {name: percent(share) for name, share in shares.items()},
+        "facts": _facts(prediction, viewed),
+        "shares": {name: percent(area.share) for name, area in viewed.items()},
         "caution": prediction.caution,
     }
 
@@ -97,26 +130,29 @@ def gaze_page_html(title: str, parts: Sequence[Data], before: str = "") -> str:
         "heat": colour_steps(share_colours()),
         "colours": list(COLOURS),
     }
-    facts = [
-        f'<section class="facts-of" id="facts-{number}"><h2>{escape(part["picture"]["name"])}</h2>'
-        f"{part['facts']}</section>"
-        for number, part in enumerate(parts)
-    ]
+    facts = ""
+    for number, part in enumerate(parts):
+        heading = f"<h2>{escape(part['picture']['name'])}</h2>"
+        facts += f'<section class="facts-of" id="facts-{number}">{heading}{part["facts"]}</section>'
+    if not before and len(parts) != 1:
+        before = _overview(parts)
     contents = {
         "title": escape(title),
-        "before": before if before or len(parts) == 1 else _overview(parts),
+        "before": before,
         "borders": escape(BORDERS.capitalize()),
-        "facts": "".join(facts),
+        "facts": facts,
     }
     return filled("gaze", data, contents)
 
 
 def _overview(parts: Sequence[Data]) -> str:
     """List the pictures with their first fixations, and the share of all fixations in each area."""
-    areas = dict.fromkeys(name for part in parts for name in part["shares"])
+    areas: dict[str, None] = {}  # each once, in their order
+    for part in parts:
+        areas |= dict.fromkeys(part["shares"])
+    columns = [OverviewColumn(name, "number") for name in areas]
     # Where nothing is to be cautious of, the column would be empty.
     has_caution = any(part["caution"] for part in parts)
-    columns = [OverviewColumn(name, "number") for name in areas]
     if has_caution:
         columns.append(OverviewColumn("caution", "aside"))
     rows = []
@@ -178,30 +214,32 @@ def _svg_path(line: NDArray[np.float64]) -> str:
     return "M" + "L".join(f"{x:.0f},{y:.0f}" for x, y in line.tolist()) + "Z"
 
 
-def _lead(prediction: GazePrediction, shares: Mapping[str, float]) -> str:
+def _lead(prediction: GazePrediction, areas: Mapping[str, ViewedArea]) -> str:
     """Say in a few sentences where people look, and why that may be wrong."""
     said = f"{prediction.describe().capitalize()}."
-    if shares:
-        areas = ", ".join(f"{name} {percent(share)}" for name, share in shares.items())
-        said += f" Share of all fixations: {areas}."
+    if areas:
+        shares = ", ".join(f"{name} {percent(area.share)}" for name, area in areas.items())
+        said += f" Share of all fixations: {shares}."
     return said if prediction.caution is None else f"{said} Caution: {prediction.caution}."
 
 
-def _facts(prediction: GazePrediction, shares: Mapping[str, float], visits: Mapping[str, AreaVisits]) -> str:
+def _facts(prediction: GazePrediction, areas: Mapping[str, ViewedArea]) -> str:
     """Tell what is known of a picture without the script: first fixations, areas, places, and details in bits."""
     first = _place_rows(prediction.first_fixations())
     places = _place_rows(prediction.peaks())
-    tables = [
-        _table("Where people look first", ("Fixation", "x, y in pixels", "Viewers"), first),
-        _table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations"), places),
-    ]
-    if shares:
-        rows = [
-            (name, percent(share), percent(visits[name].viewers), visits[name].when) for name, share in shares.items()
-        ]
-        head = ("Area", "Fixations", "Viewers", "First seen")
-        tables.insert(0, _table("Fixations in each area, viewers who see it, and when half of them have", head, rows))
+    tables = [_area_table(areas)] if areas else []
+    tables.append(_table("Where people look first", ("Fixation", "x, y in pixels", "Viewers"), first))
+    tables.append(_table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations"), places))
     return f'<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
+
+
+def _area_table(areas: Mapping[str, ViewedArea]) -> str:
+    """Make the table of areas of interest."""
+    rows = []
+    for name, area in areas.items():
+        rows.append((name, percent(area.share), percent(area.visits.viewers), area.visits.when))
+    caption = "Fixations in each area, viewers who see it, and when half of them have"
+    return _table(caption, ("Area", "Fixations", "Viewers", "First seen"), rows)
 
 
 def _place_rows(places: Sequence[Mapping[str, float]]) -> list[tuple[str, str, str]]:
@@ -219,11 +257,11 @@ def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> 
     for row in rows:
         cells = "".join(f"<td>{escape(cell)}</td>" for cell in row)
         lines.append(f"<tr>{cells}</tr>")
-    return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
-        f"<caption>{escape(caption)}</caption><thead><tr>{headings}</tr></thead>"
-        f"<tbody>{''.join(lines)}</tbody></table></div>"
+    table = (
+        f"<table><caption>{escape(caption)}</caption><thead><tr>{headings}</tr></thead>"
+        f"<tbody>{''.join(lines)}</tbody></table>"
     )
+    return scrollable(table, caption)
 
 
 def _details(prediction: GazePrediction) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from typing import NamedTuple
 
 from semfov.data.classes import amount
 from semfov.detection.objects import box_text
@@ -88,20 +89,13 @@ def _overview(data: Data, place: str) -> str:
     """
     width, height = data["size"]
     unit = max(width, height) / 640  # the drawing is about 640 pixels of the screen wide
-    windows = [(number, look["box"]) for number, look in enumerate(data["looks"], 1) if not look["whole"]]
-    # Room for digits of 13 pixels of the screen.
-    tag_sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
-    window_boxes = [_corners(box) for _, box in windows]
-    tags = place_labels(window_boxes, tag_sizes, (width, height))
-
+    windows = _numbered_windows(data, unit)
     # What comes later lies over what was drawn before.
     shapes = [rect(box, "truth") for box in data["truth"]]
-    shapes += _object_shapes(data, unit, tags)
+    shapes += _object_shapes(data, unit, [window.tag for window in windows])
     if data["best"]:
         shapes.append(f'<g class="best"><title>best place</title>{framed(data["best"])}</g>')
-    for (number, box), tag in zip(windows, tags, strict=True):
-        shapes.append(_window_shape(number, box, tag, unit))
-
+    shapes += [_window_shape(window, unit) for window in windows]
     objects = amount(data["count"], "object")
     label = f"The picture with {len(windows)} numbered {_view_word(data)}s and {objects}"
     return (
@@ -111,18 +105,45 @@ def _overview(data: Data, place: str) -> str:
     )
 
 
-def _window_shape(number: int, box: Sequence[float], tag: LabelBox, unit: float) -> str:
-    """Draw the window of a look, with the look's number in the middle of a rectangle, its tag."""
-    left, top, right, bottom = tag
+class _NumberedWindow(NamedTuple):
+    """What a look shows of the picture: its number, from 1, its box, and the rectangle in which the number stands."""
+
+    number: int
+    box: LabelBox
+    tag: LabelBox
+
+
+def _numbered_windows(data: Data, unit: float) -> list[_NumberedWindow]:
+    """List the windows of the looks that show a part of the picture; no number covers another.
+
+    Args:
+        data: data of the record.
+        unit: length in pixels of the picture of about a pixel of the screen.
+    """
+    numbers: list[int] = []
+    boxes: list[LabelBox] = []
+    sizes: list[tuple[float, float]] = []
+    for number, look in enumerate(data["looks"], 1):
+        if look["whole"]:
+            continue
+        x1, y1, x2, y2 = look["box"]
+        numbers.append(number)
+        boxes.append((x1, y1, x2, y2))
+        # Room for digits of 13 pixels of the screen.
+        sizes.append((unit * (8 * len(str(number)) + 8), unit * 17))
+    width, height = data["size"]
+    tags = place_labels(boxes, sizes, (width, height))
+    return [_NumberedWindow(*window) for window in zip(numbers, boxes, tags, strict=True)]
+
+
+def _window_shape(window: _NumberedWindow, unit: float) -> str:
+    """Draw the window of a look, with the look's number in the middle of its rectangle."""
+    left, top, right, bottom = window.tag
     x = (left + right) / 2
     y = (top + bottom) / 2
-    text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
-    return f'<g class="window" data-look="{number - 1}">{framed(box)}{rect(tag, "tag")}{text}</g>'
-
-
-def _corners(box: Sequence[float]) -> LabelBox:
-    x1, y1, x2, y2 = box
-    return x1, y1, x2, y2
+    text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{window.number}</text>'
+    shapes = f"{framed(window.box)}{rect(window.tag, 'tag')}{text}"
+    return f'<g class="window" data-look="{window.number - 1}">{shapes}</g>'
 
 
 def _object_shapes(data: Data, unit: float, obstacles: Sequence[LabelBox]) -> list[str]:
@@ -206,15 +227,16 @@ def _look(data: Data, index: int, place: str) -> str:
     number = index + 1
     width, height = look["size"]
     count = look["count"]
+    title = f"Look {number}: the whole picture" if look["whole"] else f"Look {number}"
     label = f"The window of look {number} with {amount(count, 'detection')}"
-    title = f"Look {number}{': the whole picture' if look['whole'] else ''}"
+    pixels = picture(look["view"], (width, height), f"{place}-view")
+    shapes = _detection_shapes(look, data["target"])
+    view = f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{label}">{pixels}{shapes}</svg>'
+    facts = f'<dl class="facts">{facts_html(_look_facts(look, number))}</dl>'
+    rest = left_out(count - len(look["detections"]), "detection")
     return (
         f'<section class="look" data-look="{index}" id="{place}" aria-labelledby="{place}-title">'
-        f'<h4 id="{place}-title">{title}</h4>'
-        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{label}">'
-        f"{picture(look['view'], (width, height), f'{place}-view')}{_detection_shapes(look, data['target'])}</svg>"
-        f'<dl class="facts">{facts_html(_look_facts(look, number))}</dl>{_detection_table(look, number)}'
-        f"{left_out(count - len(look['detections']), 'detection')}</section>"
+        f'<h4 id="{place}-title">{title}</h4>{view}{facts}{_detection_table(look, number)}{rest}</section>'
     )
 
 

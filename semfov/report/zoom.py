@@ -94,11 +94,13 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
     x1, _, x2, _ = look.region
     # Looks of a head have none of their own: then it is the pixels of the view for one of the picture.
     magnification = look.more.get("magnification", view.size[0] / max(x2 - x1, 1))
+    width_seen = max(1, round((x2 - x1) * magnification))
     detections = _detections(path, look, view)
     closer = _closer_look(path, look)
+    certainty = None if closer is None else f"probability {closer.place:.2f} that the target is there"
     pose = _pose_in_words(look) if path.kind.turns else None
     return {
-        "view": jpeg_uri(view.pixels, max(1, round((x2 - x1) * magnification)), quality),
+        "view": jpeg_uri(view.pixels, width_seen, quality),
         "box": [round(side) for side in look.region],
         "size": list(view.size),
         "whole": path.is_whole(look.region),
@@ -107,7 +109,7 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
         "magnification": magnification,
         "value": look.value,
         "seconds": look.seconds,
-        "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
+        "closer": certainty,
         "detections": detections[:_MOST_DETECTIONS],
         "count": len(detections),
         "brought": _brought_in_words(path, look),
