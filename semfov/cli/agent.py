@@ -8,14 +8,14 @@ from typing import Any
 import torch
 
 from semfov.agent import ActivePerception
-from semfov.cli.options import DEFAULT_DETECTOR, AgentOptions, DetectorOptions
+from semfov.cli.options import DEFAULT_DETECTOR, AgentKind, AgentOptions, DetectorOptions
 from semfov.data.classes import known_class
 from semfov.detection.load import check_detector, given_names
 from semfov.detection.onnx_file import write_settings
 from semfov.detection.weights import WEIGHTS
 from semfov.errors import InputError, check, check_device
 from semfov.io.manifest import Manifest
-from semfov.model_folder import is_model_file, open_model
+from semfov.model_folder import open_model
 
 
 def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
@@ -31,8 +31,8 @@ def detector_classes(options: AgentOptions) -> tuple[str, ...] | None:
         InputError: there is no such detector, it has classes of its own, or the weights are of another kind.
     """
     names = detector_options(options).get("classes")
-    if options.models is not None and not is_model_file(options.models):
-        return Manifest.read(options.models).classes
+    if options.models_folder is not None:
+        return Manifest.read(options.models_folder).classes
     detector = detector_of(options)
     classes = check_detector(detector)
     if classes is not None and names is not None:
@@ -62,9 +62,10 @@ def detector_of(options: AgentOptions) -> str:
     """
     if options.detector is not None:
         return options.detector
-    if options.models is None or not is_model_file(options.models):
+    if options.model_file is None:
         return DEFAULT_DETECTOR
-    return str(open_model(options.models).metadata.get("detector", {}).get("name", DEFAULT_DETECTOR))
+    fitted_to = open_model(options.model_file).metadata.get("detector", {})
+    return str(fitted_to.get("name", DEFAULT_DETECTOR))
 
 
 def note_of_detector(options: AgentOptions) -> str:
@@ -91,14 +92,11 @@ def detector_options(options: DetectorOptions) -> dict[str, Any]:
         InputError: PyTorch has no such device, or the file of names cannot be read.
     """
     check_device(options.device)
-    names = options.classes
-    if names is not None and len(names) == 1 and Path(names[0]).is_file():
-        names = given_names(names[0])
     # A flag that is not given leaves the choice to the detector's own settings.
     values = {
         "weights": options.weights,
         "device": options.device,
-        "classes": names,
+        "classes": _names_of_classes(options),
         "per_class": options.per_class or None,
         "head": options.head,
         "input_size": options.input_size,
@@ -106,6 +104,14 @@ def detector_options(options: DetectorOptions) -> dict[str, Any]:
         "preprocessing": options.colour and {"channels": options.colour},
     }
     return {name: value for name, value in values.items() if value is not None}
+
+
+def _names_of_classes(options: DetectorOptions) -> tuple[str, ...] | None:
+    """Take the names of the classes from the options, or from the text file that they name; None for none."""
+    names = options.classes
+    if names is None or len(names) != 1 or not Path(names[0]).is_file():
+        return names
+    return given_names(names[0])
 
 
 _OF_ONNX = "head", "colour", "input_size", "logits", "remember"
@@ -155,7 +161,7 @@ def make_agent(options: AgentOptions) -> ActivePerception:
     """
     device = options.device or "cpu"
     detector = detector_of(options)
-    if options.models is None or is_model_file(options.models):
+    if options.models_folder is None:
         check_onnx_options(options, detector)
     agent = _load_agent(options, detector_options(options))
     remember(options, detector)
@@ -180,7 +186,7 @@ def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePercept
         The agent.
     """
     if options.models is not None:
-        return _load_from_folder(options, options.models, loading)
+        return _load_models(options, options.models, loading)
     detector = detector_of(options)
     if options.agent == "recommended":
         expected = "gradual with --agent recommended, whose models are fitted for it"
@@ -190,19 +196,19 @@ def _load_agent(options: AgentOptions, loading: dict[str, Any]) -> ActivePercept
     return make(detector, sensor=options.sensor or "published", **loading)
 
 
-def _load_from_folder(options: AgentOptions, folder: Path, loading: dict[str, Any]) -> ActivePerception:
+def _load_models(options: AgentOptions, models: Path, loading: dict[str, Any]) -> ActivePerception:
     """Load an agent from a folder of models, or the file of one, which say what their detector is."""
-    if is_model_file(folder):
+    kinds: tuple[AgentKind, ...] = ("recommended", "published")
+    expected = "recommended or published with --models FOLDER"
+    if options.model_file is not None:
+        kinds = ("recommended",)
         expected = "recommended with --models FILE, which takes the place of a shipped model"
-        check(options.agent == "recommended", "agent", expected, options.agent)
-    else:
-        expected = "recommended or published with --models FOLDER"
-        check(options.agent in ("recommended", "published"), "agent", expected, options.agent)
+    check(options.agent in kinds, "agent", expected, options.agent)
     if options.detector is not None:
         # The file of the detector is elsewhere now.
         loading = {"detector": options.detector, **loading}
     load = ActivePerception.published if options.agent == "published" else ActivePerception.from_pretrained
-    return load(folder, **loading)
+    return load(models, **loading)
 
 
 def several_classes(text: str | None, classes: Sequence[str] | None) -> list[str] | None:

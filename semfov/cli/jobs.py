@@ -35,7 +35,6 @@ from semfov.io.manifest import FILE as MANIFEST
 from semfov.io.pretrained import Pretrained
 from semfov.io.ranges import CheckedSettings
 from semfov.kinds import Drawing
-from semfov.model_folder import is_model_file
 from semfov.paths import Record
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 
@@ -103,11 +102,11 @@ class PictureJob(ABC, Generic[_Options_co]):
     def _check_names(self) -> None:
         """Raise `InputError` where files that are named as their pictures would have the same name."""
         counts = Counter(str(source.place.with_suffix("")) for source in self.sources)
-        repeated = ", ".join([place for place, times in counts.items() if times > 1][:3])
-        folders = {"crops": self.options.crops, "labels": self.options.labels}
-        for name in [name for name, folder in folders.items() if folder is not None]:
+        repeated = [place for place, times in counts.items() if times > 1]
+        for name, folder in {"crops": self.options.crops, "labels": self.options.labels}.items():
+            is_free = folder is None or not repeated
             expected = f"pictures of different names with --{name}, whose files have their names"
-            check(not repeated, name, expected, repeated)
+            check(is_free, name, expected, ", ".join(repeated[:3]))
 
     def aim(self, classes: Sequence[str] | None) -> None:
         """Take the target from the options; before the names of the classes are known it is not checked.
@@ -120,19 +119,17 @@ class PictureJob(ABC, Generic[_Options_co]):
     def depends_on(self) -> dict[str, object]:
         """List what outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
         agent = self.agent
-        models = self.options.models
-        manifest = models
-        if models is not None and not is_model_file(models):
-            manifest = models / MANIFEST
+        manifest = self.options.model_file
+        if self.options.models_folder is not None:
+            manifest = self.options.models_folder / MANIFEST
+        # Agents that Python makes are told apart by the settings of their parts.
+        parts = [(place, type(part).__qualname__, _plain_attributes(part)) for place, part in agent.named_modules()]
         return {
             "options": self.options.result_settings(),
             "eye": agent.eye.settings(),
             "classes": agent.classes,
             "models": [module for module in agent.modules() if isinstance(module, Pretrained)],
-            # Agents that Python makes are told apart by the settings of their parts.
-            "parts": [
-                (place, type(part).__qualname__, _plain_attributes(part)) for place, part in agent.named_modules()
-            ],
+            "parts": parts,
             "weights": self.weights,
             "folder": None if manifest is None else sha256(manifest),
             "annotations": None if self.truth is None else self.truth.digest,
@@ -161,24 +158,28 @@ class PictureJob(ABC, Generic[_Options_co]):
             The outcome. An error is returned, not raised, where other pictures can still be looked at.
         """
         source = self.sources[number]
-        began = time.perf_counter()
         try:
             with torch.inference_mode():
-                picture = source.opened(self.options.how)
-                if self.truth is not None:
-                    # Its size is checked before it is looked at: boxes in another frame could not be judged.
-                    image = self.truth.image_id(source.name)
-                    self.truth.orientation(image, source.name, picture_size(source.picture()), source.file)
-                settings = {setting.name: getattr(self.options, setting.name) for setting in fields(self.task)}
-                if isinstance(picture, World):  # a scene is looked at by a head, whatever it was opened as
-                    settings["how"] = "auto"
-                settings["on_look"] = self._progress(source.name)
-                record = self.look(picture, settings, source)
-                seconds = time.perf_counter() - began
-                return PictureOutcome.of(record, picture, source, self.options, seconds, self.truth)
+                return self._outcome_of(source)
         except Exception as error:
             # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
             return source.fault(error, several=self.several)
+
+    def _outcome_of(self, source: PictureSource) -> PictureOutcome:
+        """Look at a picture, and make its text, row and figures; raises whatever is wrong with it."""
+        began = time.perf_counter()
+        picture = source.opened(self.options.how)
+        if self.truth is not None:
+            # Its size is checked before it is looked at: boxes in another frame could not be judged.
+            image = self.truth.image_id(source.name)
+            self.truth.orientation(image, source.name, picture_size(source.picture()), source.file)
+        settings = {setting.name: getattr(self.options, setting.name) for setting in fields(self.task)}
+        if isinstance(picture, World):  # a scene is looked at by a head, whatever it was opened as
+            settings["how"] = "auto"
+        settings["on_look"] = self._progress(source.name)
+        record = self.look(picture, settings, source)
+        seconds = time.perf_counter() - began
+        return PictureOutcome.of(record, picture, source, self.options, seconds, self.truth)
 
     def _progress(self, name: str) -> Callable[[Record], object] | None:
         """Make the bar of passes of one picture on a terminal, as a function that is called after each look."""
@@ -214,8 +215,7 @@ class SearchJob(PictureJob[SearchOptions]):
         """Find the classes that the target may mean, each with a weight."""
         options = self.options
         if not options.target:
-            is_folder = options.models is not None and not is_model_file(options.models)
-            name = options.models if is_folder else detector_of(options)
+            name = options.models_folder or detector_of(options)
             raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
         if classes is not None and self.weights is None:
             self.weights = meant_classes(options, classes)
@@ -231,10 +231,8 @@ class SearchJob(PictureJob[SearchOptions]):
         if self.agent.kind_of_look(picture, settings["how"], foveal=foveal) == "fovea":
             return self._search_with_fovea(picture, settings, source)
         if several:
-            print(
-                f"large pictures and scenes are searched only for the most likely class: {self.target}",
-                file=sys.stderr,
-            )
+            note = f"large pictures and scenes are searched only for the most likely class: {self.target}"
+            print(note, file=sys.stderr)
         return self.agent.search(picture, next(iter(weights)), **settings)
 
     def _search_with_fovea(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:

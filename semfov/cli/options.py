@@ -103,6 +103,18 @@ class AgentOptions(StartSettings, DetectorOptions):
     sensor: SensorName | None = None
     quiet: bool = False
 
+    @property
+    def model_file(self) -> Path | None:
+        """File of one model, where `models` names one."""
+        from semfov.model_folder import is_model_file  # with the models, which help and refusals do without
+
+        return self.models if self.models is not None and is_model_file(self.models) else None
+
+    @property
+    def models_folder(self) -> Path | None:
+        """Folder of models, where `models` names one."""
+        return self.models if self.model_file is None else None
+
 
 @dataclass(frozen=True)
 class PictureOptions(LookSettings, AgentOptions):
