@@ -321,7 +321,10 @@ def _skipped(rows: Iterable[Row]) -> list[Values]:
 
 def _parts(rows: Iterable[Row]) -> list[Values]:
     """Join what the pictures add to the list of the file, such as features."""
-    return [part for row in rows for part in row["parts"]]
+    parts: list[Values] = []
+    for row in rows:
+        parts += row["parts"]
+    return parts
 
 
 def _json(values: Values) -> str:

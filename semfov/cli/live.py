@@ -57,7 +57,8 @@ def look_live(options: LiveOptions) -> int:
     have_tracks = options.tracks is None or live.how != "fovea"
     check(have_tracks, "tracks", "looks at windows, as with --how windows, for objects with numbers", live.how)
     path = _video_path(options.out)
-    check_apart(path, [Path(source)] if isinstance(source, str) else [])
+    if isinstance(source, str):  # and no number of a camera
+        check_apart(path, [Path(source)])
     with held_outputs(options):
         _watch(live, stream, path, options.tracks)
     written = [str(file) for file in (path, options.tracks) if file is not None]
@@ -118,7 +119,8 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
     lines = _FrameLines()
     mot_lines: list[str] = []
     print(f"{stream.name}: {live.describe()}")
-    with nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE) as add_frame:
+    written = nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE)
+    with written as add_frame:
         try:
             for picture, moment in _moments(live, stream):
                 speed.count_frame()
@@ -283,8 +285,9 @@ def _legend(live: LivePerception, moment: Moment) -> list[str]:
     """Say what the line of a frame has in it, and when a search is decided."""
     place = "(x, y) × magnification" if moment.belief_map(len(moment) - 1) is None else "cell (column, row)"
     known = "what is known so far" if moment.decision is None else "what is decided so far"
-    names = ", ".join(moment.classes[label] for label in moment.sought)
-    shown = f"what it shows of {names}" if names else "what it shows"
+    shown = "what it shows"
+    if moment.sought:
+        shown += f" of {', '.join(moment.classes[label] for label in moment.sought)}"
     lines = [f"  a line: frame, at {place} of the look: {shown}, with scores; then {known}"]
     if live.criterion is not None:
         lines.append(f"  found: when {live.criterion} (--confirm)")

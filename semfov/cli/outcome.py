@@ -37,16 +37,12 @@ _CROP_QUALITY = 92  # of the JPEGs of crops
 def _outcome_text(record: Record, name: str, seconds: float) -> str:
     """Say what was found where, with what, and in how many passes and seconds."""
     width, height = record.size
-    is_at_limit = record.ending == "passes"
-    limit = " (the limit of --passes)" if is_at_limit else ""
-    looks = f"{amount(record.passes, 'look')}{limit} in {seconds:.1f} s"
-    if record.kind.turns:  # whose seconds are those of its movements and looks
-        looks += f" on this machine, {record[-1].seconds:.1f} s of eye and head"
     decision = record.decision
     headline = record.words.objects if decision is None else _decision_text(record, decision)
-    reason = record.words.lack() if is_at_limit else record.words.ended
-    # Where there is no reason, the line begins with the looks.
-    lines = [f"{name}, {width} × {height} px: {headline}", f"  {reason} {looks}.".replace("   ", "  ")]
+    # That the passes were used up is said with their number.
+    reason = record.words.lack() if record.ending == "passes" else record.words.ended
+    sentences = [reason, f"{_effort_text(record, seconds)}."]
+    lines = [f"{name}, {width} × {height} px: {headline}", f"  {' '.join(filter(None, sentences))}"]
     assumption = record.words.assumption()
     if assumption:
         lines.append(f"  {assumption}")
@@ -54,6 +50,15 @@ def _outcome_text(record: Record, name: str, seconds: float) -> str:
         lines += _regions_lines(record)
         lines += _objects_lines(record)
     return "\n".join(lines)
+
+
+def _effort_text(record: Record, seconds: float) -> str:
+    """Say how many looks were made, and how long they took on this machine and, of a head, on its own clock."""
+    limit = " (the limit of --passes)" if record.ending == "passes" else ""
+    text = f"{amount(record.passes, 'look')}{limit} in {seconds:.1f} s"
+    if not record.kind.turns:
+        return text
+    return f"{text} on this machine, {record[-1].seconds:.1f} s of eye and head"
 
 
 def _decision_text(record: Record, decision: Decision) -> str:
@@ -101,21 +106,18 @@ def _object_line(row: Values) -> str:
 def _regions_lines(record: Record) -> list[str]:
     """Write a line for each class that was looked for and that the final map names, with its most probable cell."""
     sought = [record.classes[label] for label in record.targets] or record.classes
-    cells: Counter[str] = Counter()
+    cells = Counter[str]()
     best: dict[str, Region] = {}
     for region in record.regions():
         if region.name not in sought:
             continue
         cells[region.name] += len(region.cells)
-        first = best.setdefault(region.name, region)
-        if region.probability > first.probability:
-            best[region.name] = region
-
+        best[region.name] = max(best.get(region.name, region), region, key=lambda other: other.probability)
     lines = []
     for name, count in cells.most_common():
         x, y = best[name].place
-        extent = "1 cell" if count == 1 else f"{count} cells"
-        lines.append(f"  map: {name} in {extent}, p up to {best[name].probability:.2f} around ({x:.0f}, {y:.0f})")
+        chance = f"p up to {best[name].probability:.2f}"
+        lines.append(f"  map: {name} in {amount(count, 'cell')}, {chance} around ({x:.0f}, {y:.0f})")
     return lines
 
 
@@ -224,27 +226,35 @@ class PictureOutcome:
         Returns:
             The outcome.
         """
-        out = options.results
-        form = None if out is None else results_format(out, truth=truth)
         text = _outcome_text(record, source.name, seconds)
+        if options.looks:
+            text = f"{text}\n{_looks_text(record)}"
         boxes = None if source.scene is None else source.scene.boxes
-        row = _result_row(record, source, seconds, form)
         episode = None
         if options.report is not None:
             # Records of other kinds of look have no more pixels than they keep.
             pixels = opened if record.kind.fine else None
             episode = record.page_data(pixels, name=Path(source.name).name, boxes=boxes)
-        usual = ALL_DRAWINGS if out is not None and kind_of(out) is None else ()
-        figures = _draw_episode(record, boxes, usual if options.draw is None else options.draw)
+        out = options.results
+        form = None if out is None else results_format(out, truth=truth)
+        figures = _draw_episode(record, boxes, _drawings(options))
         return cls(
             ended="looked at" if record.decision is None else record.decision.outcome,
-            text=f"{text}\n{_looks_text(record)}" if options.looks else text,
-            row=row,
+            text=text,
+            row=_result_row(record, source, seconds, form),
             episode=episode,
             names=tuple(figures),
             figures=figures,
             files=_figure(record, options) | _labels(record, source, options) | _crops(record, source, options),
         )
+
+
+def _drawings(options: PictureOptions) -> Sequence[Drawing]:
+    """Choose the figures to draw: those that are named, else all for a folder, and none for a file."""
+    if options.draw is not None:
+        return options.draw
+    writes_folder = options.results is not None and kind_of(options.results) is None
+    return ALL_DRAWINGS if writes_folder else ()
 
 
 def _figure(record: Record, options: PictureOptions) -> dict[str, bytes]:
@@ -267,19 +277,20 @@ def _crops(record: Record, source: PictureSource, options: PictureOptions) -> di
     """Cut out what the box of each object shows, or of a search the best place; returns the files by their paths."""
     if options.crops is None:
         return {}
-    names = [record.classes[label] for label in record.objects.labels.tolist()]
+    root = options.crops
+    files = {}
+
+    def add(name: str, ending: str, crop: Tensor) -> None:
+        folder = root / plain_name(name) / source.place.parent
+        files[str(folder / f"{source.place.stem}-{ending}.jpg")] = jpeg(crop, _CROP_QUALITY)
+
     crops = record.crops(source.picture())
-    endings = [f"{number:03d}" for number in range(len(crops))]
+    for number, (label, crop) in enumerate(zip(record.objects.labels.tolist(), crops, strict=True)):
+        add(record.classes[label], f"{number:03d}", crop)
     if not crops and record.best_place is not None:
         box, _ = record.best_place
-        names = [str(record.target_name)]
-        crops = record.crops(source.picture(), boxes=box[None])
-        endings = ["best"]
-
-    files = {}
-    for name, crop, ending in zip(names, crops, endings, strict=True):
-        folder = options.crops / plain_name(name) / source.place.parent
-        files[str(folder / f"{source.place.stem}-{ending}.jpg")] = jpeg(crop, _CROP_QUALITY)
+        (crop,) = record.crops(source.picture(), boxes=box[None])
+        add(str(record.target_name), "best", crop)
     return files
 
 
@@ -297,7 +308,8 @@ def _result_row(record: Record, source: PictureSource, seconds: float, form: Res
     """
     values = {**record.to_dict(), "picture": source.name, "seconds": round(seconds, 3), "ended": record.words.ended}
     picture = {name: value for name, value in values.items() if name not in ("looks", "summary")}
-    return {"picture": picture, **({} if form is None else form.added(record, source.name, source.file))}
+    added = {} if form is None else form.added(record, source.name, source.file)
+    return {"picture": picture, **added}
 
 
 def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:

@@ -147,6 +147,7 @@ def scene_json(agent: ActivePerception, image: Tensor) -> str:
         if isinstance(sensor, Foveation):
             levels = gaussian_pyramid(sharp, sensor.levels, sensor.convention)
             _, sigma_on_canvas = view.state
+            # The page draws in pixels of the picture.
             sigma = (sigma_on_canvas.flatten().cpu() / scale).tolist()
             growth = float(torch.as_tensor(sensor.growth))
     scene = {

@@ -46,20 +46,33 @@ def expected_in_all(rows: Collection[Values]) -> str:
         The sums with their errors; empty where no picture has a number.
     """
     looked_at = [row for row in rows if "error" not in row]
-    targets = list(dict.fromkeys(name for row in looked_at for name in row["targets"]))
+    targets: dict[str, None] = {}  # each once, in their order
+    for row in looked_at:
+        targets |= dict.fromkeys(row["targets"])
     texts = []
     for target in targets:
-        known = [row for row in looked_at if row["expected"].get(target) is not None]
-        if not known:
-            continue
         noun = f" {plural(target)}" if len(targets) > 1 else ""
-        where = "all" if len(known) == len(looked_at) else f"{len(known)} of {amount(len(looked_at), 'picture')}"
-        text = f"expect {_sum_with_error(known, target)}{noun} in {where}"
-        guesses = [row for row in known if row["expected_guessed"][target]]
-        if guesses:
-            text += f", of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
-        texts.append(text)
-    return "; ".join(texts)
+        texts.append(_expected_of_class(looked_at, target, noun))
+    return "; ".join(filter(None, texts))
+
+
+def _expected_of_class(rows: Sequence[Values], target: str, noun: str) -> str:
+    """Say how many objects of a class to expect in pictures, and of how many that is a guess; empty without a number.
+
+    Args:
+        rows: those of the pictures.
+        target: the class.
+        noun: what is counted, after a blank; empty where there is but one class.
+    """
+    known = [row for row in rows if row["expected"].get(target) is not None]
+    if not known:
+        return ""
+    where = "all" if len(known) == len(rows) else f"{len(known)} of {amount(len(rows), 'picture')}"
+    text = f"expect {_sum_with_error(known, target)}{noun} in {where}"
+    guesses = [row for row in known if row["expected_guessed"][target]]
+    if guesses:
+        text += f", of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
+    return text
 
 
 def _sum_with_error(rows: Sequence[Values], target: str) -> str:

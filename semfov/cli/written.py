@@ -147,23 +147,30 @@ class PictureFiles:
             complete: whether all pictures were looked at.
         """
         options = self.job.options
-        written: list[object] = []
-        if self._results is not None:
-            self._results.write()
-            was_looked_at = any("error" not in row for row in self.rows.values())
-            if complete and was_looked_at:
-                self._results.print_judgement()
-            if self._results.path != STDOUT:
-                written.append(self._results.path)
-        written += self._written
-        if options.report is not None and self._episodes:
-            episodes = [self._episodes[number] for number in sorted(self._episodes)]
-            totals = [found_in_all(self.job, self.rows.values())]
-            skipped = sum("error" in row for row in self.rows.values())
-            if skipped:
-                totals.append(f"{amount(skipped, 'picture')} skipped")
-            total = "; ".join(filter(None, totals))
-            written.append(write_page(options.report, f"semfov: {self.job.title}", episodes, total=total))
-        written += [folder for folder in (options.crops, options.labels) if folder is not None]
+        folders = [folder for folder in (options.crops, options.labels) if folder is not None]
+        written = [*self._write_results(complete=complete), *self._written, *self._write_page(), *folders]
         part = None if complete else f"{len(self.rows)} of {len(self.job.sources)}"
         tell_written(written, self.finished, part)
+
+    def _write_results(self, *, complete: bool) -> list[Path]:
+        """Write the file of results, if one is wanted, and print how complete ones agree with annotations."""
+        if self._results is None:
+            return []
+        self._results.write()
+        was_looked_at = any("error" not in row for row in self.rows.values())
+        if complete and was_looked_at:
+            self._results.print_judgement()
+        return [] if self._results.path == STDOUT else [self._results.path]
+
+    def _write_page(self) -> list[Path]:
+        """Write the page of the pictures so far, if it is wanted and there are some."""
+        report = self.job.options.report
+        if report is None or not self._episodes:
+            return []
+        episodes = [self._episodes[number] for number in sorted(self._episodes)]
+        totals = [found_in_all(self.job, self.rows.values())]
+        skipped = sum("error" in row for row in self.rows.values())
+        if skipped:
+            totals.append(f"{amount(skipped, 'picture')} skipped")
+        total = "; ".join(filter(None, totals))
+        return [write_page(report, f"semfov: {self.job.title}", episodes, total=total)]
