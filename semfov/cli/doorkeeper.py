@@ -57,6 +57,7 @@ class Doorkeeper:
         self._token = token
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        # The messages with which the server itself begins and ends are no requests.
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return

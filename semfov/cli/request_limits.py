@@ -21,6 +21,8 @@ _CALLS = ("/gradio_api/queue/join", "/gradio_api/run/predict")
 _UPLOAD = "/gradio_api/upload"
 _WRITTEN = {*_CALLS, _UPLOAD, "/gradio_api/cancel", "/gradio_api/reset"}
 
+_ELSEWHERE = 404, "expected an address of this page\n"
+
 _MOST_REQUEST = 2**18  # bytes of a request that is no upload
 _FRAME = 2**16  # bytes around the file of an upload
 _MOST_KEPT = 2**31  # bytes of all files of visitors, those that arrive among them
@@ -48,11 +50,13 @@ class RequestLimits:
         self._arriving = 0  # bytes of the uploads that are under way
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        # The messages with which the server itself begins and ends are no requests.
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
         refusal = self._refusal(scope)
         if refusal is None and scope["path"] in _CALLS:
+            # The files that a call names are in its body, which is read here and replayed to the server.
             body = await _body(receive)
             receive = _replayed(body, receive)
             refusal = self._refusal_of_call(body)
@@ -80,13 +84,18 @@ class RequestLimits:
         """Say why a request may not pass, by its head, as a status and words; None for one that may."""
         path = scope["path"]
         method = scope.get("method", "")
-        if method in ("GET", "HEAD") and path.startswith(_FILE):
-            return None if self._is_kept(path.removeprefix(_FILE)) else (403, "expected a file of this page\n")
-        if method in ("GET", "HEAD") and (path in _READ or path.startswith(_READ_BELOW)):
-            return None
+        if method in ("GET", "HEAD"):
+            return self._refusal_to_read(path)
         if method == "POST" and path in _WRITTEN:
             return self._refusal_by_size(scope)
-        return 404, "expected an address of this page\n"
+        return _ELSEWHERE
+
+    def _refusal_to_read(self, path: str) -> tuple[int, str] | None:
+        """Say why an address may not be read."""
+        if path.startswith(_FILE):
+            return None if self._is_kept(path.removeprefix(_FILE)) else (403, "expected a file of this page\n")
+        is_own = path in _READ or path.startswith(_READ_BELOW)
+        return None if is_own else _ELSEWHERE
 
     def _refusal_by_size(self, scope: Message) -> tuple[int, str] | None:
         """Say why a request is too large, or of unknown size, which browsers never send."""

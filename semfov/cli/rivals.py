@@ -406,26 +406,23 @@ class Scores:
         """Judge what was found in all pictures."""
         ids = self._reference.ids
         results: list[Entry] = []
-        listed = 0
-        right = 0
+        verdicts: list[int] = []
         for image, finding in found.items():
             sought = _of_classes(finding.objects, ids)
             objects = replace(sought, boxes=self._reference.placed(image, sought.boxes))
             rows = coco_results(image, objects.boxes, objects.labels, objects.scores, ids)
             results += [dict(row) for row in rows]
-            # For each object 1 is right, 0 is wrong, and -1 is not judged.
-            verdicts = right_boxes(objects.above(finding.threshold), self._reference.pictures[image])
-            listed += int((verdicts >= 0).sum())
-            right += int((verdicts > 0).sum())
+            verdicts += right_boxes(objects.above(finding.threshold), self._reference.pictures[image]).tolist()
         names = [self.classes[label - 1] for label in ids]
         precision = average_precision(annotations, results, images=[*found], classes=names)
+        # Of each object that is listed 1 is right, 0 is wrong, and -1 is not judged.
         return Point(
             way,
             passes=fmean(finding.passes for finding in found.values()),
             seconds=fmean(finding.seconds for finding in found.values()),
             ap50=None if precision is None else precision[1],
-            listed=listed,
-            right=right,
+            listed=verdicts.count(0) + verdicts.count(1),
+            right=verdicts.count(1),
             reference=self._reference.objects,
         )
 

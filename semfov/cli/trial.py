@@ -109,23 +109,32 @@ def _rows(bare: Trial, objects: Objects, classes: tuple[str, ...]) -> list[list[
     Returns:
         The cells of each row; `-` where one of them does not have the object.
     """
-    is_same_class = bare.labels[:, None] == objects.labels  # (M, objects)
-    overlap = box_iou(bare.boxes, objects.boxes.to(bare.boxes)) * is_same_class
+    partners = _partners(bare, objects)
     rows: list[list[str]] = []
-    unmatched = set(range(len(objects)))
-    for number, (box, score, label) in enumerate(zip(bare.boxes, bare.scores, bare.labels, strict=True)):
-        best = int(overlap[number].argmax()) if len(objects) else 0
-        listed_score = "-"
-        is_same = best in unmatched and float(overlap[number, best]) >= SAME_OBJECT_IOU
-        if is_same:
-            unmatched.remove(best)
-            listed_score = f"{objects.scores[best]:.2f}"
+    for box, score, label, partner in zip(bare.boxes, bare.scores, bare.labels, partners, strict=True):
+        listed_score = "-" if partner is None else f"{objects.scores[partner]:.2f}"
         rows.append([classes[label], f"{score:.2f}", listed_score, box_text(box.tolist())])
-    for number in sorted(unmatched):
-        name = classes[int(objects.labels[number])]
-        place = box_text(objects.boxes[number].tolist())
-        rows.append([name, "-", f"{objects.scores[number]:.2f}", place])
+    for number, (box, score, label) in enumerate(zip(objects.boxes, objects.scores, objects.labels, strict=True)):
+        if number not in partners:
+            rows.append([classes[label], "-", f"{score:.2f}", box_text(box.tolist())])
     return rows
+
+
+def _partners(bare: Trial, objects: Objects) -> list[int | None]:
+    """Find the number of the object that semfov lists at each box of the detector, of the same class; None for none.
+
+    An object is the partner of the most confident box that overlaps it best, and of no other.
+    """
+    partners: list[int | None] = []
+    for box, label in zip(bare.boxes, bare.labels, strict=True):
+        partner = None
+        if len(objects):
+            overlap = box_iou(box[None], objects.boxes.to(box))[0] * (objects.labels == label)  # (objects,)
+            best = int(overlap.argmax())
+            is_same = best not in partners and float(overlap[best]) >= SAME_OBJECT_IOU
+            partner = best if is_same else None
+        partners.append(partner)
+    return partners
 
 
 def _about_scores(bare: Trial, detector: Detector) -> list[str]:
