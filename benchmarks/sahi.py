@@ -38,9 +38,9 @@ from semfov.io.files import write_text
 from semfov.observation.matching import right_boxes
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig
-from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import TileSize
 from semfov.settings import FindSettings
+from semfov.threads import one_thread
 from semfov.viz.style import COLOURS, make_figure, save_figure, styled
 from semfov.zoom.episode import Order, WindowStep, look_by_look
 from semfov.zoom.eye import WindowEye

@@ -38,10 +38,10 @@ from semfov.observation import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.runs.command import command
 from semfov.runs.config import DataConfig, LookingConfig, ProtocolConfig, SensorConfig
-from semfov.runs.looks import one_thread
 from semfov.runs.protocols import choose_classes
 from semfov.runs.scene_run import finish
 from semfov.runs.tables import percent, plus_minus, table
+from semfov.threads import one_thread
 from train.fit_fom import FitFomConfig, fit_fom
 from train.outputs import model_path
 

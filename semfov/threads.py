@@ -18,6 +18,17 @@ _Arguments = ParamSpec("_Arguments")
 _Returned = TypeVar("_Returned")
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute on one thread: the last bits of a parallel sum depend on the number, and small tensors need no others."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_Arguments, _Returned]:
     """Decorate a function of tensors, so that one thread of the CPU works on small ones.
 
@@ -31,11 +42,8 @@ def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_
         before = torch.get_num_threads()
         if before == 1 or max(_sizes(args), default=0) >= _MANY_ELEMENTS:
             return function(*args, **kwargs)
-        torch.set_num_threads(1)
-        try:
+        with one_thread():
             return function(*args, **kwargs)
-        finally:
-            torch.set_num_threads(before)
 
     return sparing
 

@@ -13,10 +13,10 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import ChosenScenes, Scenes
 from semfov.fit.samples import Samples
 from semfov.observation.matching import match
-from semfov.runs.looks import one_thread
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import make_detector, split_photographs
 from semfov.runs.zoom_store import WindowLookStore
+from semfov.threads import one_thread
 from semfov.zoom.eye import WindowEye
 from semfov.zoom.lattice import Lattice
 from train.samples import Sampler, SamplerSettings

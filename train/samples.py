@@ -22,11 +22,12 @@ from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import pack_tensors, unpack_tensors
 from semfov.runs.config import EyeSettings
-from semfov.runs.looks import LOOK_SOURCES, one_thread
+from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.seeds import generator_for
 from semfov.runs.setup import check_sources, make_eye, make_scenes
 from semfov.runs.store import SceneStore
 from semfov.runs.workers import Where, run_tasks
+from semfov.threads import one_thread
 from semfov.zoom.eye import WindowEye
 
 _SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.runs.seeds")

@@ -17,9 +17,10 @@ from semfov.gaze.saliency import VOCUS2, FixationDensity, IttiKoch, cell_salienc
 from semfov.gaze.saliency.cells import Reduction
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
-from semfov.runs.looks import LOOK_SOURCES, one_thread
+from semfov.runs.looks import LOOK_SOURCES
 from semfov.runs.store import SceneStore
 from semfov.sensor.base import Sensor
+from semfov.threads import one_thread
 
 _SaliencyMap = Callable[[Tensor], Tensor]
 

@@ -16,10 +16,11 @@ from semfov.eye import Eye, View
 from semfov.io.ranges import Share
 from semfov.runs.config import LookingConfig
 from semfov.runs.looking import Looking
-from semfov.runs.looks import one_thread, tight
+from semfov.runs.looks import tight
 from semfov.runs.results import ResultRecord
 from semfov.runs.scene_run import finish, store_folder
 from semfov.runs.store import DetectionStore, cell_store
+from semfov.threads import one_thread
 
 
 class _Proposed(Detector):

@@ -13,8 +13,8 @@ from eval.ivsn.templates import ClassTemplates, at_points
 from eval.search.run import SearchConfig, SearchRun
 from semfov.errors import check
 from semfov.runs.config import PolicyConfig
-from semfov.runs.looks import one_thread
 from semfov.runs.presets import AGENT
+from semfov.threads import one_thread
 
 
 @dataclass(frozen=True)

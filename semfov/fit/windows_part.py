@@ -15,9 +15,9 @@ from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.metrics.episodes import FloatArray
 from semfov.runs.config import SensorConfig
-from semfov.runs.looks import one_thread
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredWindowLooks
+from semfov.threads import one_thread
 from semfov.zoom import GlimpseEvidence, WindowEye
 from semfov.zoom.episode import WindowStep, find_everything, look_by_look
 from semfov.zoom.looks import WindowLook

@@ -14,6 +14,7 @@ from semfov.io.files import JsonObject
 from semfov.io.schema import Json, Object, Schema, Text
 from semfov.io.state import StatedModule, without_settings
 from semfov.io.storage import checksum, read, write_file
+from semfov.threads import one_thread
 from semfov.version import __version__
 
 _COMMON = ("kind", "version", "metadata")  # values of every record
@@ -100,8 +101,9 @@ class Pretrained(StatedModule):
             path = cls.shipped / f"{name}.safetensors"
         tensors, record = read(path, cls.kind)
         try:
-            cls._check_content(tensors, record)
-            model = cls._restore(record, tensors)
+            with one_thread():  # the first picture waits for dozens of small checks
+                cls._check_content(tensors, record)
+                model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
             reason = " ".join(str(error).split())
             raise DataError(f"{path}: not a complete {cls.title} ({reason})") from None

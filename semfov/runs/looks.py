@@ -1,7 +1,6 @@
 """Computes the looks that are stored, bit for bit the same with any number of threads and processes."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 
 import torch
@@ -13,17 +12,6 @@ from semfov.eye import Eye, View
 
 LOOK_SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.reading", __name__)
 """The modules that turn an image into detections; all modules that they import count, too."""
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Compute on one thread, because the last bits of a parallel sum depend on the number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def photograph_looks(

@@ -17,8 +17,8 @@ from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.runs.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.runs.looks import one_thread
 from semfov.sensor import Foveation, named_sensor
+from semfov.threads import one_thread
 
 _OPTIONAL = "background", "weights", "classes", "head", "stride", "input_size", "runtime", "logits", "per_class"
 """Settings of a detector that are options of `load_detector` of the same name, given only where they are changed."""

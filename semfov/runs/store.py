@@ -22,7 +22,8 @@ from semfov.eye import Eye
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
 from semfov.io.storage import read_tensors, write_tensors
-from semfov.runs.looks import LOOK_SOURCES, one_thread, photograph_looks
+from semfov.runs.looks import LOOK_SOURCES, photograph_looks
+from semfov.threads import one_thread
 from semfov.version import __version__
 
 _Action = TypeVar("_Action", bound=Hashable)
