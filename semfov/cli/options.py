@@ -13,7 +13,6 @@ from semfov.errors import InputError
 from semfov.io.files import JsonObject
 from semfov.io.ranges import Count, Form, Range, Seed, Whole, Workers
 from semfov.kinds import Drawing, Quality
-from semfov.report.template import page_path
 from semfov.runs.settings import Settings
 from semfov.sensor.named import SensorName
 from semfov.settings import (
@@ -174,7 +173,11 @@ class PictureOptions(LookSettings, AgentOptions):
     @property
     def page(self) -> Path | None:
         """File of the page, where `report` names one or its folder."""
-        return None if self.report is None else page_path(self.report)
+        if self.report is None:
+            return None
+        from semfov.report.template import page_path
+
+        return page_path(self.report)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
@@ -27,8 +27,9 @@ from semfov.paths import Record
 from semfov.paths.conversion import Values
 from semfov.paths.look import CONFIDENT, RecordedLook, detections_in_words
 from semfov.paths.regions import Region
-from semfov.report.episode import Data, jpeg
-from semfov.viz import save_figure
+
+if TYPE_CHECKING:
+    from semfov.report.episode import Data
 
 _OBJECTS_LISTED = 20  # largest number of objects that are listed
 _CROP_QUALITY = 92  # of the JPEGs of crops
@@ -261,6 +262,8 @@ def _figure(record: Record, options: PictureOptions) -> dict[str, bytes]:
     """Draw the figure of one picture, if it is wanted; returns the file by its path."""
     if options.figure is None:
         return {}
+    from semfov.viz import save_figure
+
     with tempfile.TemporaryDirectory() as folder:
         drawn = save_figure(record.plot(), Path(folder) / options.figure.name)
         return {str(options.figure): drawn.read_bytes()}
@@ -277,6 +280,8 @@ def _crops(record: Record, source: PictureSource, options: PictureOptions) -> di
     """Cut out what the box of each object shows, or of a search the best place; returns the files by their paths."""
     if options.crops is None:
         return {}
+    from semfov.report.episode import jpeg
+
     root = options.crops
     files = {}
 
@@ -316,6 +321,8 @@ def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawi
     """Draw those figures and the animation that a record of this kind has; returns the files by name."""
     if not drawings:
         return {}
+    from semfov.viz import save_figure
+
     figures = record.figures(boxes)
     drawn = []
     with tempfile.TemporaryDirectory() as folder:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from semfov.cli.formats import FORMATS, CocoResults, JsonLines, ResultsFormat, Row, suffix_of, suffixes
 from semfov.cli.options import FIGURES
@@ -17,8 +17,9 @@ from semfov.data.classes import amount
 from semfov.errors import DataError, check, printable
 from semfov.io.code import package_digest
 from semfov.io.files import write_text, written_alone
-from semfov.runs.results import SceneResults
-from semfov.runs.scene_run import digest_of
+
+if TYPE_CHECKING:
+    from semfov.runs.results import SceneResults
 
 _SHARE = 0.05  # of the time may be spent on writing results that are not complete yet
 STDOUT = Path("-")  # standard output in place of a file of results, which takes JSON lines
@@ -138,7 +139,7 @@ def held_outputs(options: object) -> AbstractContextManager[None]:
     return written_alone(files, folders)
 
 
-def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[PictureSource]) -> SceneResults:
+def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[PictureSource]) -> "SceneResults":
     """Open what a command has finished of pictures that are the same, with all that it depends on.
 
     Args:
@@ -152,6 +153,9 @@ def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[P
     Raises:
         DataError: another command was stopped, and what it has finished is kept there (`check_nothing_kept`).
     """
+    from semfov.runs.results import SceneResults
+    from semfov.runs.scene_run import digest_of
+
     # Half of a sha256 is enough to tell commands apart, and leaves room in the name of a file.
     key = digest_of([depends_on, package_digest()])[:32]
     versions = [json.dumps(source.version()) for source in sources]
@@ -173,6 +177,10 @@ def check_nothing_kept(file: Path, own: Path | None = None) -> None:
     """
     folder = _kept_folder(file)
     others = [path for path in folder.glob("*.sqlite") if path != own]
+    if not others:
+        return
+    from semfov.runs.results import SceneResults
+
     count = sum(len(SceneResults(folder, path.stem, str)) for path in others)
     if count:
         raise DataError(
@@ -192,7 +200,7 @@ def tell_continuing(done: int, total: int) -> None:
         print(f"continuing: {done} of {total} pictures were looked at before")
 
 
-def tell_written(files: Sequence[object], finished: SceneResults | None, part: str | None) -> None:
+def tell_written(files: Sequence[object], finished: "SceneResults | None", part: str | None) -> None:
     """List the files of a command, and say how it continues.
 
     Args:

@@ -1,7 +1,7 @@
 """The files that a command writes about its pictures: results, figures, crops, labels and a page."""
 
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from semfov.cli.jobs import PictureJob
 from semfov.cli.options import PictureOptions
@@ -20,9 +20,10 @@ from semfov.data.classes import amount
 from semfov.errors import SemfovError
 from semfov.io.files import check_apart, plain_name, write_bytes
 from semfov.paths.conversion import Values
-from semfov.report import write_page
-from semfov.report.episode import Data
-from semfov.runs.results import SceneResults
+
+if TYPE_CHECKING:
+    from semfov.report.episode import Data
+    from semfov.runs.results import SceneResults
 
 _KEPT = ("ended", "text", "row", "episode", "names")
 """Attributes of an outcome from which it is made again, without its files."""
@@ -167,6 +168,8 @@ class PictureFiles:
         report = self.job.options.report
         if report is None or not self._episodes:
             return []
+        from semfov.report import write_page
+
         episodes = [self._episodes[number] for number in sorted(self._episodes)]
         totals = [found_in_all(self.job, self.rows.values())]
         skipped = sum("error" in row for row in self.rows.values())

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from semfov.data.images import PhotographPicture, open_pillow, opening, to_bytes, upright_size
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
-from semfov.data.rasters import open_by_windows
 from semfov.data.tone import White, check_white, stated_limits
 from semfov.data.windowed import BY_WINDOWS, Box, ChosenBands, LargePicture
 from semfov.errors import DataError, check, lookup
@@ -101,7 +100,12 @@ def _check_bands(bands: ChosenBands) -> None:
 def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
     """Open a file by the readers of its kind, and note how its values are shown."""
     check_local(path, "picture")
-    picture = open_by_windows(path, white=white, bands=bands) if _has_windows(path) else PhotographPicture(path, white)
+    if _has_windows(path):
+        from semfov.data.rasters import open_by_windows
+
+        picture: LargePicture = open_by_windows(path, white=white, bands=bands)
+    else:
+        picture = PhotographPicture(path, white)
     if white is not None or bands is not None:
         # With which a record can open the file again; percentiles stay a word.
         limits = white if isinstance(white, str | None) else stated_limits(white)

@@ -16,7 +16,6 @@ from semfov.data.images import (
     quiet_decoders,
     read_photograph,
 )
-from semfov.data.rasters import open_by_windows
 from semfov.data.tiff_tags import UPRIGHT, TiffTags
 from semfov.data.tone import White, check_white
 from semfov.data.windowed import BY_WINDOWS
@@ -55,6 +54,8 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     """
     check_white(white)
     if _is_read_by_windows(path, white, oriented):
+        from semfov.data.rasters import open_by_windows
+
         picture = open_by_windows(path, white=white)
         check_area(picture.size, f"image {Path(path)}")
         check_decoding(picture.size, _BYTES_A_PIXEL, Path(path).stat().st_size, f"image {Path(path)}", SMALLER)

@@ -223,7 +223,7 @@ class ComposedScenes(Scenes):
         self._seed = seed
         self.ids = list(range(count))
 
-    def _generator(self, index: int, *part: int) -> np.random.Generator:
+    def _generator(self, index: int, *part: int) -> "np.random.Generator":
         """Make the random numbers of a scene, or of a part of it."""
         return np.random.Generator(np.random.PCG64([self._seed, self.ids[index], *part]))
 

@@ -174,7 +174,7 @@ class EmbeddedScenes(ComposedScenes):
         return json_sha256([_VERSION, _digest(part.photograph.path), part.box, part.mirrored])
 
 
-def _drawn(photograph: _Photograph, generator: np.random.Generator) -> _Part:
+def _drawn(photograph: _Photograph, generator: "np.random.Generator") -> _Part:
     """Draw a random part of a photograph."""
     # The numbers are drawn in this order, on which the scenes of a seed depend.
     full_width, full_height = photograph.objects.size

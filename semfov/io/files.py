@@ -15,8 +15,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from semfov.errors import DataError, check, check_data
 
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part")
@@ -133,6 +131,8 @@ def written_alone(files: Iterable[Path] = (), folders: Iterable[Path] = ()) -> I
 @contextmanager
 def _locked(place: Path, path: Path) -> Iterator[None]:
     """Hold a lock of the system, which lets go of it when the process ends in any way; what is left holds nobody up."""
+    from filelock import FileLock, Timeout
+
     lock = FileLock(place)
     try:
         place.parent.mkdir(parents=True, exist_ok=True)

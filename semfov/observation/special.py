@@ -4,7 +4,6 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -85,6 +84,8 @@ mark_constant(_interpolated)
 @lru_cache
 def _expand(c: float) -> tuple[tuple[float, ...], ...]:
     """Expand P, P' and Stirling's series in powers of g (`_polynomials`)."""
+    from numpy.polynomial import Polynomial
+
     fall = Polynomial([1.0, -1.0])  # 1 - g
     product = Polynomial([1.0])  # P
     for i in range(1, _SHIFT):
@@ -104,6 +105,7 @@ def _expand(c: float) -> tuple[tuple[float, ...], ...]:
 @lru_cache
 def _interpolate(c: float) -> tuple[float, ...]:
     """Interpolate what single precision replaces by a polynomial (`_interpolated`)."""
+    from numpy.polynomial import Chebyshev, Polynomial
 
     def rest(lift: NDArray[np.float64]) -> NDArray[np.float64]:
         """Subtract all other terms of h from h, at values of g."""

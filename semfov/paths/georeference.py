@@ -8,9 +8,7 @@ from typing import Any, Literal, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.gdal import check_system, raster_settings
 from semfov.data.images import quiet_decoders
-from semfov.data.vrt import open_raster
 from semfov.data.windowed import RASTERS
 from semfov.errors import DataError, needing
 from semfov.io.files import check_regular
@@ -87,6 +85,9 @@ def _system_and_transform(source: str) -> tuple[Any, Any]:
         DataError: the file cannot be read.
     """
     import rasterio.transform
+
+    from semfov.data.gdal import raster_settings
+    from semfov.data.vrt import open_raster
 
     try:
         with quiet_decoders, raster_settings():
@@ -200,6 +201,8 @@ def _cut(corners: NDArray[np.float64], side: float) -> NDArray[np.float64]:
 def _is_referenced(source: str) -> bool:
     """Tell whether a TIFF is a GeoTIFF; refuse a reference system that names a file."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    from semfov.data.gdal import check_system
 
     check_regular(source)
     try:

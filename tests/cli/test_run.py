@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 import semfov
-from semfov import DataError, InputError, read_image
+from semfov import DataError, InputError, read_image, viz
 from semfov.cli import outcome, written
 from semfov.cli.jobs import FindJob
 from semfov.cli.options import FindOptions, SearchOptions
@@ -79,7 +79,7 @@ def test_a_call_that_was_stopped_continues(agent, flight, tmp_path, monkeypatch)
         (0, semfov.ActivePerception, "find_all"), (1, semfov.ActivePerception, "find_all"),
         (0, written, "write_bytes"), (1, written, "write_bytes"),
         (1, Record, "to_dict"), (1, Record, "crops"), (1, Record, "to_yolo"), (1, Record, "page_data"),
-        (0, outcome, "save_figure"), (1, outcome, "_outcome_text"),
+        (0, viz, "save_figure"), (1, outcome, "_outcome_text"),
     ],
     ids=lambda value: "" if isinstance(value, type | ModuleType) else str(value),
 )  # fmt: skip
