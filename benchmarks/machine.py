@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from semfov.data import example
@@ -50,6 +51,7 @@ def photograph(width: int = 640, height: int = 480) -> Tensor:
 
 
 def use_threads(count: int) -> None:
-    """Set the number of threads of torch and of OpenCV."""
+    """Set the number of threads of torch, of OpenCV and of the matrix products of NumPy."""
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
+    threadpool_limits(count, user_api="blas")
