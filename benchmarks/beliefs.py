@@ -4,6 +4,7 @@ The published cost of exploration, 9.85 s per decision, is that of loops like th
 """
 
 from collections.abc import Callable
+from itertools import islice
 
 import numpy as np
 import torch
@@ -115,6 +116,25 @@ def kaplan_update() -> Comparison:
     return Comparison(
         "Kaplan's rule, 30 detections", ours, {"loop over cells": loop, "whole map each": brute}, {}, agree
     )
+
+
+def kaplan_updates(episodes: int = 1000, one_by_one: int = 50) -> Comparison:
+    """Fusion of 30 detections into each of many maps at once; the peer fuses some of them one at a time."""
+    beta, (likelihood, footprint) = make_belief(100, batch=episodes).beta, make_look(100, batch=episodes)
+
+    def ours() -> Tensor:
+        return fuse(beta, likelihood, footprint)
+
+    def singles() -> list[Tensor]:
+        maps = zip(beta.split(1), likelihood.split(1), footprint.split(1), strict=True)
+        return [fuse(*each) for each in islice(maps, one_by_one)]
+
+    def agree() -> None:
+        torch.testing.assert_close(ours()[:one_by_one], torch.cat(singles()), rtol=0, atol=0)
+
+    peers: dict[str, Run] = {"one at a time": singles}
+    share = {"one at a time": one_by_one / episodes}
+    return Comparison(f"Kaplan's rule, 30 detections in {episodes:,} episodes", ours, peers, share, agree)
 
 
 def compiled() -> Comparison:

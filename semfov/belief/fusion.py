@@ -20,7 +20,7 @@ __all__ = ["fuse", "kaplan", "product", "semba", "sum"]
 
 _Rule = Callable[[Tensor, Tensor], Tensor]
 # Elements of the maps that are fused together on a CPU; those of many episodes leave the processor's cache.
-_BLOCK = 1 << 19
+_BLOCK = 1 << 17
 RULES: dict[str, _Rule] = {}  # the rules by name, without checks, for likelihoods from `_scale_likelihood`
 
 
