@@ -576,8 +576,10 @@ class GazePrediction(OtherWords):
 
 def _is_blank(photograph: Tensor) -> bool:
     """Tell whether a picture `(3, h, w)` in bytes has one colour."""
-    lowest, highest = photograph.flatten(1).aminmax(dim=1)  # (3,) both
-    return int((highest.int() - lowest.int()).max()) <= _BLANK
+    channels = photograph.flatten(1)
+    # Of bytes, `aminmax` along a dimension takes thirty times as long as both.
+    span = channels.amax(1).int() - channels.amin(1).int()  # (3,)
+    return int(span.max()) <= _BLANK
 
 
 def _fovea_of(looking: Detector | Eye, quality: Quality, panorama: bool) -> Eye:
