@@ -43,6 +43,7 @@ $(STAMP): pyproject.toml constraints.txt
 		/^[a-z ]/ {print >("$(VENV)/" part ".txt")}' constraints.txt
 	printf "$(VENV)/%s.txt\n" cuda torch others | xargs -n 1 -P 3 $(BIN)/python -m pip $(INSTALL)
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m compileall -q semfov  # as pip does with a wheel: the first picture does not wait for it
 	@touch $@
 
 search: $(STAMP)
