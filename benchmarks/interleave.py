@@ -48,7 +48,8 @@ STAGES = ("sensor", "detector", "belief", "policy")
 def load(path: Path, threads: int, spinning: bool) -> OnnxDetector:
     """Load a detector with `threads` threads, which spin while they wait if `spinning`."""
     detector = load_onnx(path, threads=threads)
-    detector.session = OnnxSession(path, threads=threads, spinning=spinning)
+    # In this process, whose time is measured: a model of open size would run in another one.
+    detector.session = OnnxSession(path, threads=threads, spinning=spinning, open_ended=False)
     return detector
 
 
