@@ -32,6 +32,7 @@ _PTZ = "http://www.onvif.org/ver20/ptz/wsdl"
 _TYPES = "http://www.onvif.org/ver10/schema"
 _SOAP = "http://www.w3.org/2003/05/soap-envelope"
 _SPACES = "http://www.onvif.org/ver10/tptz"
+_PREFIXES = {"s": _SOAP, "t": _TYPES, "m": _MEDIA}  # as paths through an answer write them, such as `t:PTZ/t:XAddr`
 _FARTHEST = 1.0  # largest translation of one relative move, in the units of ONVIF
 _BEYOND = 1.001  # largest position in the units of ONVIF, with its rounding
 
@@ -102,7 +103,7 @@ class OnvifClient:
         answer = self.call(self.address, body)
         found = {}
         for name in ("PTZ", "Media"):
-            element = answer.find(f".//{{{_TYPES}}}{name}/{{{_TYPES}}}XAddr")
+            element = answer.find(f".//t:{name}/t:XAddr", _PREFIXES)
             if element is None or not element.text:
                 raise DataError(f"camera: expected a camera with the service {name}, got one without it")
             # A camera behind a router gives its own address, at which it cannot be reached from here: scheme and host
@@ -141,7 +142,7 @@ class OnvifClient:
             raise DataError(f"camera: it refuses a command: {_reason_of(error)}") from None
         except (URLError, HTTPException, OSError, ValueError) as error:
             raise DataError(f"camera: no answer from {address} ({error}); check the address") from None
-        if message.find(f"{{{_SOAP}}}Body/{{{_SOAP}}}Fault") is not None:
+        if message.find("s:Body/s:Fault", _PREFIXES) is not None:
             raise DataError(f"camera: it refuses a command: {_reason(message) or 'it does not say why'}")
         return message
 
@@ -153,7 +154,7 @@ class OnvifClient:
         """
         try:
             answer = self._send(self.address, "", f'<GetSystemDateAndTime xmlns="{_DEVICE}"/>')
-            moment = answer.find(f".//{{{_TYPES}}}UTCDateTime")
+            moment = answer.find(".//t:UTCDateTime", _PREFIXES)
             if moment is None:
                 return timedelta()
             ahead = _time_of(moment) - datetime.now(UTC)
@@ -164,18 +165,20 @@ class OnvifClient:
     def _credentials(self, user: str) -> str:
         """Make the header that names a user, with a digest of the password for this message alone."""
         nonce = os.urandom(16)
-        created = (datetime.now(UTC) + (self._ahead or timedelta())).strftime("%Y-%m-%dT%H:%M:%SZ")
+        now_there = datetime.now(UTC) + (self._ahead or timedelta())
+        created = now_there.strftime("%Y-%m-%dT%H:%M:%SZ")
         # WS-Security UsernameToken: the digest of nonce, time and password, in this order.
         secret = nonce + created.encode() + self.password.encode()
         digest = base64.b64encode(hashlib.sha1(secret).digest()).decode()
-        secext, utility = f"{_SECURITY}wssecurity-secext-1.0.xsd", f"{_SECURITY}wssecurity-utility-1.0.xsd"
         kind = f"{_SECURITY}username-token-profile-1.0#PasswordDigest"
-        return (
-            f'<w:Security xmlns:w="{secext}" s:mustUnderstand="1"><w:UsernameToken>'
-            f'<w:Username>{escape(user)}</w:Username><w:Password Type="{kind}">{digest}</w:Password>'
-            f"<w:Nonce>{base64.b64encode(nonce).decode()}</w:Nonce>"
-            f'<u:Created xmlns:u="{utility}">{created}</u:Created></w:UsernameToken></w:Security>'
-        )
+        parts = [
+            f"<w:Username>{escape(user)}</w:Username>",
+            f'<w:Password Type="{kind}">{digest}</w:Password>',
+            f"<w:Nonce>{base64.b64encode(nonce).decode()}</w:Nonce>",
+            f'<u:Created xmlns:u="{_SECURITY}wssecurity-utility-1.0.xsd">{created}</u:Created>',
+        ]
+        token = f"<w:UsernameToken>{''.join(parts)}</w:UsernameToken>"
+        return f'<w:Security xmlns:w="{_SECURITY}wssecurity-secext-1.0.xsd" s:mustUnderstand="1">{token}</w:Security>'
 
 
 def _parsed(data: bytes) -> XML.Element:
@@ -190,7 +193,7 @@ def _parsed(data: bytes) -> XML.Element:
 
 def _reason(message: XML.Element) -> str:
     """Take the reason from a fault; empty for none."""
-    return message.findtext(f".//{{{_SOAP}}}Reason/{{{_SOAP}}}Text", "").strip()
+    return message.findtext(".//s:Reason/s:Text", "", _PREFIXES).strip()
 
 
 def _reason_of(error: HTTPError) -> str:
@@ -344,7 +347,7 @@ class OnvifCamera(PanTiltCamera):
     def _status(self) -> tuple[Position, bool | None]:
         """Ask for the position, and whether the camera moves; None where it does not say."""
         answer = self._command("GetStatus")
-        pan_and_tilt = answer.find(f".//{{{_TYPES}}}PanTilt[@x]")
+        pan_and_tilt = answer.find(".//t:PanTilt[@x]", _PREFIXES)
         if pan_and_tilt is None:
             raise DataError("camera: expected its position, got a status without pan and tilt")
         pan = _number(pan_and_tilt, "x")
@@ -354,7 +357,7 @@ class OnvifCamera(PanTiltCamera):
         if not is_generic or max(abs(pan), abs(tilt)) > _BEYOND:
             expected = "its position from -1 to 1 (the generic space of ONVIF)"
             raise DataError(f"camera: expected {expected}, got {pan:g}, {tilt:g} in {units or 'no named space'}")
-        zoomed = answer.find(f".//{{{_TYPES}}}Zoom[@x]")
+        zoomed = answer.find(".//t:Zoom[@x]", _PREFIXES)
         zoom = 0.0 if zoomed is None else _number(zoomed, "x")
         return Position(pan, tilt, zoom), _is_moving(answer)
 
@@ -364,7 +367,7 @@ class OnvifCamera(PanTiltCamera):
         while True:
             pan = self._turn(position.pan, goal.pan)
             distance = Position(pan, goal.tilt - position.tilt, goal.zoom - position.zoom)
-            step = Position(*(max(-_FARTHEST, min(_FARTHEST, length)) for length in distance))
+            step = Position(_limited(distance.pan), _limited(distance.tilt), _limited(distance.zoom))
             stop = Position(position.pan + step.pan, position.tilt + step.tilt, position.zoom + step.zoom)
             self._move("RelativeMove", "Translation", step)
             self._wait(stop)
@@ -382,15 +385,19 @@ class OnvifCamera(PanTiltCamera):
         until = time.monotonic() + self.patience
         while True:
             position, moves = self._status()
-            off = max(abs(self._turn(position.pan, goal.pan)), abs(position.tilt - goal.tilt))
-            if self._zooms:
-                off = max(off, abs(position.zoom - goal.zoom))
-            # A camera that was just told to move may not have begun.
-            if off <= _NEAR and not moves:
+            # A camera that was just told to move may not have begun: that it stands still is not enough.
+            if self._distance(position, goal) <= _NEAR and not moves:
                 return
             if time.monotonic() > until:
                 raise DataError(f"camera: expected it at {goal} within {self.patience:g} s, got {position}")
             time.sleep(_POLL)
+
+    def _distance(self, position: Position, goal: Position) -> float:
+        """Compute the longest of the ways to a goal; the zoom of a camera that does not zoom says nothing."""
+        pan = abs(self._turn(position.pan, goal.pan))
+        tilt = abs(goal.tilt - position.tilt)
+        zoom = abs(goal.zoom - position.zoom) if self._zooms else 0.0
+        return max(pan, tilt, zoom)
 
     def _move(self, command: str, name: str, to: Position) -> None:
         """Send a movement."""
@@ -408,8 +415,8 @@ class OnvifCamera(PanTiltCamera):
     def _first_profile(self, media: str) -> str:
         """Ask for the first media profile of which pan and tilt can be set."""
         answer = self.client.call(media, f'<GetProfiles xmlns="{_MEDIA}"/>')
-        for profile in answer.iter(f"{{{_MEDIA}}}Profiles"):
-            if profile.find(f"{{{_TYPES}}}PTZConfiguration") is not None:
+        for profile in answer.iterfind(".//m:Profiles", _PREFIXES):
+            if profile.find("t:PTZConfiguration", _PREFIXES) is not None:
                 return profile.get("token", "")
         raise DataError("camera: expected a media profile with pan and tilt, got none; set it up in the camera")
 
@@ -418,7 +425,7 @@ def _time_of(moment: XML.Element) -> datetime:
     """Read a date and a time; raise `ValueError` where a part of them is no number."""
 
     def number(group: str, name: str) -> int:
-        return int(moment.findtext(f"{{{_TYPES}}}{group}/{{{_TYPES}}}{name}", ""))
+        return int(moment.findtext(f"t:{group}/t:{name}", "", _PREFIXES))
 
     return datetime(
         number("Date", "Year"),
@@ -433,10 +440,15 @@ def _time_of(moment: XML.Element) -> datetime:
 
 def _is_moving(status: XML.Element) -> bool | None:
     """Read from a status whether any motor moves; None where it says nothing of them."""
-    states = [element.text for element in status.findall(f".//{{{_TYPES}}}MoveStatus/*")]
+    states = [element.text for element in status.iterfind(".//t:MoveStatus/*", _PREFIXES)]
     if "MOVING" in states:
         return True
     return False if "IDLE" in states else None
+
+
+def _limited(length: float) -> float:
+    """Shorten a translation to the longest that one relative move makes."""
+    return max(-_FARTHEST, min(_FARTHEST, length))
 
 
 def _focal(field: float) -> float:
