@@ -89,15 +89,9 @@ class _CameraScene(Sphere):
     still = False
 
     def __init__(self, camera: PanTiltCamera, color: Color = "rgb") -> None:
-        if isinstance(camera, type):
-            raise InputError(f"camera: expected a camera, got the class {camera.__name__}; give {camera.__name__}(…)")
-        names = ("look_at", "size", "pan", "tilt", "fields", "speeds")
-        missing = [name for name in names if not hasattr(camera, name)]
-        got = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
-        check(not missing, "camera", f"a camera with {', '.join(names)}", got)
+        _check_camera(camera)
         fields = check_fields(camera.fields)
-        for name, limits in (("pan", camera.pan), ("tilt", camera.tilt)):
-            check_limits(name, limits)
+        # As many pixels to a degree as the narrowest view has.
         width = min(_WIDEST, 2 * round(180 * camera.size[0] / fields[0]))
         super().__init__(
             (width, width // 2), camera.size, pan=camera.pan, tilt=camera.tilt, fields=fields, speeds=camera.speeds
@@ -116,9 +110,12 @@ class _CameraScene(Sphere):
             frame = self.camera.look_at((pan, tilt), field)
             if not isinstance(frame, CameraFrame):
                 return self._image_of(frame, pose, pose)
-            real_pose = pose.new_tensor([*frame.direction, field if frame.field is None else frame.field])
-            error = max(float(Sphere.turn(self, real_pose, pose)), abs(float(real_pose[2]) - field))
-            if error <= field / 10:
+            real_field = field if frame.field is None else frame.field
+            real_pose = pose.new_tensor([*frame.direction, real_field])
+            # Between the optical axes: `turn` of this scene is that of the motors.
+            turn_error = float(super().turn(real_pose, pose))
+            field_error = abs(float(real_pose[2]) - field)
+            if max(turn_error, field_error) <= field / 10:
                 return self._image_of(frame.image, real_pose, pose)
         expected = f"a frame from pan {pan:.1f}°, tilt {tilt:.1f}°, field {field:.1f}° after {_TRIES} attempts"
         got = "pan {:.1f}°, tilt {:.1f}°, field {:.1f}°".format(*real_pose.tolist())
@@ -160,6 +157,18 @@ class _CameraScene(Sphere):
             nearest = frame[:, row.clamp(0, height - 1), column.clamp(0, width - 1)]
             canvas[:, inside] = nearest.float() / 255
         return canvas.unflatten(-1, (rows, columns))
+
+
+def _check_camera(camera: object) -> None:
+    """Raise `InputError` unless this is a camera with all that a scene around it needs, its limits in degrees."""
+    if isinstance(camera, type):
+        raise InputError(f"camera: expected a camera, got the class {camera.__name__}; give {camera.__name__}(…)")
+    names = ("look_at", "size", "pan", "tilt", "fields", "speeds")
+    missing = [name for name in names if not hasattr(camera, name)]
+    got = f"{type(camera).__name__} without {', '.join(missing)}; derive it from semfov.head.PanTiltCamera"
+    check(not missing, "camera", f"a camera with {', '.join(names)}", got)
+    for name in ("pan", "tilt"):
+        check_limits(name, getattr(camera, name))
 
 
 SceneLike: TypeAlias = World | PanTiltCamera | LargePicture | ImageLike
