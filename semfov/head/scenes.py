@@ -365,13 +365,7 @@ class Panorama(Sphere):
         if not isinstance(image, tuple):
             pixels = as_image(image, color=color)
             image = (pixels.shape[-1], pixels.shape[-2])
-            width, height = image
-            if abs(width / height - 2) > 0.1:
-                warnings.warn(
-                    f"image: expected a panorama of 360 by 180 degrees, which is twice as wide as high, got {width} × "
-                    f"{height} px; its views are distorted, and how='head' turns a head in front of a flat picture",
-                    stacklevel=2,
-                )
+            _warn_of_proportions(*image)
         super().__init__(image, size, tilt=(-reach, reach), fields=fields, speeds=speeds, cell=cell)
         self.reach = reach
         self._source: Tensor | None = None
@@ -384,6 +378,16 @@ class Panorama(Sphere):
         if self._source is None:
             return super().view(pose)
         return sample(self._source, pose, self.size).clamp(0, 1), pose
+
+
+def _warn_of_proportions(width: int, height: int) -> None:
+    """Warn the caller of `Panorama` of a picture that is not about twice as wide as high."""
+    if abs(width / height - 2) > 0.1:
+        warnings.warn(
+            f"image: expected a panorama of 360 by 180 degrees, which is twice as wide as high, got {width} × "
+            f"{height} px; its views are distorted, and how='head' turns a head in front of a flat picture",
+            stacklevel=3,
+        )
 
 
 class _Plane(_Scene):
@@ -420,16 +424,22 @@ class _Plane(_Scene):
         self.centres = self.scene.centres
         self.area = torch.ones(len(self.scene))
 
+    def _window_size(self, field: float) -> tuple[float, float]:
+        """Compute width and height, in pixels of the picture, of the window of a field of view."""
+        width = field * self.degree
+        return width, width * self.size[1] / self.size[0]
+
     def _box(self, pose: Tensor) -> tuple[int, int, int, int]:
         """Find the window `(x1, y1, x2, y2)` of a pose in whole pixels."""
         pan, tilt, field = pose.tolist()
         picture_width, picture_height = self.picture
-        width = field * self.degree
-        height = width * self.size[1] / self.size[0]
+        width, height = self._window_size(field)
         columns = max(1, round(width))
         rows = max(1, round(height))
-        x = round(picture_width / 2 + pan * self.degree - width / 2)
-        y = round(picture_height / 2 - tilt * self.degree - height / 2)
+        middle_x = picture_width / 2 + pan * self.degree
+        middle_y = picture_height / 2 - tilt * self.degree  # pixels count down, and tilts up
+        x = round(middle_x - width / 2)
+        y = round(middle_y - height / 2)
         # Windows at the border of the picture may be rounded to a place one pixel beyond it.
         x1 = min(max(x, 0), picture_width - columns)
         y1 = min(max(y, 0), picture_height - rows)
@@ -474,8 +484,7 @@ class _Plane(_Scene):
     def poses(self, field: float) -> list[list[Tensor]]:
         """List the windows of a field of view that lie inside the picture, half a window apart, in rows."""
         picture_width, picture_height = self.picture
-        width = field * self.degree
-        height = width * self.size[1] / self.size[0]
+        width, height = self._window_size(field)
         is_inside = round(width) <= picture_width and round(height) <= picture_height
         got = f"{field} degrees, {width:.0f} × {height:.0f} pixels; give narrower `fields`, or a smaller `degree`"
         expected = f"a window inside the picture of {picture_width} × {picture_height} pixels"
@@ -489,7 +498,8 @@ class _Plane(_Scene):
         """Spread windows of a side over a length, half a window apart at most; middles in degrees from its middle."""
         steps = 2 * math.ceil(length / side - 1 - 1e-9)
         room = length - side
-        return [room * (step / max(steps, 1) - 0.5) / self.degree for step in range(steps + 1)]
+        shares = [step / max(steps, 1) for step in range(steps + 1)]
+        return [room * (share - 0.5) / self.degree for share in shares]
 
     def aim(self, point: Tensor, field: float) -> Tensor:
         """Find the pose of the window whose middle is nearest to a point."""
