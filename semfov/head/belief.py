@@ -128,12 +128,13 @@ class SceneObserver(Observer):
         if before is None:
             before = self.inner.start(1, views.view_grid, values)
         view = self.inner.update(before, look.inner)
-        cells = views.visible[pose]  # (V,), of the scene
+        shown = views.shown[pose]
+        cells = shown.cells  # (V,), of the scene
         probabilities = views.spread(self._probabilities(view, look.target), pose).mT  # (V, C)
         closest_so_far = belief.closest[0, cells]
         is_owner = belief.owner[0, cells] == pose
         # The distances of this gaze, and of earlier ones in the same view.
-        distance = views.distances[pose][int(look.cell)]
+        distance = shown.distances[int(look.cell)]
         nearest = torch.minimum(distance, torch.where(is_owner, closest_so_far, torch.inf))
         # The view takes the cells to which its gaze came closest, and renews those that it had.
         takes = (nearest <= closest_so_far) | is_owner

@@ -132,7 +132,7 @@ class CloserLookOffers:
         if self.speeds is None:
             return gains
         gains = gains / views.durations(here, self.speeds)[actions]
-        turns = views.world.turn(views.poses[here // views.cells], views.poses[actions // views.cells])
+        turns = views.turns(here)[actions // views.cells]
         return torch.where(self.speeds.makes(turns), gains, OUT)
 
     def _best(self, belief: SceneBelief) -> list[int]:

@@ -118,6 +118,14 @@ class HeadStep(NamedTuple):
     ahead: float = 0.0
 
 
+class _NextLook(NamedTuple):
+    """A look that was chosen, with the value that it was chosen for, and its seconds with the movement to it."""
+
+    action: int
+    gain: float
+    seconds: float
+
+
 def look_around(
     views: Views,
     detect: Detect,
@@ -155,12 +163,12 @@ def look_around(
     looks = _HeadLooks(views, detect, target)
     forgetting = Forgetting(views.world.rate) if views.world.rate else None
     memory = Memory.empty(looks, observer, 1)
-    action = start
-    spent = speeds.look  # seconds at the end of the present look
-    ahead = 0.0  # seconds that the next one takes
-    gain = math.inf  # value that it is chosen for
+    clock = speeds.look  # seconds at the end of the present look; the first one begins at 0
+    present = _NextLook(start, math.inf, 0.0)
     for number in range(passes):
-        looks.passed = ahead
+        action = present.action
+        clock += present.seconds
+        looks.passed = present.seconds
         cell = torch.tensor([action])
         look, memory = attend(looks, observer, memory, _ONE, cell, views.grid.centres[cell], forgetting)
         belief = own(memory.belief, SceneBelief, "belief")
@@ -172,16 +180,14 @@ def look_around(
         choice = Greedy(drawn_by(generator, len(views.grid), looks.like))
         _, chosen = choice(number, _ONE, values, memory.visited, views.grid.centres)
         following = int(chosen)
-        chosen_for = gain
-        spent += ahead
-        ahead = float(views.durations(action, speeds)[following])
+        seconds = float(views.durations(action, speeds)[following])
         gain = float(values[0, following])
-        yield HeadStep(action, spent, belief, look.detections(), chosen_for, ahead)
-        is_too_late = spent + ahead > duration
-        is_worthless = gain <= OUT or (min_gain > 0 and gain * ahead < min_gain)
+        yield HeadStep(action, clock, belief, look.detections(), present.gain, seconds)
+        is_too_late = clock + seconds > duration
+        is_worthless = gain <= OUT or (min_gain > 0 and gain * seconds < min_gain)
         if is_too_late or is_worthless or bool(memory.visited.all()):
             return
-        action = following
+        present = _NextLook(following, gain, seconds)
 
 
 def _generator(seed: int | Sequence[int]) -> torch.Generator:

@@ -50,7 +50,7 @@ class LookGain(nn.Module):
     def __init__(self, views: Views) -> None:
         super().__init__()
         self.views = views
-        self._acuity = [views.acuity(distance) for distance in views.distances[: views.lattice]]
+        self._acuity = [views.acuity(shown.distances) for shown in views.shown[: views.lattice]]
 
     def closer(self, belief: SceneBelief, cells: Tensor) -> Tensor:
         """Compute the expected gain of closer looks at places, with a narrower field of view.
@@ -116,7 +116,7 @@ class SearchGain(LookGain):
         found = new_chance[views.gaze_cell]  # (A,)
         gains = torch.zeros_like(found)
         for pose in poses:
-            cells = views.visible[pose]
+            cells = views.shown[pose].cells
             gain_in_sharpness = (self._acuity[pose] - sharpness[cells]).clamp(min=0)  # (cells, V)
             sharper = gain_in_sharpness @ weighted[cells]
             actions = slice(pose * views.cells, (pose + 1) * views.cells)
@@ -179,13 +179,13 @@ class ExploreGain(LookGain):
         unseen_worth = torch.where(is_seen, 0.0, self.unseen * views.world.area)
         gains = torch.full((len(views.grid),), OUT)
         for pose in poses:
-            cells = views.visible[pose]
+            cells = views.shown[pose].cells
             fixated = torch.arange(views.cells) if pose == here else self._landings
             gain = self._acuity[pose][fixated] @ unseen_worth[cells]
             is_seen_here = is_seen[cells]
             if bool(is_seen_here.any()):
                 seen = cells[is_seen_here]
-                distance = views.distances[pose][fixated][:, is_seen_here]  # (fixated, seen)
+                distance = views.shown[pose].distances[fixated][:, is_seen_here]  # (fixated, seen)
                 corrected = corrected_cells(probabilities[:, seen], belief.closest[:, seen], distance, views.fovea)[0]
                 gain = gain + corrected @ views.world.area[seen]
             gains[pose * views.cells + fixated] = gain
@@ -245,8 +245,6 @@ class PerSecond(AcquisitionFunction):
         allowed[self.poses] = True
         if self.speeds is not None:
             values = values / views.durations(self.action, self.speeds)
-            pose = views.poses[present_pose]
-            turn = views.world.turn(pose.expand_as(views.poses), views.poses)
-            allowed &= self.speeds.makes(turn)
+            allowed &= self.speeds.makes(views.turns(self.action))
         allowed_actions = allowed.repeat_interleave(views.cells)
         return torch.where(allowed_actions, values, OUT)[None]

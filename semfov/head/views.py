@@ -1,6 +1,7 @@
 """The poses of a head and the fixations of its eye, numbered as the actions of an episode."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -13,6 +14,21 @@ from semfov.head.scenes import World, check_fields
 from semfov.head.speeds import Speeds
 
 _POINTS = 10  # number of cells in a row and in a column of a view, as the shipped models were fitted on
+
+
+@dataclass(frozen=True)
+class ShownCells:
+    """The V cells of the scene that a view shows.
+
+    Attributes:
+        cells: `(V,)`, their numbers.
+        points: `(V, 2)`, the pixels of the view at which it shows them.
+        distances: `(cells, V)`, from the cells of the view, as fractions of its longer side.
+    """
+
+    cells: Tensor
+    points: Tensor
+    distances: Tensor
 
 
 class Views:
@@ -38,9 +54,7 @@ class Views:
         grid: cells of the strip.
         gaze: `(A, D)`, point of the scene that an action fixates.
         gaze_cell: `(A,)`, cell of the scene there.
-        visible: for each pose, the cells of the scene that it shows, `(V,)`.
-        points: for each pose, the pixels of the view at which it shows them, `(V, 2)`.
-        distances: for each pose, distances from the cells of its view to those seen, `(cells, V)`.
+        shown: for each pose, the cells of the scene that it shows.
     """
 
     def __init__(self, world: World, fields: Sequence[float] | None = None, *, fovea: float = 100 / 640) -> None:
@@ -66,14 +80,7 @@ class Views:
         shifts = [world.shift(centres[:, None], centres[None], field) for field in fields]
         self._shifts = torch.stack(shifts)
         self._field_numbers = [len(fields) - 1] * self.lattice
-        self.visible: list[Tensor] = []
-        self.points: list[Tensor] = []
-        self.distances: list[Tensor] = []
-        for pose in self.poses:
-            points, inside = world.to_view(world.centres, pose)
-            self.visible.append(inside.nonzero()[:, 0])
-            self.points.append(points[inside])
-            self.distances.append(self._distances(pose, points[inside]))
+        self.shown = [self._shown(pose, *world.to_view(world.centres, pose)) for pose in self.poses]
 
     def _strip(self) -> Grid:
         """Make the grid of the cells of all views."""
@@ -113,14 +120,12 @@ class Views:
             Its number.
         """
         number = len(self.poses)
-        actions = self.cells
-        self.poses = torch.cat([self.poses, pose[None]])
-        self.gaze = torch.cat([self.gaze, self.gaze[:actions]])
-        self.gaze_cell = torch.cat([self.gaze_cell, self.gaze_cell[:actions]])
+        # Room for what the view of the new pose shows, which `replace` writes.
+        self.poses = F.pad(self.poses, (0, 0, 0, 1))
+        self.gaze = F.pad(self.gaze, (0, 0, 0, self.cells))
+        self.gaze_cell = F.pad(self.gaze_cell, (0, self.cells))
         self._field_numbers.append(0)
-        self.visible.append(self.visible[0])
-        self.points.append(self.points[0])
-        self.distances.append(self.distances[0])
+        self.shown.append(self.shown[0])
         self.grid = self._strip()
         return self.replace(number, pose)
 
@@ -151,10 +156,19 @@ class Views:
         if not bool(inside[middle]):
             inside[middle] = True
             points[middle] = self.view_grid.extent / 2 - 0.5
-        self.visible[number] = inside.nonzero()[:, 0]
-        self.points[number] = points[inside]
-        self.distances[number] = self._distances(pose, points[inside])
+        self.shown[number] = self._shown(pose, points, inside)
         return number
+
+    def _shown(self, pose: Tensor, points: Tensor, inside: Tensor) -> ShownCells:
+        """Describe the cells of the scene that a pose `(3,)` shows.
+
+        Args:
+            pose: the pose.
+            points: `(S, 2)`, the pixels of its view at which the middles of all cells lie.
+            inside: `(S,)` boolean, which of them the view shows.
+        """
+        shown_points = points[inside]
+        return ShownCells(inside.nonzero()[:, 0], shown_points, self._distances(pose, shown_points))
 
     def field_of(self, pose: Tensor) -> float:
         """Find the field of view of a pose, which has it in the precision of a tensor."""
@@ -182,7 +196,9 @@ class Views:
     def reachable(self) -> Tensor:
         """Cells of the scene that the views that tile it show, `(S,)` boolean."""
         reachable = torch.zeros(len(self.world.scene), dtype=torch.bool)
-        reachable[torch.cat([self.visible[pose] for row in self.tiling for pose in row])] = True
+        for row in self.tiling:
+            for pose in row:
+                reachable[self.shown[pose].cells] = True
         return reachable
 
     def spread(self, values: Tensor, pose: int) -> Tensor:
@@ -196,7 +212,7 @@ class Views:
             `(C, V)`.
         """
         image = values.unflatten(-1, (_POINTS, _POINTS))[None]  # (1, C, rows, columns)
-        shares = (self.points[pose] + 0.5) / self.view_grid.extent
+        shares = (self.shown[pose].points + 0.5) / self.view_grid.extent
         place = (2 * shares - 1)[None, None].to(values)  # (1, 1, V, 2), from -1 to 1, as `grid_sample` takes them
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
 
@@ -218,6 +234,11 @@ class Views:
         """
         return 1 / (1 + distance / self.fovea)
 
+    def turns(self, action: int) -> Tensor:
+        """Compute by which angles the head turns from the pose of an action to all poses, `(P,)` in degrees."""
+        pose = self.poses[action // self.cells]
+        return self.world.turn(pose.expand_as(self.poses), self.poses)
+
     def durations(self, action: int, speeds: Speeds) -> Tensor:
         """Compute the time from one action to each other one, the look there included.
 
@@ -229,9 +250,9 @@ class Views:
             `(A,)` in seconds.
         """
         number, cell = divmod(action, self.cells)
-        pose = self.poses[number]
-        head = self.world.turn(pose.expand_as(self.poses), self.poses)
-        octaves = (self.poses[:, 2] / pose[2]).log2()
+        head = self.turns(action)
+        fields = self.poses[:, 2]
+        octaves = (fields / fields[number]).log2()
         # The angle of the saccade is measured in the field of view of the new pose.
         shifts_from_cell = self._shifts[:, cell]  # (fields, cells)
         eye = shifts_from_cell[torch.tensor(self._field_numbers)]  # (poses, cells)

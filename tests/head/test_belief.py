@@ -61,7 +61,7 @@ def test_belief_about_one_view_equals_that_of_an_eye_without_a_head(views, eye, 
     for cell in cells:
         point = views.view_grid.centres[cell][None]
         alone = inner(alone, eye.look(view, point), point, views.view_grid, 3)
-    shown, points = views.visible[pose], views.points[pose]
+    shown, points = views.shown[pose].cells, views.shown[pose].points
     for number in range(0, len(shown), 7):
         # Bilinear interpolation by hand, between the four cells around the point.
         at = (points[number] + 0.5) / torch.tensor([6.4, 4.8]) - 0.5
@@ -84,7 +84,7 @@ def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
     for count, (belief, action) in enumerate(zip(beliefs, actions, strict=True), 1):
         place, cell = divmod(action, 100)
         centre = views.view_grid.centres[cell]
-        for number, point in zip(views.visible[place].tolist(), views.points[place], strict=True):
+        for number, point in zip(views.shown[place].cells.tolist(), views.shown[place].points, strict=True):
             distance = torch.linalg.vector_norm(point - centre) / 64
             distances[place, number] = torch.minimum(distances[place, number], distance)
         nearest, owner = distances.amin(0), belief.owner[0]
@@ -216,7 +216,7 @@ def test_explore_gain_equals_brute_force(views, eye, models):
             continue
         place, cell = divmod(action, 100)
         value = 0.0
-        for x, point in zip(views.visible[place].tolist(), views.points[place], strict=True):
+        for x, point in zip(views.shown[place].cells.tolist(), views.shown[place].points, strict=True):
             distance = torch.linalg.vector_norm(point - views.view_grid.centres[cell]) / 64
             if belief.owner[0, x] < 0:
                 value += float(area[x]) * 0.2 / (1 + float(distance) / fovea)
@@ -272,7 +272,7 @@ def test_a_still_head_that_forgets_believes_what_an_eye_without_a_head_does(view
         keep = math.exp(-0.5 * (step.seconds - seconds)) if seconds else 1.0
         belief = inner.update(inner.fade(belief, look, keep, belief.visited), look)
         seconds = step.seconds
-        got = step.belief.probability(3)[0, views.visible[pose]]
+        got = step.belief.probability(3)[0, views.shown[pose].cells]
         torch.testing.assert_close(got, views.spread(belief.probability(3), pose)[0], atol=1e-5, rtol=0)
 
 

@@ -38,8 +38,8 @@ def test_narrower_fields_add_no_poses_before_they_are_looked_through(speck):
     wide, zooming = (Views(Panorama(speck, fields=fields)) for fields in ((60.0,), (2.0, 60.0)))
     assert torch.equal(wide.poses, zooming.poses)
     assert torch.equal(wide.gaze_cell, zooming.gaze_cell)
-    for one, other in zip(wide.distances, zooming.distances, strict=True):
-        assert torch.equal(one, other)
+    for one, other in zip(wide.shown, zooming.shown, strict=True):
+        assert torch.equal(one.distances, other.distances)
 
 
 def views_of(kind):
@@ -169,8 +169,8 @@ def test_a_pose_that_takes_a_free_number_is_as_one_that_is_added(speck):
     assert len(one) == len(other)
     for name in ("poses", "gaze", "gaze_cell"):
         assert torch.equal(getattr(one, name), getattr(other, name))
-    for name in ("visible", "points", "distances"):
-        assert torch.equal(getattr(one, name)[number], getattr(other, name)[number])
+    for name in ("cells", "points", "distances"):
+        assert torch.equal(getattr(one.shown[number], name), getattr(other.shown[number], name))
     assert torch.equal(one.durations(0, Speeds()), other.durations(0, Speeds()))
 
 
