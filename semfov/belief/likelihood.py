@@ -5,9 +5,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
+from semfov.belief.grid import Footprint, Grid
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_shape
+
+_LEAST = 1e-6  # of the likelihood of background, by which the others are divided
 
 
 class Observation(Protocol):
@@ -79,3 +81,24 @@ def likelihoods(
     if observation is not None:
         likelihood = observation.calibrate(likelihood, grid.box_distance(detections.boxes, fixation))
     return likelihood.pow(tempering)
+
+
+def likelihood_ratios(detections: Detections, fixation: Tensor, grid: Grid, observation: Observation) -> Tensor:
+    r"""Compute the calibrated likelihoods relative to background, :math:`p(S \mid k, d) / p(S \mid 0, d)`.
+
+    Args:
+        detections: a batch `(B, L)`, boxes in pixels of the grid's image.
+        fixation: `(B, 2)`, in pixels.
+        grid: the cells.
+        observation: model that calibrates the scores by distance.
+
+    Returns:
+        `(B, L, K+1)`, 1 for background unless its likelihood is below 1e-6.
+    """
+    likelihood = likelihoods(detections, fixation, grid, observation)
+    return likelihood / likelihood[..., :1].clamp(min=_LEAST)
+
+
+def cells_of_detections(detections: Detections, grid: Grid, rule: Footprint = "overlap") -> Tensor:
+    """Find the cells that detections cover, `(B, L, X·Y)` (`Grid.footprint`); padding covers none."""
+    return grid.footprint(detections.boxes, rule) * detections.mask[..., None]

@@ -19,6 +19,9 @@ from semfov.observation.thresholds import Thresholds
 
 _Kind = TypeVar("_Kind")
 
+WEAK_PRIOR = 1e-5
+"""ε, the Dirichlet parameter of every class before the first look, which one look outweighs."""
+
 _REACH = 1 / 6  # distance, in longer sides of the image, over which a faded look counts as farther by a factor e
 
 
@@ -209,6 +212,20 @@ def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
             "observer"
         )
     return value
+
+
+def faded_parameters(beta: Tensor, prior: float, keep: float) -> Tensor:
+    r"""Move Dirichlet parameters towards the prior, :math:`\beta_0 + k (\beta - \beta_0)`.
+
+    Args:
+        beta: the parameters, of any shape.
+        prior: β₀, the parameter of every class before the first look.
+        keep: k, the share of the evidence to keep.
+
+    Returns:
+        The new parameters.
+    """
+    return prior + keep * (beta - prior)
 
 
 def farther(keep: float) -> float:

@@ -9,8 +9,8 @@ from torch import Tensor
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.fusion import RULES, fuse_scaled, scale_covering
 from semfov.belief.grid import Footprint, Grid
-from semfov.belief.likelihood import Observation, likelihoods
-from semfov.belief.observers.base import Evidence, Observer, farther, own
+from semfov.belief.likelihood import Observation, cells_of_detections, likelihoods
+from semfov.belief.observers.base import Evidence, Observer, faded_parameters, farther, own
 from semfov.detection.detections import Detections
 from semfov.errors import check, lookup
 from semfov.observation.foveal import FovealObservationModel
@@ -106,8 +106,9 @@ class Semantic(Observer):
     ) -> SemanticEvidence:
         """Compute the likelihoods of the detections (`likelihoods`), the same for every target."""
         likelihood = likelihoods(detections, fixation, grid, self.observation, tempering=self.tempering)
-        cells = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
-        return SemanticEvidence(scale_covering(likelihood, cells), cells, grid.distance(fixation).to(likelihood))
+        cells = cells_of_detections(detections, grid, self.footprint)
+        scaled = scale_covering(likelihood, cells)
+        return SemanticEvidence(scaled, cells, grid.distance(fixation).to(likelihood))
 
     def update(self, belief: Belief, look: Evidence) -> DirichletBelief:
         """Fuse one more look in each episode."""
@@ -146,7 +147,7 @@ class Semantic(Observer):
         old = dirichlet_belief(belief)
         if keep == 1:
             return old
-        faded = self.prior + keep * (old.beta - self.prior)
+        faded = faded_parameters(old.beta, self.prior, keep)
         return replace(old, beta=faded, closest=old.closest + farther(keep))
 
     def extra_repr(self) -> str:

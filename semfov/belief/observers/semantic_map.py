@@ -8,13 +8,10 @@ from torch import Tensor
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.fusion import RULES
 from semfov.belief.grid import Grid
-from semfov.belief.likelihood import likelihoods
-from semfov.belief.observers.base import Evidence, Observer, farther, own
+from semfov.belief.likelihood import cells_of_detections, likelihood_ratios
+from semfov.belief.observers.base import WEAK_PRIOR, Evidence, Observer, faded_parameters, farther, own
 from semfov.detection.detections import Detections
 from semfov.observation.foveal import FovealObservationModel
-
-_LEAST = 1e-6  # of the likelihood of background, by which the others are divided
-_WEAK = 1e-5  # ε, the Dirichlet parameter of a prior that one look outweighs
 
 
 @dataclass(frozen=True)
@@ -67,14 +64,14 @@ class SemanticMap(Observer):
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> DirichletBelief:
         """Begin with the same small parameter for every class in every cell."""
-        return DirichletBelief(like.new_full((batch, len(grid), self.components), _WEAK))
+        return DirichletBelief(like.new_full((batch, len(grid), self.components), WEAK_PRIOR))
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> CellEvidence:
         """Sum what the detections in each cell say, the same for every target."""
-        likelihood = likelihoods(detections, fixation, grid, self.model)
-        ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
-        covered = grid.footprint(detections.boxes) * detections.mask[..., None]
-        return CellEvidence(covered.to(ratio).mT @ ratio, grid.distance(fixation).to(ratio))
+        ratio = likelihood_ratios(detections, fixation, grid, self.model)
+        covered = cells_of_detections(detections, grid).to(ratio)
+        ratio_of_cells = covered.mT @ ratio  # (B, X·Y, K+1)
+        return CellEvidence(ratio_of_cells, grid.distance(fixation).to(ratio))
 
     def log_likelihood(self, ratio: Tensor) -> Tensor:
         """Compute the logarithm of the likelihood of every class in a cell.
@@ -105,8 +102,9 @@ class SemanticMap(Observer):
         """Take the likelihood of cells to which the look is closer than all before."""
         old = dirichlet_belief(belief)
         cells = own(look, CellEvidence, "look")
-        prior = torch.full_like(old.beta, _WEAK)
-        fused = RULES["kaplan"](prior, self.log_likelihood(cells.ratio.to(prior)).softmax(-1))
+        prior = torch.full_like(old.beta, WEAK_PRIOR)
+        likelihood = self.log_likelihood(cells.ratio.to(prior)).softmax(-1)
+        fused = RULES["kaplan"](prior, likelihood)
         is_closer = (cells.distance < old.closest)[..., None]
         return replace(
             old,
@@ -122,4 +120,5 @@ class SemanticMap(Observer):
         old = dirichlet_belief(belief)
         if keep == 1:
             return old
-        return replace(old, beta=_WEAK + keep * (old.beta - _WEAK), closest=old.closest + farther(keep))
+        faded = faded_parameters(old.beta, WEAK_PRIOR, keep)
+        return replace(old, beta=faded, closest=old.closest + farther(keep))

@@ -10,17 +10,14 @@ from semfov.belief.association import one_of, refuted
 from semfov.belief.belief import Belief, DirichletBelief, pick
 from semfov.belief.fusion import RULES
 from semfov.belief.grid import Footprint, Grid
-from semfov.belief.likelihood import likelihoods
-from semfov.belief.observers.base import Evidence, Observer, farther, own
+from semfov.belief.likelihood import cells_of_detections, likelihood_ratios
+from semfov.belief.observers.base import WEAK_PRIOR, Evidence, Observer, faded_parameters, farther, own
 from semfov.belief.prior import Prior, PriorLike, with_prior
 from semfov.detection.detections import Detections
 from semfov.errors import check
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.presence import EVEN, Presence, log_evidence, presence_facts
 from semfov.observation.thresholds import Thresholds
-
-_LEAST = 1e-6  # of the likelihood of background, by which the others are divided
-_WEAK = 1e-5  # ε, the Dirichlet parameter of a prior that one look outweighs
 
 
 @dataclass(frozen=True)
@@ -187,7 +184,7 @@ class SemanticSearch(Observer):
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> SearchBelief:
         """Begin with the same small parameter for every class in every cell."""
-        beta = like.new_full((batch, len(grid), self.components), _WEAK)
+        beta = like.new_full((batch, len(grid), self.components), WEAK_PRIOR)
         visited = torch.zeros_like(beta[..., 0], dtype=torch.bool)
         return SearchBelief(
             beta,
@@ -202,19 +199,16 @@ class SemanticSearch(Observer):
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SearchEvidence:
         """Compute the likelihoods of the detections, relative to background, the same for every target."""
-        likelihood = likelihoods(detections, fixation, grid, self.model)
-        ratio = likelihood / likelihood[..., :1].clamp(min=_LEAST)
-        covered = grid.footprint(detections.boxes) * detections.mask[..., None]
-        weight = covered
-        if self.footprint != "overlap":
-            weight = grid.footprint(detections.boxes, self.footprint) * detections.mask[..., None]
+        ratio = likelihood_ratios(detections, fixation, grid, self.model)
+        covered = cells_of_detections(detections, grid)
+        weight = covered if self.footprint == "overlap" else cells_of_detections(detections, grid, self.footprint)
         return SearchEvidence(
-            ratio,
-            weight,
-            covered,
-            grid.distance(fixation).to(ratio),
-            grid.cell_of(fixation),
-            log_evidence(detections.highest.to(ratio)),
+            ratio=ratio,
+            weight=weight,
+            covered=covered,
+            distance=grid.distance(fixation).to(ratio),
+            fixated=grid.cell_of(fixation),
+            evidence=log_evidence(detections.highest.to(ratio)),
         )
 
     def unseen(self, like: Tensor) -> Tensor:
@@ -240,12 +234,14 @@ class SemanticSearch(Observer):
         weight = seen.weight.to(old.beta)
         share = self.model.refutation.clamp(0, 1).to(old.beta)
         remaining = refuted(weight, seen.covered.to(old.beta), visited, share)
-        is_closer = (seen.distance < old.closest)[..., None]
         odds = self.model.miss_odds(seen.distance).to(weight)
+        fused = _fusion(seen, weight, odds)
+        fused_for_next = _fusion(seen, remaining, odds)
+        is_closer = (seen.distance < old.closest)[..., None]
         return replace(
             old,
-            beta=torch.where(is_closer, _fusion(seen, weight, odds), old.beta),
-            following=torch.where(is_closer, _fusion(seen, remaining, odds), old.following),
+            beta=torch.where(is_closer, fused, old.beta),
+            following=torch.where(is_closer, fused_for_next, old.following),
             visited=visited,
             evidence=torch.maximum(old.evidence, seen.evidence.to(old.beta)),
             looks=old.looks + 1,
@@ -264,8 +260,8 @@ class SemanticSearch(Observer):
             return old
         return replace(
             old,
-            beta=_WEAK + keep * (old.beta - _WEAK),
-            following=_WEAK + keep * (old.following - _WEAK),
+            beta=faded_parameters(old.beta, WEAK_PRIOR, keep),
+            following=faded_parameters(old.following, WEAK_PRIOR, keep),
             visited=visited,
             evidence=keep * old.evidence,
             looks=keep * old.looks,
@@ -285,4 +281,5 @@ def _fusion(look: SearchEvidence, weight: Tensor, odds: Tensor) -> Tensor:
         Dirichlet parameters, `(B, X·Y, K+1)`.
     """
     likelihood = one_of(look.ratio.to(weight), weight, odds)
-    return RULES["kaplan"](torch.full_like(odds, _WEAK), likelihood / likelihood.amax(-1, keepdim=True))
+    scaled = likelihood / likelihood.amax(-1, keepdim=True)  # the rule without checks takes a maximum of 1
+    return RULES["kaplan"](torch.full_like(odds, WEAK_PRIOR), scaled)
