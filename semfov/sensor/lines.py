@@ -259,28 +259,30 @@ def difference(
     """
     rows = down.count
     width = across.length
+    weights_of_rows, weights_of_columns = weights
+    # Between the passes, each line of the planes is followed by the line of the others.
     between = planes.new_empty(rows, 2, width)
-    weighted_across = _weighted(across, weights[1])
-    # The second pass reads a line of the planes and one of the others alternately.
-    minus = _weighted(down, -weights[0])
+    every_second_line = (0, 1, 2 * width)
+    across_planes = _products(across, 1, rows, (0, 1, across.count), every_second_line)
+    weighted_across = _weighted(across, weights_of_columns)
+    across_others = _products(weighted_across, 1, rows, (0, 1, across.count), every_second_line)
+    # The second pass adds a line of the planes, and subtracts one of the others.
+    minus = _weighted(down, -weights_of_rows)
     alternating = Lines(
-        2 * rows,
-        down.length,
-        None,
-        _alternated(down.ends, minus.ends),
-        _alternated(down.middle, minus.middle),
-        down.rows,
-        2 * down.start,
-        2 * down.shift,
+        count=2 * rows,
+        length=down.length,
+        dense=None,
+        ends=_alternated(down.ends, minus.ends),
+        middle=_alternated(down.middle, minus.middle),
+        rows=down.rows,
+        start=2 * down.start,
+        shift=2 * down.shift,
     )
-    first_passes = [
-        _products(lines, 1, rows, (0, 1, across.count), (0, 1, 2 * width)) for lines in (across, weighted_across)
-    ]
-    second_pass = _products(alternating, 1, width, (0, width, 1), (0, width, 1))
+    down_both = _products(alternating, 1, width, (0, width, 1), (0, width, 1))
     for plane, other, target in zip(planes, others, result, strict=True):
-        _multiply(first_passes[0], plane, plane.storage_offset(), between, 0)
-        _multiply(first_passes[1], other, other.storage_offset(), between, width)
-        _multiply(second_pass, between, 0, target, target.storage_offset())
+        _multiply(across_planes, plane, plane.storage_offset(), between, 0)
+        _multiply(across_others, other, other.storage_offset(), between, width)
+        _multiply(down_both, between, 0, target, target.storage_offset())
 
 
 def _alternated(matrix: Tensor, other: Tensor) -> Tensor:
@@ -293,8 +295,9 @@ def _weighted(lines: Lines, weight: Tensor) -> Lines:
     tiles, tile, _ = lines.middle.shape
     edge = lines.ends.shape[1]
     stop = lines.rows + tiles * tile
-    ends = torch.stack([weight[:edge], weight[len(weight) - edge :]])[..., None] * lines.ends
-    return replace(lines, ends=ends, middle=weight[lines.rows : stop].view(tiles, tile, 1) * lines.middle)
+    weight_of_ends = torch.stack([weight[:edge], weight[len(weight) - edge :]])  # (2, edge)
+    weight_of_tiles = weight[lines.rows : stop].view(tiles, tile, 1)
+    return replace(lines, ends=weight_of_ends[..., None] * lines.ends, middle=weight_of_tiles * lines.middle)
 
 
 def _multiply(products: list[_Product], source: Tensor, read_from: int, target: Tensor, write_from: int) -> None:
