@@ -84,10 +84,10 @@ class Eye(StatedModule):
             image = as_image(image, like=self.sensor.like)[None]
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.fit(image)
-        scale = as_positions(torch.tensor(placement.scale, dtype=torch.float64), canvas) * (
-            max(placement.size) / self.reference
-        )
-        return View(canvas, placement, self.sensor.open(canvas, scale))
+        # From the image to the canvas, and from an image of the reference size to this one.
+        to_canvas = as_positions(torch.tensor(placement.scale, dtype=torch.float64), canvas)
+        from_reference = max(placement.size) / self.reference
+        return View(canvas, placement, self.sensor.open(canvas, to_canvas * from_reference))
 
     def fit(self, image: Tensor) -> tuple[Tensor, Placement]:
         """Fit an image into the canvas of the sensor, which is the detector's input unless the sensor says otherwise.
@@ -243,16 +243,21 @@ class Eye(StatedModule):
         """Resample a window of an image to a `(width, height)`; of bytes, floats are made around it alone."""
         if image.dtype != torch.uint8:
             return glimpse(image, window[None], size)
-        ratio = float((window[2:] - window[:2]).amax()) / max(size)
+        sides = window[2:] - window[:2]
+        ratio = float(sides.amax()) / max(size)  # pixels of the image for one of the canvas
         # The filter reaches a pixel of the canvas further than the window.
         reach = math.ceil(max(ratio, 1.0)) + 1
         x1, y1, x2, y2 = window.tolist()
         left = max(math.floor(x1) - reach, 0)
         top = max(math.floor(y1) - reach, 0)
-        part = image[:, :, top : math.ceil(y2) + reach, left : math.ceil(x2) + reach]
+        right = math.ceil(x2) + reach
+        bottom = math.ceil(y2) + reach
+        part = image[:, :, top:bottom, left:right]
         copy = _floats(part, ratio, self.sensor.like)
+        # The window in pixels of the copy.
         scale = window.new_tensor([copy.shape[-1] / part.shape[-1], copy.shape[-2] / part.shape[-2]])
-        on_copy = (window - window.new_tensor([left, top]).repeat(2)) * scale.repeat(2)
+        corner = window.new_tensor([left, top])
+        on_copy = (window - corner.repeat(2)) * scale.repeat(2)
         return glimpse(copy, on_copy[None], size)
 
     def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
@@ -287,7 +292,8 @@ def _floats(image: Tensor, ratio: float, like: Tensor) -> Tensor:
     """Make floats in [0, 1] of bytes `(1, 3, h, w)`, reduced where they are to have far fewer pixels (`ratio`)."""
     reduction = reduction_for(ratio)
     height, width = image.shape[-2:]
-    return resized(image[0], (max(1, height // reduction), max(1, width // reduction))).to(like) / 255
+    size = (max(1, height // reduction), max(1, width // reduction))
+    return resized(image[0], size).to(like) / 255
 
 
 def _on_canvas(fixations: PointLike, view: View) -> Tensor:

@@ -128,14 +128,16 @@ class Panoramas(ComposedScenes):
         columns, rows = self._pixels_around(patch, camera)
         pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()  # (rows, columns, 2)
         directions = panorama_directions(pixels.flatten(0, 1), self.size)
-        points, _ = camera.points(directions)  # (rows · columns, 2)
+        points, _ = camera.points(directions)
+        points = points.unflatten(0, (len(rows), len(columns)))
         x1, y1, x2, y2 = patch.box
+        # Boxes count from the edges of pixels, and points from their centres.
         low = points.new_tensor([x1, y1]) - 0.5
         high = points.new_tensor([x2, y2]) - 0.5
-        inside = ((points >= low) & (points < high)).all(-1).view(len(rows), len(columns))
+        inside = ((points >= low) & (points < high)).all(-1)
         # Places in the photograph as `grid_sample` takes them, from -1 to 1; far ones, behind the camera, are unused.
         place = 2 * (points - low) / (high - low) - 1
-        place = place.nan_to_num().clamp(-2, 2).view(1, *inside.shape, 2)
+        place = place.nan_to_num().clamp(-2, 2)[None]
         projection = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)[0]
         row, column = inside.nonzero().unbind(-1)
         canvas[:, rows[row], columns[column]] = projection[:, row, column]

@@ -135,7 +135,8 @@ class Sensor(StatedModule, ABC):
     def _stated(self) -> dict[str, object]:
         """List the constructor's settings, without those that are parameters."""
         learned = {name.removeprefix("log_") for name in self._parameters}
-        return {name: value for name, value in self.settings().items() if name in {*self.names} - learned}
+        stated = {*self.names} - learned
+        return {name: value for name, value in self.settings().items() if name in stated}
 
     @classmethod
     def from_settings(cls, settings: Settings) -> Self:

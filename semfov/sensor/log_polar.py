@@ -54,7 +54,9 @@ class _Retina:
 
     def level(self, eccentricity: float) -> float:
         """Compute the level of a Gaussian pyramid, also between two, whose pixels are as large as a receptive field."""
-        field = self.pooling * self.spacing * (1 + eccentricity / self.fovea) * sqrt(self.scale[0] * self.scale[1])
+        at_fixation = self.pooling * self.spacing  # in pixels of the retina
+        across, down = self.scale
+        field = at_fixation * (1 + eccentricity / self.fovea) * sqrt(across * down)  # in pixels of the image
         return min(max(log2(field), 0.0), float(_TALLEST))
 
     def eccentricity(self, ring: int) -> float:

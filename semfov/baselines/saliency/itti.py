@@ -119,22 +119,23 @@ def _conspicuity(image: Tensor) -> Tensor:
     levels = max(_CENTRES) + max(_DELTAS)
     pyramid = _dyadic_pyramid(anchor(double_opponency(image)), levels)
     finest = min(_CENTRES)
-    features = [_with_orientations(level) for level in pyramid[finest:]]
+    features = {finest + number: _with_orientations(level) for number, level in enumerate(pyramid[finest:])}
     total = torch.zeros((), dtype=image.dtype, device=image.device)
     for scale in _CENTRES:
-        centre = features[scale - finest]
-        size = (centre.shape[-2], centre.shape[-1])
-        contrasts = []
-        for delta in _DELTAS:
-            surround = features[scale - finest + delta]
-            enlarged = F.interpolate(surround, size, mode="bilinear", align_corners=False)
-            contrasts.append((centre - enlarged).abs())
+        contrasts = [_contrast(features[scale], features[scale + delta]) for delta in _DELTAS]
         maps = _promote(torch.stack(contrasts, 1)).sum(1)
         # Across-scale addition happens at the coarsest centre.
         total = total + _dyadic_pyramid(maps, max(_CENTRES) - scale)[-1]
     intensity, colour, orientation = total.split([1, 2, len(_ORIENTATIONS)], 1)
     channels = [intensity, colour.sum(1, keepdim=True), _promote(orientation).sum(1, keepdim=True)]
     return torch.cat(channels, 1)
+
+
+def _contrast(centre: Tensor, surround: Tensor) -> Tensor:
+    """Compute the centre-surround difference of features `(B, C, h, w)` and of those at a coarser scale."""
+    size = (centre.shape[-2], centre.shape[-1])
+    enlarged = F.interpolate(surround, size, mode="bilinear", align_corners=False)
+    return (centre - enlarged).abs()
 
 
 def _with_orientations(level: Tensor) -> Tensor:
