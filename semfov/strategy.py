@@ -96,13 +96,20 @@ class Strategy(nn.Module):
             return self, index, {index: 1.0}
         by_target: Mapping[Any, float] = target if isinstance(target, Mapping) else dict.fromkeys(target, 1.0)
         check(len(by_target) > 0, "target", "a class, or several classes with weights", "none")
-        weights: dict[int, float] = {}
-        for name, weight in by_target.items():
-            index = class_index(name, classes[1:], "target")
-            check(index not in weights, "target", "each class once", f"{classes[index]!r} twice")
-            weights[index] = weight
+        weights = _weights_by_index(by_target, classes)
         policy = self.policy
         uses_probabilities = policy.name in (TargetPosterior.name, Uniform.name) or policy.function.by_place
         expected = f"one class for policy {policy.name!r}, which does not use probabilities"
         check(uses_probabilities, "target", expected, dict(by_target))
-        return Strategy(AnyOf(self.observer, weights), policy), max(weights, key=weights.__getitem__), weights
+        most_probable = max(weights, key=weights.__getitem__)
+        return Strategy(AnyOf(self.observer, weights), policy), most_probable, weights
+
+
+def _weights_by_index(by_target: Mapping[Any, float], classes: Sequence[str]) -> dict[int, float]:
+    """Find the weights of the classes 1..K that are meant; raises `InputError` for an unknown class, or one twice."""
+    weights: dict[int, float] = {}
+    for target, weight in by_target.items():
+        index = class_index(target, classes[1:], "target")
+        check(index not in weights, "target", "each class once", f"{classes[index]!r} twice")
+        weights[index] = weight
+    return weights

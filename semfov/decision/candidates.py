@@ -292,22 +292,26 @@ class CandidateCells(CandidatePlaces[Step]):
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Find the most evident place, if a fixated cell is nearly as probable as any, or no other look follows."""
         probability = self._step.belief.probability(self._target)[0]
-        for place in self._examined:
-            probability = probability.masked_fill(place.cells, 0)
+        for examined in self._examined:
+            probability = probability.masked_fill(examined.cells, 0)
         is_located = bool(place_known(probability, self._step.visited[0], thresholds.place))
         if not last and not is_located:
             return None
+        place = self._most_evident(probability)
+        return None if place is None or place.probability < thresholds.place else place
+
+    def _most_evident(self, probability: Tensor) -> CandidatePlace | None:
+        """Find the cell with the largest product of probability `(X·Y,)` and evidence; None without evidence."""
         boxes = torch.cat([look.detections.boxes[0] for _, look in self._looks])
         if not len(boxes):
             return None
         evidence = self._evidence(boxes)  # (N, X·Y)
         value = probability * evidence.amax(0)
         cell = int(value.argmax())
-        chance = float(probability[cell])
-        if float(value[cell]) <= 0 or chance < thresholds.place:
+        if float(value[cell]) <= 0:
             return None
         best = int(evidence[:, cell].argmax())
-        return CandidatePlace(boxes[best], float(evidence[best, cell]), chance, cell)
+        return CandidatePlace(boxes[best], float(evidence[best, cell]), float(probability[cell]), cell)
 
     def _evidence(self, boxes: Tensor) -> Tensor:
         """Evidence of each detection of all looks in each cell: its faded score times its footprint.

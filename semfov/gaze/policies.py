@@ -56,16 +56,11 @@ class Policy(nn.Module):
         **settings: object,
     ) -> None:
         super().__init__()
-        if not isinstance(function, type):
-            # All names are listed for the message alone.
-            function = FUNCTIONS[function if function in FUNCTIONS else lookup(function, FUNCTIONS, "policy")]
-        kind = getattr(function, "__name__", function)
-        check(issubclass(function, AcquisitionFunction), "function", "a class of acquisition functions", kind)
-        self.function = function
+        self.function = _function_class(function)
         self.model = self._model_for(model)
         self._check_settings(settings)
         if samples is not None:
-            predicts = "likelihoods" in function.takes
+            predicts = "likelihoods" in self.function.takes
             check(predicts, "samples", f"None for policy {self.name!r}, which predicts no look", samples)
             assert isinstance(model, FovealObservationModel)
             settings["likelihoods"] = sampled_likelihoods(model, samples, calibrated=calibrated)
@@ -133,6 +128,16 @@ class Policy(nn.Module):
                 expected = "a target to search for" if name == "target" else f"{name} of a scene"
                 raise InputError(f"policy {self.name!r}: expected {expected}, got none")
         return arguments
+
+
+def _function_class(function: str | type[AcquisitionFunction]) -> type[AcquisitionFunction]:
+    """Find the class of an acquisition function by its name; a class of one is returned as it is."""
+    if isinstance(function, type):
+        expected = "a class of acquisition functions"
+        check(issubclass(function, AcquisitionFunction), "function", expected, function.__name__)
+        return function
+    # All names, the baselines included, are listed for the message alone.
+    return FUNCTIONS[function if function in FUNCTIONS else lookup(function, FUNCTIONS, "policy")]
 
 
 def policy_names(task: Task) -> list[str]:
