@@ -3,7 +3,7 @@
 import math
 import unicodedata
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import wraps
@@ -230,12 +230,18 @@ def lookup(name: str, known: Iterable[_Name], what: str) -> _Name:
     names = list(known)
     if name in names:
         return names[names.index(name)]
-    # Names that begin with it come first: of `yolox`, `yolox-nano` differs in more letters than `yolov3`.
-    beginning = [each for each in names if name and each.startswith(str(name))]
-    longer = get_close_matches(str(name), beginning, n=3, cutoff=0.0)
-    similar = list(dict.fromkeys([*longer, *get_close_matches(str(name), names, n=3, cutoff=0.5)]))[:3]
+    similar = _similar_names(str(name), names)
     hint = f"did you mean {' or '.join(map(repr, similar))}?" if similar else f"known: {', '.join(names) or 'none'}"
     raise InputError(f"unknown {what} {name!r}; {hint}")
+
+
+def _similar_names(name: str, known: Sequence[str]) -> list[str]:
+    """List up to three known names that are nearest to a name, first those that begin with it."""
+    # Of `yolox`, `yolox-nano` differs in more letters than `yolov3`.
+    longer = [longer_name for longer_name in known if name and longer_name.startswith(name)]
+    beginning_with_it = get_close_matches(name, longer, n=3, cutoff=0.0)
+    close = get_close_matches(name, known, n=3, cutoff=0.5)
+    return list(dict.fromkeys([*beginning_with_it, *close]))[:3]
 
 
 def check_options(options: Iterable[str], known: Iterable[str], what: str) -> None:

@@ -210,17 +210,17 @@ def other_method(method: str, option: str, known: Collection[str]) -> str | None
         The advice; None if there is none.
     """
     meant = (option, *OPTIONS.get(option, "").split())
-    advice = next((_OTHER_METHODS[method, word] for word in meant if (method, word) in _OTHER_METHODS), None)
-    if advice is not None:
-        return advice
+    for word in meant:
+        if (method, word) in _OTHER_METHODS:
+            return _OTHER_METHODS[method, word]
     if method not in _LOOKING or meant_options(option, known):
         return None
     if option in _OTHER_PLACES:
         return _OTHER_PLACES[option]
-    of_detector = next((name for name in meant if name in _OF_DETECTORS), None)
-    if of_detector is None:
-        return None
-    return f"an agent is made with it: semfov.ActivePerception.recommended({of_detector}=…)"
+    for word in meant:
+        if word in _OF_DETECTORS:
+            return f"an agent is made with it: semfov.ActivePerception.recommended({word}=…)"
+    return None
 
 
 MAKERS = {"ActivePerception": "ActivePerception.recommended()"}
