@@ -89,8 +89,8 @@ def foveate(
         row = points[None] if points.ndim == 2 else points
         return foveate(bands, row, sigma=sigma, growth=growth)[0]
     images = image if isinstance(image, Bands) else as_batch(image)
-    like = images.base if isinstance(images, Bands) else images
-    _warn_of_shares(points, images.shape if isinstance(images, Bands) else images.shape[-2:])
+    like = _like(images)
+    _warn_of_shares(points, _size(images))
     fovea = Fovea.at(points, sigma, growth, like)
     if _blocks_pay(images, fovea, levels):
         views = _foveate_in_blocks(images, fovea, levels, convention)
@@ -133,7 +133,9 @@ def _collapse(bands: Bands, windows: tuple[FovealWindow, ...], into: Tensor | No
     views = bands.base[:, None]  # all fixations share the coarsest level
     for k in reversed(range(len(windows))):
         expanded = _expand(views, bands.sizes[k], bands.convention)
-        views = _blend(expanded, windows[k].plane(), bands.details[k][:, None], into if k == 0 else None)
+        band = bands.details[k][:, None]
+        memory = into if k == 0 else None  # which has the size of the finest band
+        views = _blend(expanded, windows[k].plane(), band, memory)
     return views
 
 
@@ -189,8 +191,8 @@ def _foveate_in_blocks(images: Tensor | Bands, fovea: Fovea, levels: int, conven
     Returns:
         Views `(B, G, C, H, W)` with the dtype of the images.
     """
-    like = images.base if isinstance(images, Bands) else images
-    height, width = images.shape if isinstance(images, Bands) else images.shape[-2:]
+    like = _like(images)
+    height, width = _size(images)
     channels = like.shape[1]
     batch, number = fovea.count
     block = max(1, _BLOCK // max(1, channels * height * width))  # views that are made together
@@ -253,6 +255,16 @@ def _slices(count: int, step: int) -> Iterator[slice]:
     """Cut `count` rows into parts of at most `step`."""
     for first in range(0, count, step):
         yield slice(first, first + step)
+
+
+def _like(images: Tensor | Bands) -> Tensor:
+    """Give a tensor with the batch, the channels, the dtype and the device of images, or of their pyramid."""
+    return images.base if isinstance(images, Bands) else images
+
+
+def _size(images: Tensor | Bands) -> tuple[int, int]:
+    """Read the `(height, width)` of images, or of those of a pyramid."""
+    return images.shape if isinstance(images, Bands) else (images.shape[-2], images.shape[-1])
 
 
 def _bands(images: Tensor | Bands, levels: int, convention: Convention) -> Bands:

@@ -161,7 +161,8 @@ def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "korni
     >>> [tuple(level.shape[-2:]) for level in gaussian_pyramid(torch.rand(1, 3, 64, 48), 2)]
     [(64, 48), (32, 24), (16, 12)]
     """
-    _check(image, convention, levels)
+    _check(image, convention)
+    _check_levels(image, levels)
     pyramid = [widened(image)]
     for _ in range(levels):
         pyramid.append(reduce(pyramid[-1], convention))
@@ -186,7 +187,8 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     >>> [tuple(band.shape[-2:]) for band in bands.details], tuple(bands.base.shape[-2:])
     ([(64, 48), (32, 24), (16, 12)], (8, 6))
     """
-    _check(image, convention, levels)
+    _check(image, convention)
+    _check_levels(image, levels)
     bands = []
     level = widened(image)
     for _ in range(levels):
@@ -228,13 +230,17 @@ def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int]
     return min(height, width) > 1 and tuple(size) == (2 * height, 2 * width)
 
 
-def _check(image: Tensor, convention: Convention, levels: int | None = None) -> None:
-    """Raise `InputError` unless `image` is `(B, C, H, W)` of floats, with a pixel for a pyramid of `levels`."""
-    check(levels is None or levels >= 0, "levels", "0 or more", levels)
+def _check(image: Tensor, convention: Convention) -> None:
+    """Raise `InputError` unless `image` is `(B, C, H, W)` of floats, and the convention is known."""
     check_shape(image, "image", None, None, None, None)
     check(image.is_floating_point(), "image", "floating-point numbers", image.dtype)
-    check(levels is None or min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
     lookup(convention, get_args(Convention), "pyramid convention")
+
+
+def _check_levels(image: Tensor, levels: int) -> None:
+    """Raise `InputError` unless a pyramid of so many levels can be made of `image`."""
+    check(levels >= 0, "levels", "0 or more", levels)
+    check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
 
 
 @constant
