@@ -218,8 +218,7 @@ class Grid:
         if rule == "soft":
             shared = self._in_cells(sides.overlap(), torch.logical_and)
             return self._in_cells(sides.log_weight(), torch.add).exp() * shared
-        box_centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
-        central_cell = self.cell_of(box_centre)
+        central_cell = self.cell_of(box_centres(boxes))
         covered = central_cell[..., None] == torch.arange(len(self), device=boxes.device)
         if rule == "centre":
             inside = self._in_cells(sides.holds_middle(), torch.logical_and)
@@ -266,8 +265,7 @@ class Grid:
         check_finite(fixation, "fixation")
         boxes = as_positions(boxes)
         fixation = as_positions(fixation)
-        centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
-        offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
+        offset = torch.linalg.vector_norm(box_centres(boxes) - fixation[..., None, :], dim=-1)
         return offset / self._layout(offset).longest[..., None]
 
     def distance(self, fixation: Tensor) -> Tensor:
@@ -302,6 +300,11 @@ class Grid:
         offset = self.centres[..., :, None, :] - self.centres[..., None, :, :]  # (B, X·Y, X·Y, 2)
         longer_side = self.extent.amax(-1)[..., None, None]
         return torch.linalg.vector_norm(offset, dim=-1) / longer_side
+
+
+def box_centres(boxes: Tensor) -> Tensor:
+    """Compute the centres of boxes `(..., 4)` as points `(..., 2)`, half a pixel before the coordinates of boxes."""
+    return (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
 
 
 def _layout(columns: int, rows: int, extent: Tensor) -> _Layout:

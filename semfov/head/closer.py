@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from semfov.belief.grid import box_centres
 from semfov.detection.detections import Detections
 from semfov.head.belief import SceneBelief
 from semfov.head.gain import OUT, LookGain
@@ -80,7 +81,7 @@ class CloserLookOffers:
         may_show = detections.mask[0] & (scores >= _FAINTEST)
         boxes = detections.boxes[0, may_show]
         size = boxes.new_tensor(self.views.world.size)
-        middles = (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5
+        middles = box_centres(boxes)
         inside = ((middles >= -0.5) & (middles <= size - 0.5)).all(-1)
         return boxes[inside], middles[inside]
 
