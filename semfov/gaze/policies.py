@@ -119,14 +119,16 @@ class Policy(nn.Module):
 
     def _arguments(self, scene: Mapping[str, object]) -> dict[str, object]:
         """Choose what the function takes of a scene, and add the settings; raises `InputError` for what it lacks."""
-        parameters = self.function.takes
-        arguments = {name: value for name, value in scene.items() if name in parameters and value is not None}
-        arguments |= {name: getattr(self, name) for name in self._settings}
-        for name, parameter in parameters.items():
+        arguments: dict[str, object] = {}
+        for name, parameter in self.function.takes.items():
+            value = getattr(self, name) if name in self._settings else scene.get(name)
             is_needed = parameter.default is parameter.empty
-            if is_needed and arguments.get(name) is None:
+            if is_needed and value is None:
                 expected = "a target to search for" if name == "target" else f"{name} of a scene"
                 raise InputError(f"policy {self.name!r}: expected {expected}, got none")
+            # A setting may be None; of a scene, None is no argument, and the default stands.
+            if name in self._settings or value is not None:
+                arguments[name] = value
         return arguments
 
 

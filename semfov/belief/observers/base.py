@@ -56,22 +56,25 @@ class Evidence:
         Returns:
             One batch with all looks, in order.
         """
-
-        def joined(values: Sequence[Any]) -> Any:
-            first = values[0]
-            if isinstance(first, Tensor):
-                return torch.cat(list(values))
-            if isinstance(first, Evidence):
-                return type(first).join(values)
-            if isinstance(first, tuple):
-                return tuple(joined(part) for part in zip(*values, strict=True))
-            return first
-
         changes = {}
         for field in fields(cls):  # type: ignore[arg-type]
             values = [getattr(look, field.name) for look in looks]
-            changes[field.name] = joined(_padded(values) if field.name in cls.by_detection else values)
+            if field.name in cls.by_detection:
+                values = _padded(values)
+            changes[field.name] = _joined(values)
         return replace(looks[0], **changes)  # type: ignore[type-var]
+
+
+def _joined(values: Sequence[Any]) -> Any:
+    """Join the values of a field of several batches of looks; a value that all looks share is that of the first."""
+    first = values[0]
+    if isinstance(first, Tensor):
+        return torch.cat(list(values))
+    if isinstance(first, Evidence):
+        return type(first).join(values)
+    if isinstance(first, tuple):
+        return tuple(_joined(parts) for parts in zip(*values, strict=True))
+    return first
 
 
 def _padded(values: Sequence[Tensor]) -> list[Tensor]:
