@@ -53,6 +53,21 @@ class Bootstrap:
         apart = torch.where(there, self.samples - self.samples.nanmean(0), 0.0)
         return (apart.square().sum(0) / (there.sum(0) - 1)).sqrt()
 
+    def cells(self, row: int, digits: int = 3, *, sign: str = "", unit: float = 1.0) -> list[str]:
+        """Write a row of the figures, each with its standard error, such as `0.512 ± 0.013`, for a table.
+
+        Args:
+            row: number of the row.
+            digits: decimal places.
+            sign: `+` writes the sign of positive values, too.
+            unit: factor of all figures, 100 for percent.
+
+        Returns:
+            The cells.
+        """
+        pairs = zip(self.value[row].tolist(), self.error[row].tolist(), strict=True)
+        return [f"{unit * value:{sign}.{digits}f} ± {unit * error:.{digits}f}" for value, error in pairs]
+
     def interval(self, level: float = 0.95) -> Tensor:
         """Interval that contains a share of the samples, with as many below as above it; → `(2, ...)`."""
         ends = self.samples.new_tensor([(1 - level) / 2, (1 + level) / 2])

@@ -125,7 +125,9 @@ class _CodeLooks(Looks):
     empty: Tensor
 
     def __init__(self, eye: Eye, image: Tensor, grid: Grid) -> None:
-        self.eye, self.grid, self.like = eye, grid, image
+        self.eye = eye
+        self.grid = grid
+        self.like = image
         self._crops: RememberedLooks[int, Detections] = RememberedLooks(self._open)
 
     def _open(self) -> Callable[[int], Detections]:
@@ -168,7 +170,8 @@ class _Inhibited(Greedy):
 
     def __init__(self, noise: Tensor, looks: _CodeLooks, *, escape: bool) -> None:
         super().__init__(drawn_from(noise))
-        self.looks, self.escape = looks, escape
+        self.looks = looks
+        self.escape = escape
         self.inhibited = torch.zeros(len(noise), noise.shape[-1], dtype=torch.bool)
 
     def __call__(
@@ -216,21 +219,15 @@ def _search_as_semba(config: _SembaConfig) -> None:
     head = [*(f"CP@{n}" for n in _SHIFTS if n <= config.protocol.shifts), "stopped", "right of those"]
     ways = [f"{step.name}, {rule}" for step, rule in product(_STEPS, _RULES)]
     rows = [["as in the code of SemBA, rule", *head]]
-    rows += [[way, *_cells(bootstrap, n)] for n, way in enumerate(ways)]
+    rows += [[way, *bootstrap.cells(n, 1, unit=100)] for n, way in enumerate(ways)]
     differences = [["less the row of this rule before", *head]]
     for n in range(len(_RULES), len(ways)):
         before = bootstrap.less(n - len(_RULES))
-        differences.append([ways[n], *_cells(before, n, "+")])
+        differences.append([ways[n], *before.cells(n, 1, sign="+", unit=100)])
     lines = [*table(rows), "", *table(differences)]
     text = "\n".join([f"{len(results)} searches in {len(set(scenes))} photographs", "", *lines, ""])
     write_text(config.out / "summary.md", text)
     print(text)
-
-
-def _cells(figures: Bootstrap, row: int, sign: str = "") -> list[str]:
-    """Cells of a row of the table, in %."""
-    pairs = zip(figures.value[row].tolist(), figures.error[row].tolist(), strict=True)
-    return [f"{100 * value:{sign}.1f} ± {100 * error:.1f}" for value, error in pairs]
 
 
 @torch.inference_mode()
@@ -240,8 +237,11 @@ def _search_scene(config: _SembaConfig, run: Looking, index: int) -> list[Tensor
     annotation = run.scenes.annotation(index)
     middle = grid.cell_of(grid.extent[None] / 2)
     covered = grid.footprint(annotation.boxes)
-    goals = {target: covered[annotation.labels == target].any(0) for target in run.scenes.targets(index)}
-    goals = {target: goal for target, goal in goals.items() if not bool(goal[middle])}
+    goals: dict[int, Tensor] = {}
+    for target in run.scenes.targets(index):
+        cells_of_target = covered[annotation.labels == target].any(0)
+        if not bool(cells_of_target[middle]):  # no search starts on its target
+            goals[target] = cells_of_target
     if not goals:
         return []
     targets = torch.tensor([*goals], dtype=torch.int64)
@@ -258,9 +258,8 @@ def _search_scene(config: _SembaConfig, run: Looking, index: int) -> list[Tensor
     for step, rule in product(_STEPS, _RULES):
         looks_of_code = code_looks[step.picture]
         looks: Looks = looks_of_code if step.scores else looks_here
-        choice = Greedy(drawn_from(noise))
-        if step.inhibition:
-            choice = _Inhibited(noise, looks_of_code, escape=step.escape)
+        inhibited = _Inhibited(noise, looks_of_code, escape=step.escape)
+        choice = inhibited if step.inhibition else Greedy(drawn_from(noise))
         # Scores of the code have no component for background: classes are components from 0 on.
         first = 0 if step.scores else 1
         observer = Semantic(len(run.scenes.classes) + first, prior=config.belief.prior, fusion=rule)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from eval.bootstrap import Bootstrap
+from eval.comparison.records import grouped
 from semfov.agents.window_episode import LIKELY
 from semfov.data.scene import Annotation
 from semfov.detection.detections import Detections
@@ -102,23 +103,8 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
         are left out.
     """
     after = {}
-    for number, (objects, listed, unseen, spread, given, faint) in returned.items():
-        right, sure = right_boxes(objects, annotation), right_boxes(listed, annotation)
-        counts = right >= 0
-        chances = objects.scores[counts]
-        mean, variance = number_of_faint(chances) if faint else number_of(chances, unseen or (0.0, 0.0), spread)
-        alike = (box_iou(plain.boxes, listed.boxes) >= _SAME) & (plain.labels[:, None] == listed.labels)
-        after[str(number)] = {
-            "scores": chances.tolist(),
-            "labels": objects.labels[counts].tolist(),
-            "right": right[counts].tolist(),
-            "listed": int((sure >= 0).sum()),
-            "listed right": int((sure > 0).sum()),
-            "kept": int(alike.any(1).sum()) if len(listed) else 0,
-            "in all": None if unseen is None else mean,
-            "error": None if unseen is None else variance**0.5,
-            "given": given,
-        }
+    for number, returned_then in returned.items():
+        after[str(number)] = _compared(returned_then, annotation, plain)
     labels = annotation.labels[~annotation.crowd]
     counted = {str(label): int((labels == label).sum()) for label in labels.unique().tolist()}
     return {
@@ -128,6 +114,29 @@ def object_record(way: str, returned: Mapping[int, Returned], annotation: Annota
         "by class": counted,
         "plain": len(plain),
         "after": after,
+    }
+
+
+def _compared(returned: Returned, annotation: Annotation, plain: Objects) -> ResultRecord:
+    """Compare what is returned after a number of passes with annotated objects and a plain pass (`object_record`)."""
+    objects, listed, unseen, spread, given, faint = returned
+    # 1 for a right box, 0 for a wrong one, and -1 for one in an area that is annotated as a crowd.
+    right = right_boxes(objects, annotation)
+    right_listed = right_boxes(listed, annotation)
+    counts = right >= 0
+    chances = objects.scores[counts]
+    mean, variance = number_of_faint(chances) if faint else number_of(chances, unseen or (0.0, 0.0), spread)
+    alike = (box_iou(plain.boxes, listed.boxes) >= _SAME) & (plain.labels[:, None] == listed.labels)
+    return {
+        "scores": chances.tolist(),
+        "labels": objects.labels[counts].tolist(),
+        "right": right[counts].tolist(),
+        "listed": int((right_listed >= 0).sum()),
+        "listed right": int((right_listed > 0).sum()),
+        "kept": int(alike.any(1).sum()) if len(listed) else 0,
+        "in all": None if unseen is None else mean,
+        "error": None if unseen is None else variance**0.5,
+        "given": given,
     }
 
 
@@ -270,24 +279,19 @@ def _figures(boxes: Sequence[_Boxes], counts: _Counts, pictures: Tensor) -> list
 
 def object_table(records: Sequence[ResultRecord]) -> list[str]:
     """Write the tables of the figures of all ways, as Markdown."""
-    groups: dict[str, list[ResultRecord]] = {}
-    for record in records:
-        groups.setdefault(record["way"], []).append(record)
+    groups = grouped(records, "way")
     first = next(iter(groups.values()))
     numbers = list(first[0]["after"])
     figures = Bootstrap.of(object_figures(groups, numbers), range(len(first)))
     heads = [f"AP50, {number}" for number in numbers]
     heads += ["precision", "recall", "boxes for each object"]
     heads += ["mean absolute error of the count", "mean absolute error of the expected number", "ECE"]
+    ways = list(groups)
     rows = [["", *heads]]
-    for way, values, errors in zip(groups, figures.value.tolist(), figures.error.tolist(), strict=True):
-        rows.append([way, *(f"{value:.3f} ± {error:.3f}" for value, error in zip(values, errors, strict=True))])
-    paired = figures.less(list(groups).index(SEMFOV))
+    rows += [[way, *figures.cells(number)] for number, way in enumerate(ways)]
+    paired = figures.less(ways.index(SEMFOV))
     differences = [[f"difference to {SEMFOV}", *heads]]
-    for way, values, errors in zip(groups, paired.value.tolist(), paired.error.tolist(), strict=True):
-        if way != SEMFOV:
-            cells = [f"{value:+.3f} ± {error:.3f}" for value, error in zip(values, errors, strict=True)]
-            differences.append([way, *cells])
+    differences += [[way, *paired.cells(number, sign="+")] for number, way in enumerate(ways) if way != SEMFOV]
     objects = sum(record["objects"] for record in first)
     return [
         f"Objects of {len(first)} pictures with {objects} annotated ones: average precision (IoU 0.5) after n passes; "

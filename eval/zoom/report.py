@@ -1,6 +1,5 @@
 """Runs an experiment with large pictures to its end, and writes its tables and curves."""
 
-from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -54,17 +53,15 @@ def curve(records: list[ResultRecord], passes: int) -> list[float]:
 
 def zoom_summary(records: list[ResultRecord], run: ZoomRun) -> str:
     """Write the tables of all measures, as Markdown."""
-    groups: dict[str, list[ResultRecord]] = defaultdict(list)
-    for record in records:
-        groups[record["measure"]].append(record)
+    groups = grouped(records, "measure")
     lines: list[str] = []
-    if groups["objects"]:
+    if "objects" in groups:
         lines += object_table(groups["objects"])
-    if groups["recall"]:
+    if "recall" in groups:
         lines += recalls(grouped(groups["recall"], "way"), run)
-    if groups["first hit"]:
+    if "first hit" in groups:
         lines += _first_hits(grouped(groups["first hit"], "way"))
-    if groups["decision"]:
+    if "decision" in groups:
         lines += decision_tables(groups["decision"])
     return "\n".join(lines)
 
@@ -93,16 +90,18 @@ def recalls(finding: dict[str, list[ResultRecord]], run: ZoomRun) -> list[str]:
     pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
     figures = Bootstrap.of(partial(recall_and_precision, finding, at), range(len(run.scenes)))
     rows = [["", *map(str, at), "area under the curve", "boxes for each object", "precision"]]
-    for (way, group), value, error in zip(finding.items(), figures.value, figures.error, strict=True):
-        recall, precision = recall_cells(value, error)
+    for number, (way, group) in enumerate(finding.items()):
+        recall, precision = _recall_cells(figures, number)
         area = mean(curve(group, passes))
-        boxes = sum(record["boxes"] for record in group) / max(sum(record["objects"] for record in group), 1)
-        rows.append([way, *recall, f"{area:.3f}", f"{boxes:.2f}", precision])
-    paired = figures.less(list(finding).index(SEMFOV))
+        boxes = sum(record["boxes"] for record in group)
+        annotated = sum(record["objects"] for record in group)
+        rows.append([way, *recall, f"{area:.3f}", f"{boxes / max(annotated, 1):.2f}", precision])
+    ways = list(finding)
+    paired = figures.less(ways.index(SEMFOV))
     differences = [[f"difference to {SEMFOV}", *map(str, at), "precision"]]
-    for way, value, error in zip(finding, paired.value, paired.error, strict=True):
+    for number, way in enumerate(ways):
         if way != SEMFOV:
-            recall, precision = recall_cells(value, error, "+")
+            recall, precision = _recall_cells(paired, number, "+")
             differences.append([way, *recall, precision])
     what = "objects" if run.config.target is None else run.config.target
     objects = sum(record["objects"] for record in next(iter(finding.values())))
@@ -140,11 +139,10 @@ def recall_and_precision(finding: dict[str, list[ResultRecord]], at: Sequence[in
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def recall_cells(value: Tensor, error: Tensor, sign: str = "") -> tuple[list[str], str]:
-    """Write the cells of recall, and that of precision, for `recall_and_precision` and its standard errors."""
-    figures = zip(value.tolist(), error.tolist(), strict=True)
-    *recall, precision = (f"{figure:{sign}.3f} ± {deviation:.3f}" for figure, deviation in figures)
-    return recall, precision if value[-1].isfinite() else "-"
+def _recall_cells(figures: Bootstrap, way: int, sign: str = "") -> tuple[list[str], str]:
+    """Write the cells of recall, and that of precision, of a way of looking (`recall_and_precision`)."""
+    *recall, precision = figures.cells(way, sign=sign)
+    return recall, precision if figures.value[way, -1].isfinite() else "-"
 
 
 def _curves(records: list[ResultRecord], run: ZoomRun) -> Path:
