@@ -21,6 +21,8 @@ _SHARES = (0.01, 0.02, 0.05)
 TELLING = ["area under ROC", *(f"hits at {100 * share:.0f} %" for share in _SHARES)]
 """Column headings of `Telling.rows`."""
 
+_PLACE = "place right"
+
 CALIBRATED = ["ECE", "ECE if calibrated"]
 """Column headings of `calibrated`."""
 
@@ -70,14 +72,8 @@ class Telling:
 
     def rows(self) -> list[list[str]]:
         """Cells under the headings `TELLING` for each way."""
-        low, high = self.figures.interval()
-        return [
-            [
-                plus_minus(float(value[0]), float(error[0]), 3) if value[0].isfinite() else "-",
-                *(_spanned(*span) for span in zip(value[1:-1], least[1:-1], most[1:-1], strict=True)),
-            ]
-            for value, error, least, most in zip(self.figures.value, self.figures.error, low, high, strict=True)
-        ]
+        interval = self.figures.interval()
+        return [_cells(self.figures, interval, way, TELLING) for way in range(len(self.names))]
 
     def place(self, name: str) -> str:
         """Share of right places of a way, in percent, with its interval."""
@@ -87,22 +83,35 @@ class Telling:
     def differences(self, name: str) -> list[str]:
         """Table of the differences of all ways to one of them, paired over the searches."""
         differences = self.figures.less(self.names.index(name))
-        low, high = differences.interval()
-        heads = [*TELLING, "place right"] if self.places else TELLING
+        interval = differences.interval()
+        heads = [*TELLING, _PLACE] if self.places else TELLING
         rows = [[f"difference to {name}", *heads]]
         for way, other in enumerate(self.names):
-            if other == name:
-                continue
-            value = differences.value[way]
-            area = "-"
-            if value[0].isfinite():
-                area = plus_minus(float(value[0]), float(differences.error[way, 0]), 3, sign="+")
-            row = [other, area]
-            for column in range(1, len(heads)):
-                digits = 1 if heads[column] == "place right" else 0
-                row.append(_spanned(value[column], low[way, column], high[way, column], digits=digits, sign="+"))
-            rows.append(row)
+            if other != name:
+                rows.append([other, *_cells(differences, interval, way, heads, sign="+")])
         return table(rows)
+
+
+def _cells(figures: Bootstrap, interval: Tensor, way: int, heads: Sequence[str], *, sign: str = "") -> list[str]:
+    """Write the figures of a way under headings: the area with its standard error, and shares with their intervals.
+
+    Args:
+        figures: the figures of all ways, `(ways, columns)`.
+        interval: their intervals, `(2, ways, columns)`.
+        way: number of the way.
+        heads: the headings, those of `TELLING` first.
+        sign: `+` writes the sign of positive figures, too.
+    """
+    value = figures.value[way]
+    low, high = interval[:, way]
+    area = "-"
+    if value[0].isfinite():
+        area = plus_minus(float(value[0]), float(figures.error[way, 0]), 3, sign=sign)
+    cells = [area]
+    for column in range(1, len(heads)):
+        digits = 1 if heads[column] == _PLACE else 0
+        cells.append(_spanned(value[column], low[column], high[column], digits=digits, sign=sign))
+    return cells
 
 
 def _tells(score: Tensor, there: Tensor) -> list[float]:
@@ -125,5 +134,5 @@ def _spanned(value: Tensor, low: Tensor, high: Tensor, *, digits: int = 0, sign:
     """Write a share in percent with its interval, such as `66 (57 to 73)`; a dash where there is none."""
     if not value.isfinite():
         return "-"
-    middle, *ends = (f"{100 * float(each):{sign}.{digits}f}" for each in (value, low, high))
-    return f"{middle} ({' to '.join(ends)})"
+    share, least, most = (f"{100 * float(figure):{sign}.{digits}f}" for figure in (value, low, high))
+    return f"{share} ({least} to {most})"
