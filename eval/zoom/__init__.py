@@ -9,13 +9,8 @@ an oracle. The tables give recall after n passes of the detector, for mosaics th
 decisions. To continue a stopped run, give the same command again.
 """
 
-from collections.abc import Sequence
-
 from eval.zoom.report import zoom
 from eval.zoom.run import ZoomConfig
-from semfov.runs.command import run_command
+from semfov.runs.command import command
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    return run_command(zoom, ZoomConfig, __doc__, arguments)
+main = command(zoom, ZoomConfig, __doc__)
