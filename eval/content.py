@@ -115,9 +115,9 @@ _FAULTS = {
     "names of other pictures": _Fault(
         ("do not fit the pictures",), _same, renamed=lambda names, rng: [names[n] for n in _deranged(len(names), rng)]
     ),
+    "none": _Fault(("",), _same),  # any line names it
 }
 
-_SOUND = "none"
 _CLOSE_OFFSET = 10  # pixels, along both axes
 _OFFSET = re.compile(r"\((-?\d+), (-?\d+)\) px")
 
@@ -144,29 +144,45 @@ def measure(config: ContentConfig) -> str:
     check(len(names) >= config.size, "size", f"at most the {len(names)} pictures that somebody looked at", config.size)
     densities, sizes = _densities(config, names)
     rng = np.random.default_rng(config.seed)
-    named = dict.fromkeys([*_FAULTS, _SOUND], 0)
-    by_rules = dict(named)
-    errors: dict[str, list[float]] = {fault: [] for fault, planted in _FAULTS.items() if planted.offset is not None}
+    counts = {fault: _Counts() for fault in _FAULTS}
     for _ in track(range(config.sets), "sets", "set"):
         chosen = sorted(rng.choice(names, config.size, replace=False).tolist())
-        for fault, planted in [*_FAULTS.items(), (_SOUND, _Fault((), _same))]:
-            records = _read_wrongly(planted, chosen, by_picture, rng)
+        for name, fault in _FAULTS.items():
+            records = _read_wrongly(fault, chosen, by_picture, rng)
             lines = content_suspicions(records, densities, sizes)
-            rules = suspicions(records, sizes)
-            if fault == _SOUND:
-                named[fault] += bool(lines)
-            else:
-                lines_of_fault = [line for line in lines if any(words in line for words in planted.words)]
-                named[fault] += bool(lines_of_fault)
-                if planted.offset is not None and lines_of_fault:
-                    errors[fault].append(_offset_error(lines_of_fault[0], planted.offset))
-            by_rules[fault] += bool(rules)
+            counts[name].add(fault, lines, suspicions(records, sizes))
     rows = [["fault", "named by content", "offset right within 10 px", "anything suspicious by rules"]]
-    for fault, count in named.items():
-        close = [error <= _CLOSE_OFFSET for error in errors.get(fault, [])]
-        within = f"{sum(close) / len(close):.2f}" if close else ""
-        rows.append([fault, f"{count / config.sets:.2f}", within, f"{by_rules[fault] / config.sets:.2f}"])
+    rows += [[fault, *of_fault.cells(config.sets)] for fault, of_fault in counts.items()]
     return "\n".join(table(rows))
+
+
+@dataclass
+class _Counts:
+    """Sets in which a fault is found, of all that were read with it.
+
+    Attributes:
+        named: sets in which a line by content names it; of sound recordings those with any line.
+        by_rules: sets in which the rules without pictures say anything.
+        offset_errors: for each set in which its offset is named, how far that is from the planted one, in pixels.
+    """
+
+    named: int = 0
+    by_rules: int = 0
+    offset_errors: list[float] = field(default_factory=list)
+
+    def add(self, fault: _Fault, lines: list[str], lines_by_rules: list[str]) -> None:
+        """Count what is said of a set."""
+        naming = [line for line in lines if any(words in line for words in fault.words)]
+        self.named += bool(naming)
+        self.by_rules += bool(lines_by_rules)
+        if fault.offset is not None and naming:
+            self.offset_errors.append(_offset_error(naming[0], fault.offset))
+
+    def cells(self, sets: int) -> list[str]:
+        """Write the shares of the sets; that of right offsets is of those in which one is named."""
+        close = [error <= _CLOSE_OFFSET for error in self.offset_errors]
+        right_offset = f"{sum(close) / len(close):.2f}" if close else ""
+        return [f"{self.named / sets:.2f}", right_offset, f"{self.by_rules / sets:.2f}"]
 
 
 def _offset_error(line: str, offset: tuple[int, int]) -> float:
