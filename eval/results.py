@@ -57,24 +57,28 @@ def results(config: ResultsConfig) -> None:
             _HANDLERS[type(runs[name])](runs[name])
     pages = (config.page, config.tables)
     texts = [_read_page(page) for page in pages]
+    renewed: list[str] = []
     stale: list[str] = []
     for page, text in zip(pages, texts, strict=True):
-        filled, others = _fill_page(text, runs)
+        filled, kept = _fill_page(text, runs)
         write_text(page, filled)
-        stale += others
+        stale += kept
+    for text in texts:
+        renewed += [match["name"] for match in PLACE.finditer(text) if match["name"] not in stale]
     drawn = draw_figures(config.pictures, runs)
-    renewed = [match["name"] for text in texts for match in PLACE.finditer(text) if match["name"] not in stale]
-    stale += [
-        f"{name}.png" for name in (*PAGE_FIGURES, THRESHOLD_FIGURE) if config.pictures / f"{name}.png" not in drawn
-    ]
-    print(f"\nrenewed: {', '.join([*renewed, *(path.name for path in drawn)]) or 'nothing'}")
+    for name in (*PAGE_FIGURES, THRESHOLD_FIGURE):
+        path = config.pictures / f"{name}.png"
+        if path not in drawn:
+            stale.append(path.name)
+    renewed += [path.name for path in drawn]
+    print(f"\nrenewed: {', '.join(renewed) or 'nothing'}")
     print(f"kept, because experiments have not run: {', '.join(stale) or 'nothing'}")
     for path in [*pages, *drawn]:
         print(f"written: {path}")
 
 
 def _read_page(path: Path) -> str:
-    """Write the text of a page with tables."""
+    """Read the text of a page with tables."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -94,18 +98,20 @@ def _fill_page(text: str, runs: Runs) -> tuple[str, list[str]]:
     stale = []
 
     def fill(match: re.Match[str]) -> str:
-        made = _page_table(match["name"], runs)
+        name = match["name"]
+        made = _page_table(name, runs)
         if missing(made.made_of, runs):
-            stale.append(match["name"])
+            stale.append(name)
             return match[0]
-        source = origin(runs[name].out for name in made.made_of)
-        return "\n\n".join((f"<!-- table {match['name']} -- {source} -->", "\n".join(made.make(runs)), END))
+        source = origin(runs[experiment].out for experiment in made.made_of)
+        lines = "\n".join(made.make(runs))
+        return "\n\n".join([f"<!-- table {name} -- {source} -->", lines, END])
 
     return PLACE.sub(fill, text), stale
 
 
 def _page_table(line: str, runs: Runs) -> _PageTable:
-    """Write the table that a comment names: of several experiments, or of one experiment."""
+    """Find the table that a comment names: of several experiments, or of one experiment."""
     if line in _WHOLE:
         return _WHOLE[line]
     name, _, kind = line.partition(" ")

@@ -197,9 +197,11 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
     for name in DETECTORS:
         settings = detector(name, config)
         common, few = _common(settings, config)
-        seek, tour = partial(SearchConfig, **common), partial(ExploreConfig, **common)
+        seek = partial(SearchConfig, **common)
+        tour = partial(ExploreConfig, **common)
         for fovea in FOVEAE:
-            sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
+            sensor = SensorConfig(name=fovea)
+            belief = BeliefConfig(model=f"{settings.name}-{fovea}")
             yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=_PUBLISHED)
             yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=_PUBLISHED_EXPLORATION)
         yield from _thresholds(name, settings, few)
@@ -219,7 +221,8 @@ def _beyond(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
     settings = detector("nano", config)
     common, few = _common(settings, config)
     seek = partial(SearchConfig, **common)
-    sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
+    sensor = SensorConfig(name="published")
+    belief = BeliefConfig(model=f"{settings.name}-published")
     yield "proposed-nano", seek(sensor=sensor, belief=belief, policies=_PROPOSED)
     # One start: an expectation takes ten times as long as the published decision.
     options: dict[str, Any] = {**few, "sensor": sensor, "belief": belief}

@@ -59,57 +59,59 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
     """Draw the figures whose experiments are all finished; returns their files."""
     written = []
     if not missing(AT_THRESHOLDS, runs):
-        tested = {
-            f"{title}\n{contrast.text}": (contrast, name)
-            for contrast in CONTRASTS
-            for name, title in DETECTORS.items()
-            if contrast.finding in (TESTED[0], TESTED[7])
-        }
-        drawn = plot_curve_panels(
-            {title: _threshold_panel(*chosen, runs) for title, chosen in tested.items()}, label="difference (points)"
-        )
+        drawn = plot_curve_panels(_threshold_panels(runs), label="difference (points)")
         written.append(save_figure(drawn, folder / f"{THRESHOLD_FIGURE}.png"))
     for name, figure in PAGE_FIGURES.items():
-        if missing(published(figure.kind).values(), runs):
-            continue
-        panels = {title: panel(folder, figure) for title, folder in published_columns(figure.kind, runs).items()}
-        drawn = plot_curve_panels(panels, label=_LABELS[figure.kind])
-        written.append(save_figure(drawn, folder / f"{name}.png"))
+        if not missing(published(figure.kind).values(), runs):
+            runs_by_title = published_columns(figure.kind, runs)
+            panels = {title: panel(run, figure) for title, run in runs_by_title.items()}
+            drawn = plot_curve_panels(panels, label=_LABELS[figure.kind])
+            written.append(save_figure(drawn, folder / f"{name}.png"))
     return written
+
+
+def _threshold_panels(runs: Runs) -> dict[str, Panel]:
+    """Make the panels of the differences at all score thresholds, for both headlines and both detectors."""
+    panels = {}
+    for contrast in CONTRASTS:
+        if contrast.finding in (TESTED[0], TESTED[7]):
+            for name, title in DETECTORS.items():
+                panels[f"{title}\n{contrast.text}"] = _threshold_panel(contrast, name, runs)
+    return panels
 
 
 @styled
 def plot_curve_panels(panels: Mapping[str, Panel], *, label: str) -> Figure:
     """Curves of several experiments with the same policies side by side, two in a row, with one legend."""
     rows = -(-len(panels) // 2)
-    figure, every = make_figure(rows, 2, width=8.8, height=2.9 * rows + 0.5)
-    for axes, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
+    figure, all_axes = make_figure(rows, 2, width=8.8, height=2.9 * rows + 0.5)
+    for axes, (title, (curves, errors)) in zip(all_axes, panels.items(), strict=False):
         plot_curves(curves, errors, label=label, title=title, ax=axes)
         legend = axes.get_legend()
         assert legend is not None
         legend.remove()
-    for axes in every[len(panels) :]:
+    for axes in all_axes[len(panels) :]:
         axes.remove()
-    figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(*all_axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 
 def panel(folder: Path, figure: _PaperFigure) -> Panel:
     """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
-    curves = {
-        policy: averaged(records_of(folder, policy, commonest=figure.kind == "search"), last)
-        for policy in figure.policies
-    }
-    return (
-        {policy: each.mean for policy, each in curves.items()},
-        {policy: each.over_repetitions for policy, each in curves.items()},
-    )
+    means = {}
+    errors = {}
+    for policy in figure.policies:
+        curve = averaged(records_of(folder, policy, commonest=figure.kind == "search"), last)
+        means[policy] = curve.mean
+        errors[policy] = curve.over_repetitions
+    return means, errors
 
 
 def _threshold_panel(contrast: Contrast, name: str, runs: Runs) -> Panel:
     """Curves of a difference at each score threshold with one of `DETECTORS`, and their standard errors over images."""
-    means, errors = {}, {}
+    means = {}
+    errors = {}
     for threshold in SCORE_THRESHOLDS:
         label = f"threshold {threshold:g}"
         means[label], errors[label] = contrast.difference(threshold, name, runs)
