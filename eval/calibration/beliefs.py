@@ -69,7 +69,8 @@ class BeliefCalibrationRun(ComparedLooking):
     def __init__(self, config: SearchConfig) -> None:
         super().__init__(replace(config, policies=tuple(_ALL_CLASSES.values())))
         self.left_out: dict[str, str] = {}
-        belief, leave_out = self.config.belief, self.left_out.__setitem__
+        belief = self.config.belief
+        leave_out = self.left_out.__setitem__
         of_search = if_shipped(make_searching, belief.search_model, self.eye, partial(leave_out, LEARNED))
         of_map = if_shipped(make_map, belief.map_model, self.eye, partial(leave_out, MAP))
         self.models = self.models._replace(search=of_search, map=of_map)

@@ -70,22 +70,7 @@ def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCa
     """Write the tables, as Markdown."""
     beliefs = list(run.observers)
     there = sum(record["present"] for record in records)
-    by_looks = [["looks", "belief", "cells", *_HEAD]]
-    for looks in _judged_after(sums):
-        by_looks += [[str(looks), belief, *_measures_row(_pooled(sums, belief, looks))] for belief in beliefs]
     last = _judged_after(sums)[-1]
-    by_distance = [["distance", "belief", "cells", *_HEAD]]
-    for group in CELL_GROUPS:
-        with_group = [belief for belief in beliefs if (belief, last, group) in sums]
-        by_distance += [[group, belief, *_measures_row(sums[belief, last, group])] for belief in with_group]
-    notes = []
-    for name, reason in run.left_out.items():
-        notes.append(f"Left out because no fitted model is shipped: {name} ({reason}).")
-    if MAP in beliefs:
-        notes.append(
-            f"The {MAP} assumes that classes are as frequent as they are in photographs. Here half of the target "
-            "classes are present, so its probabilities are expected to be too low."
-        )
     cells = _pooled(sums, beliefs[0], last)
     holds = torch.arange(cells.count) < cells.bins[2].sum()  # as many cells as hold the target
     constant = AddedSums.of(torch.full((cells.count,), cells.rate), holds)
@@ -96,20 +81,51 @@ def _beliefs_summary(records: Sequence[ResultRecord], sums: _Sums, run: BeliefCa
             f"updated with the same looks. A constant prediction of {cells.rate:.4f}, the share of cells that hold the "
             f"target, would have an NLL of {constant.nll:.4f}, a Brier score of {constant.brier:.4f} and an ECE of 0.",
             "",
-            *table(by_looks),
+            *table(_rows_by_looks(sums, beliefs)),
             "",
             f"After {last} looks, by distance from the closest fixation, as a fraction of the image's longer side; "
             "fixated cells are a group of their own.",
             "",
-            *table(by_distance),
+            *table(_rows_by_distance(sums, beliefs, last)),
             "",
             LANDINGS_TEXT,
             "",
             *table([["belief", *LANDINGS], *_landing_table(records)]),
             "",
-            *[line for note in notes for line in (note, "")],
+            *_notes(run),
         ]
     )
+
+
+def _rows_by_looks(sums: _Sums, beliefs: Sequence[str]) -> list[list[str]]:
+    """Write the rows of the table of all cells, by number of looks."""
+    rows = [["looks", "belief", "cells", *_HEAD]]
+    for looks in _judged_after(sums):
+        rows += [[str(looks), belief, *_measures_row(_pooled(sums, belief, looks))] for belief in beliefs]
+    return rows
+
+
+def _rows_by_distance(sums: _Sums, beliefs: Sequence[str], looks: int) -> list[list[str]]:
+    """Write the rows of the table after a number of looks, by group of cells."""
+    rows = [["distance", "belief", "cells", *_HEAD]]
+    for group in CELL_GROUPS:
+        with_group = [belief for belief in beliefs if (belief, looks, group) in sums]
+        rows += [[group, belief, *_measures_row(sums[belief, looks, group])] for belief in with_group]
+    return rows
+
+
+def _notes(run: BeliefCalibrationRun) -> list[str]:
+    """Say which beliefs are left out, and what is known of the others; each note is followed by an empty line."""
+    lines: list[str] = []
+    for name, reason in run.left_out.items():
+        lines += [f"Left out because no fitted model is shipped: {name} ({reason}).", ""]
+    if MAP in run.observers:
+        lines += [
+            f"The {MAP} assumes that classes are as frequent as they are in photographs. Here half of the target "
+            "classes are present, so its probabilities are expected to be too low.",
+            "",
+        ]
+    return lines
 
 
 def _judged_after(sums: _Sums) -> list[int]:
@@ -147,8 +163,8 @@ def _beliefs_csv(sums: _Sums) -> str:
 def _beliefs_json(sums: _Sums) -> str:
     """All sums as JSON; the sums of several runs may be added up (`AddedSums.from_record`)."""
     entries = [
-        {"belief": belief, "looks": looks, "cells": group, **each.record()}
-        for belief, looks, group, each in _sums_by_name(sums)
+        {"belief": belief, "looks": looks, "cells": group, **of_group.record()}
+        for belief, looks, group, of_group in _sums_by_name(sums)
     ]
     return json.dumps({"edges": AddedSums.EDGES.tolist(), "bands": BANDS, "sums": entries}) + "\n"
 
