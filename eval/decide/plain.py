@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -102,8 +103,6 @@ def plain_rules(records: Sequence[ResultRecord]) -> dict[str, PlainDecisions]:
         if name == _QUARTERS:
             tiled = _logits([record["tiled"] for record in records])
             rules[name] = _without_places(torch.cat([whole, tiled], 1), there, fold, passes=5)
-        elif most == 0:
-            rules[name] = _without_places(whole, there, fold, passes=1)
         else:
             looks = [record["plain"][:most] for record in records]
             rules[name] = _with_closer_looks(whole, looks, there, fold)
@@ -129,8 +128,8 @@ def _with_closer_looks(
     """
     count = len(looks)
     numbers = torch.tensor([len(of_search) for of_search in looks])
-    all_looks = [look for of_search in looks for look in of_search]
-    if not all_looks:
+    all_looks = [*chain.from_iterable(looks)]
+    if not all_looks:  # none was asked for, or no search has a place to look at
         return _without_places(whole, there, fold, passes=1)
     search = torch.arange(count).repeat_interleave(numbers)  # (L,), the search of each look
     facts = torch.tensor([look["facts"] for look in all_looks], dtype=torch.float64)  # (L, n)

@@ -28,6 +28,7 @@ from semfov.data.scene import Annotation
 from semfov.decision import (
     MOST_CLOSER,
     CandidateCells,
+    Decision,
     Verifier,
     cell_of,
     confirms,
@@ -365,9 +366,6 @@ class DecisionRun(ComparedLooking):
         if verifier is not None:
             rule = partial(_by_closer_looks, verifier=verifier, close_up=scene.close_up)
         steps = _search_steps(looks, way.strategy, target, search.start, search.noise, rule)
-        last = steps[-1]
-        closer_looks = 0
-        place = None
         if verifier is not None:
             verifier.end()
             verifier.look_closely(scene.close_up)
@@ -375,10 +373,9 @@ class DecisionRun(ComparedLooking):
             closer_looks = len(verifier.looks)
             place = decision.place
         else:
-            # If a detection at the gaze has ended the search, the target's place is the fixated cell.
-            cell = int(last.cell) if way.rule is at_the_gaze else None
-            seen = [step.detections for step in steps]
-            decision = decision_without_closer_looks(int(rule(last)), last.belief, seen, scene.grid, target, cell)
+            decision = _decision_by_rule(way, steps, target, scene.grid)
+            closer_looks = 0
+            place = None
         path = torch.cat([step.cell for step in steps])
         return {
             "outcome": decision.outcome,
@@ -422,15 +419,16 @@ def sharp_place(detections: Detections, grid: Grid, target: int, goal: Tensor, b
     if not bool((score > 0).any()):
         return None
     box = detections.boxes[0, int(score.argmax())]
-    cell = int(grid.footprint(box[None], "soft")[0].argmax())
-    return {"right": bool(goal[cell]), "overlap": overlap(box, boxes)}
+    return {"right": bool(goal[cell_of(box, grid)]), "overlap": overlap(box, boxes)}
 
 
 def quarters(image: Tensor) -> list[Tensor]:
     """Return the four quarters of pictures `(B, C, H, W)`."""
-    row, column = image.shape[-2] // 2, image.shape[-1] // 2
-    rows = image[..., :row, :], image[..., row:, :]
-    return [part for half in rows for part in (half[..., :column], half[..., column:])]
+    row = image.shape[-2] // 2
+    column = image.shape[-1] // 2
+    upper = image[..., :row, :]
+    lower = image[..., row:, :]
+    return [upper[..., :column], upper[..., column:], lower[..., :column], lower[..., column:]]
 
 
 def overlap(box: Tensor | None, boxes: Tensor) -> float | None:
@@ -452,11 +450,17 @@ def landing(beliefs: list[Belief], cells: Tensor, goal: Tensor, target: int) -> 
     Returns:
         The two probabilities; None if no look lands on the target, or if already the first one does.
     """
-    hits = goal[cells].nonzero()[:, 0].tolist()
-    if not hits or hits[0] == 0:
+    number = _landing_look(cells, goal)
+    if number is None:
         return None
-    pair = beliefs[hits[0] - 1 : hits[0] + 1]
-    return [float(belief.probability(target)[0, cells[hits[0]]]) for belief in pair]
+    before_and_after = beliefs[number - 1 : number + 1]
+    return [float(belief.probability(target)[0, cells[number]]) for belief in before_and_after]
+
+
+def _landing_look(cells: Tensor, goal: Tensor) -> int | None:
+    """Find the first look that lands on the target; None if none does, or already the look at the start."""
+    hits = goal[cells].nonzero()[:, 0].tolist()
+    return hits[0] if hits and hits[0] > 0 else None
 
 
 def detected_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
@@ -474,10 +478,10 @@ def detected_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: i
     Returns:
         Whether it does; None if no look lands on the target, or if already the first one does (as in `landing`).
     """
-    hits = goal[path].nonzero()[:, 0].tolist()
-    if not hits or hits[0] == 0:
+    number = _landing_look(path, goal)
+    if number is None:
         return None
-    step = steps[hits[0]]
+    step = steps[number]
     seen = step.detections
     named = seen.mask & (seen.scores.argmax(-1) == target)  # more probable than background, too
     return bool(confirms(replace(seen, mask=named), grid, step.cell, target, 0.0))
@@ -510,6 +514,16 @@ def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
         means = [sum(column) / len(column) for column in zip(*group, strict=True)]
         cells += [str(len(group)), " → ".join(f"{mean:.3f}" for mean in means) or "-"]
     return cells
+
+
+def _decision_by_rule(way: _Way, steps: list[Step], target: int, grid: Grid) -> Decision:
+    """Make the decision of a search that has ended without closer looks."""
+    last = steps[-1]
+    outcome = int(way.rule(last, target, grid))
+    # If a detection at the gaze has ended the search, the target's place is the fixated cell.
+    cell = int(last.cell) if way.rule is at_the_gaze else None
+    seen = [step.detections for step in steps]
+    return decision_without_closer_looks(outcome, last.belief, seen, grid, target, cell)
 
 
 def _by_closer_looks(step: Step, verifier: Verifier[Step], close_up: LookAt) -> Tensor:
