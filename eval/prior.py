@@ -14,7 +14,7 @@ and are searched as large pictures. If the command is stopped, repeat it to cont
 """
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from eval.bootstrap import Bootstrap
-from eval.comparison.records import gather
+from eval.comparison.records import gather, grouped
 from eval.comparison.summary import announce, write_summary
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import PASSES, WindowEpisode, WindowTask
@@ -156,13 +156,15 @@ class PriorRun(SceneRun):
         return {"eye": self.eye.settings(), "settings": settings, "windows": self.evidence}
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
-        watch, annotation = Stopwatch(), self.scenes.annotation(index)
+        watch = Stopwatch()
+        annotation = self.scenes.annotation(index)
         source = StoredWindowLooks(self.eye, self.scenes, index, None)
         generator = generator_for("prior", self.config.seed, self.scenes.ids[index])
         drawn = (torch.randperm(len(self.scenes.classes), generator=generator) + 1)[: self.config.drawn].tolist()
         pair = choose_classes(self.scenes, index, annotation, 1, self.config.max_target_area, self.config.seed)
-        always = [(f"{_ALWAYS}{self.scenes.classes[target - 1]}", target) for target in self.always]
-        questions = [*always, *((RANDOM, target) for target in drawn), *((PAIR, target) for target in pair)]
+        questions = [(f"{_ALWAYS}{self.scenes.classes[target - 1]}", target) for target in self.always]
+        questions += [(RANDOM, target) for target in drawn]
+        questions += [(PAIR, target) for target in pair]
         records = []
         for question, target in questions:
             priors: dict[str, PriorLike] = {"fit": "fit", "half": 0.5}
@@ -193,15 +195,9 @@ class PriorRun(SceneRun):
 
 def prior_summary(records: Iterable[ResultRecord]) -> str:
     """Write the table, as Markdown."""
-    by_question: dict[str, list[ResultRecord]] = {}
-    for record in records:
-        by_question.setdefault(record["question"], []).append(record)
-    for beginning, name in _MISSING.items():
-        missing = []
-        for question, group in by_question.items():
-            if question.startswith(beginning):
-                missing += [record for record in group if not record["present"]]
-        by_question[name] = missing
+    by_question = grouped(records, "question")
+    missing = {name: _without_target(by_question, beginning) for beginning, name in _MISSING.items()}
+    by_question |= missing
     heads = ["mean p", "Brier", "difference", "best", "ECE", "area", *_DECIDED, "passes"]
     rows = [["searches for", "`prior=`", "number", "there", *heads]]
     for question, group in by_question.items():
@@ -221,6 +217,15 @@ def prior_summary(records: Iterable[ResultRecord]) -> str:
             "",
         ]
     )
+
+
+def _without_target(by_question: Mapping[str, Sequence[ResultRecord]], beginning: str) -> list[ResultRecord]:
+    """List the searches whose target is not there, of all questions whose names begin so."""
+    searches: list[ResultRecord] = []
+    for question, group in by_question.items():
+        if question.startswith(beginning):
+            searches += [record for record in group if not record["present"]]
+    return searches
 
 
 def _measured(records: Sequence[ResultRecord], way: str) -> list[str]:
