@@ -135,5 +135,8 @@ def quality_table(rows: Mapping[str, Mapping[str, Tensor]]) -> list[str]:
 
 def _figures(of_sources: Sequence[Tensor]) -> list[str]:
     """Write means of scores `(P, 2)` with standard errors over pictures."""
-    columns = [column for scores in of_sources for column in scores.double().numpy().T]
-    return [plus_minus(float(column.mean()), float(standard_error(column)), 3) for column in columns]
+    cells = []
+    for scores in of_sources:
+        columns = scores.double().numpy().T
+        cells += [plus_minus(float(column.mean()), float(standard_error(column)), 3) for column in columns]
+    return cells

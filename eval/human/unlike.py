@@ -152,19 +152,22 @@ def unlike_table(columns: dict[str, dict[str, Tensor]]) -> list[str]:
     Returns:
         The lines.
     """
-    head = ["", *(f"{name}: {figure}" for name in columns for figure in ("area", "called unlike"))]
-    kinds = [*next(iter(columns.values()))]
-    body = []
-    for kind in kinds:
+    head = [""]
+    for name in columns:
+        head += [f"{name}: area", f"{name}: called unlike"]
+    rows = [head]
+    for kind in next(iter(columns.values())):
         row = [kind]
         for distances in columns.values():
+            # Photographs are what the other kinds are told from.
             area = "" if kind in (FITTED, OTHERS) else f"{_area(distances, [kind]):.3f}"
             row += [area, _share_unlike(distances[kind])]
-        body.append(row)
-    row = [f"all {len(KINDS)} kinds of pages, charts, drawings and flat pictures"]
+        rows.append(row)
+    row_of_all = [f"all {len(KINDS)} kinds of pages, charts, drawings and flat pictures"]
     for distances in columns.values():
-        row += [f"{_area(distances, [*KINDS]):.3f}", _share_unlike(torch.cat([distances[kind] for kind in KINDS]))]
-    return table([head, *body, row])
+        of_all_kinds = torch.cat([distances[kind] for kind in KINDS])
+        row_of_all += [f"{_area(distances, [*KINDS]):.3f}", _share_unlike(of_all_kinds)]
+    return table([*rows, row_of_all])
 
 
 def _share_unlike(distances: Tensor) -> str:

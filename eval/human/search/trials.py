@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +37,14 @@ def read_searches(path: Path, screen: tuple[int, int], subject: str | None = Non
         files = sorted(path.glob("*.json"))
         if not files:
             raise DataError(f"{path}: expected JSON files of scanpaths, found none")
-        return [each for file in files for each in read_searches(file, screen, subject)]
+        return [*chain.from_iterable(read_searches(file, screen, subject) for file in files)]
     if path.suffix == ".csv":
-        searches = [each.resized(screen) for each in read_table(path)]
+        searches = [search.resized(screen) for search in read_table(path)]
     else:
         searches = read_ruarte(path, screen=screen, subject=subject)
-    for each in searches:
-        if each.target is None or each.box is None:
-            raise DataError(f"{path}: {each.picture}: expected a target and its box, by which searches are scored")
+    for search in searches:
+        if search.target is None or search.box is None:
+            raise DataError(f"{path}: {search.picture}: expected a target and its box, by which searches are scored")
     return searches
 
 
@@ -118,14 +119,14 @@ def drawn_searches(
     centres = grid.centres.numpy()
     first = int(grid.cell_of(torch.tensor(start)))
     drawn = []
-    for each in searches:
-        generator = generator_for("searches", seed, each.picture, name)
+    for search in searches:
+        generator = generator_for("searches", seed, search.picture, name)
         weights = torch.from_numpy(density).double().clone()
         weights[first] = 0
         others = weights.multinomial(longest - 1, generator=generator).numpy()
         cells = np.concatenate([[first], others])
-        steps = _steps_to_target(np.stack([cells % grid.columns, cells // grid.columns], -1), each, grid)
+        steps = _steps_to_target(np.stack([cells % grid.columns, cells // grid.columns], -1), search, grid)
         points = centres[cells[:steps]].astype(np.float64)
         found = steps is not None
-        drawn.append(Fixations(each.picture, name, points, each.size, None, each.target, each.box, found))
+        drawn.append(Fixations(search.picture, name, points, search.size, None, search.target, search.box, found))
     return drawn
