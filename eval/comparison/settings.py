@@ -47,6 +47,7 @@ class ComparedConfig(RunConfig):
 
 def sensor_settings(record: Mapping[str, Any]) -> SensorConfig:
     """Return the settings of a sensor from what a folder of models keeps of it, `SensorConfig.record`."""
-    own = {each.name for each in fields(SensorConfig)} - {"settings"}
-    others = {name: value for name, value in record.items() if name not in own}
-    return SensorConfig(**{name: record[name] for name in own & record.keys()}, settings=others or None)
+    names = {setting.name for setting in fields(SensorConfig)} - {"settings"}
+    of_config = {name: value for name, value in record.items() if name in names}
+    of_sensor = {name: value for name, value in record.items() if name not in names}
+    return SensorConfig(**of_config, settings=of_sensor or None)

@@ -45,8 +45,9 @@ def _sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
     fused = observer(observer.start(1, grid, sharp.scores), sharp, middle, grid)
     cells = grid.footprint(sharp.boxes) & sharp.mask[..., None]
     scores = sharp.scores[..., 1:] * sharp.mask[..., None]
-    each = cells[..., None] * scores[:, :, None]
-    highest = each.amax(1) if each.shape[1] else each.sum(1)
+    scores_in_cells = cells[..., None] * scores[:, :, None]  # (1, L, X·Y, K)
+    # Without a detection there is no maximum, and the sum is 0.
+    highest = scores_in_cells.amax(1) if scores_in_cells.shape[1] else scores_in_cells.sum(1)
     background = torch.full_like(highest[..., :1], _SURE)
     return {FUSED: fused.class_probabilities(), PAINTED: torch.cat([background, highest], -1)}
 
@@ -101,8 +102,9 @@ class ExploreRun(ComparedLooking):
             return records, watch.seconds
         looks = StoredLooks(self.detections(index), grid)
         watch.lap("look")
-        episodes, scene = explorations_of(self.scenes, index, len(grid), protocol), self.scenes.ids[index]
-        noise = torch.stack([noise_for(protocol, len(grid), scene, None, each.repetition) for each in episodes])
+        episodes = explorations_of(self.scenes, index, len(grid), protocol)
+        scene = self.scenes.ids[index]
+        noise = torch.stack([noise_for(protocol, len(grid), scene, None, episode.repetition) for episode in episodes])
         for name in self.policies:
             candidate = self.candidate(name, index)
             watch.lap("saliency")
@@ -115,9 +117,10 @@ class ExploreRun(ComparedLooking):
         with torch.inference_mode():
             sharp = self.eye.detector(self.scenes[index].image[None])
             for name, probabilities in _sharp_maps(sharp, grid).items():
-                counts = counts_of(probabilities, answers).items()
-                named = list[int](), {each: count.tolist() * (protocol.shifts + 1) for each, count in counts}
-                records += [self._record(name, answers, episode, named) for episode in episodes]
+                counts = counts_of(probabilities, answers)
+                # The map of one pass is the same after any number of gaze shifts, and fixates no cell.
+                at_all_shifts = {count: number.tolist() * (protocol.shifts + 1) for count, number in counts.items()}
+                records += [self._record(name, answers, episode, ([], at_all_shifts)) for episode in episodes]
         watch.lap("sharp look")
         return records, watch.seconds
 

@@ -59,13 +59,16 @@ class SearchRun(ComparedLooking):
         episodes = episodes_of(self.scenes, index, config.belief.columns, config.belief.rows, protocol)
         watch = Stopwatch()
         records: list[ResultRecord] = []
-        detections, grid = self.detections(index), self.grid(index)
+        detections = self.detections(index)
+        grid = self.grid(index)
         watch.lap("look")
         if not episodes:
             return records, watch.seconds
         scene = self.scenes.ids[index]
         looks = StoredLooks(detections, grid, torch.tensor([episode.cue for episode in episodes]))
-        noise = torch.stack([noise_for(protocol, len(grid), scene, each.target, each.repetition) for each in episodes])
+        noise = torch.stack(
+            [noise_for(protocol, len(grid), scene, episode.target, episode.repetition) for episode in episodes]
+        )
         for name in self.policies:
             candidate = self.candidate(name, index)
             watch.lap("saliency")
