@@ -73,9 +73,10 @@ class Strategy(nn.Module):
         inner = observer.observer
         if not isinstance(inner, SemanticSearch) or inner.model.presence is None:
             return self, Prior.of(None, None)
-        each = Prior(1 - (1 - EVEN) ** (1 / len(observer.weights)), EVEN, known=False)
-        changed = SemanticSearch(inner.model, prior=each, footprint=inner.footprint)
-        return Strategy(AnyOf(changed, observer.weights), self.policy), each
+        share = 1 - (1 - EVEN) ** (1 / len(observer.weights))
+        prior_of_class = Prior(share, EVEN, known=False)
+        changed = SemanticSearch(inner.model, prior=prior_of_class, footprint=inner.footprint)
+        return Strategy(AnyOf(changed, observer.weights), self.policy), prior_of_class
 
     def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
         """Prepare the search for a target.
