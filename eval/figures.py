@@ -234,7 +234,8 @@ def ambiguities(example: Example) -> Figure | None:
 
 def ambiguous(sharp: Detections, looks: Sequence[Detections]) -> tuple[Detections, int, Detections] | None:
     """Find the two detections of one object that differ in class, of which the less confident is most confident."""
-    best, pair = 0.0, None
+    best = 0.0
+    pair = None
     for number, look in enumerate(looks):
         same = box_iou(sharp.boxes[0], look.boxes[0]) >= _SAME_OBJECT
         other = sharp.labels[0][:, None] != look.labels[0][None]
@@ -272,7 +273,8 @@ def grid_example(example: Example) -> Figure:
     from matplotlib.colors import ListedColormap
 
     figure, (axes,) = example.pictures(1, 1, 5.4)
-    grid, detections = example.grid, confident_detections(example.scanpath.detections[0], MOST)
+    grid = example.grid
+    detections = confident_detections(example.scanpath.detections[0], MOST)
     draw_image(axes, example.foveated("published", example.fixation), grid)
     updated = grid.footprint(detections.boxes[0]).any(0)
     draw_cells(axes, grid, updated.float().masked_fill(~updated, torch.nan), cmap=ListedColormap([GAZE]), alpha=0.45)
@@ -284,9 +286,12 @@ def grid_example(example: Example) -> Figure:
 @styled
 def saliency_example(example: Example) -> Figure:
     """Draw the foveal image after a few looks, and its saliency by VOCUS2, which is 0 in visited cells."""
-    grid, model, reduction = example.grid, VOCUS2(), SaliencyConfig().reduction
+    grid = example.grid
+    model = VOCUS2()
+    reduction = SaliencyConfig().reduction
     state, points = open_at_reference(example.eye.sensor, example.eye.reference, example.image, grid.centres)
-    visited, cells = torch.zeros(1, len(grid), dtype=torch.bool), [int(example.scanpath.cells[0])]
+    visited = torch.zeros(1, len(grid), dtype=torch.bool)
+    cells = [int(example.scanpath.cells[0])]
     for _ in range(LOOKS):
         view = example.eye.sensor.picture(state, points[cells[-1]][None])
         saliency = model(view)

@@ -73,11 +73,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--gaze", action="store_true", help="make the picture of docs/guides/gaze-prediction.md")
     parser.add_argument("--out", type=Path, help="file to write (none: the picture's file in docs/pictures)")
     options = parser.parse_args(arguments)
-    name, make = "looking.webp", _make_film
+    name = "looking.webp"
+    make = _make_film
     if options.zoom:
-        name, make = "zoom.png", _make_zoom_picture
+        name = "zoom.png"
+        make = _make_zoom_picture
     if options.gaze:
-        name, make = "gaze.png", _make_gaze_picture
+        name = "gaze.png"
+        make = _make_gaze_picture
     path = options.out or _PICTURES / name
     make(path)
     print(path)

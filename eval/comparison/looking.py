@@ -24,7 +24,9 @@ class Candidate(Strategy):
 
     def __init__(self, strategy: Strategy, saliency: Tensor | None = None, weight: float = 1.0) -> None:
         super().__init__(strategy.observer, strategy.policy)
-        self.strategy, self.saliency, self.weight = strategy, saliency, weight
+        self.strategy = strategy
+        self.saliency = saliency
+        self.weight = weight
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """Return the acquisition function of episodes that fixate `cell` `(B,)`."""
@@ -43,7 +45,9 @@ class ComparedLooking(PolicyLooking):
 
     def __init__(self, config: ComparedConfig) -> None:
         super().__init__(config)
-        folder, eye, how = store_folder(config.cache) / "saliency", self.eye.settings(), config.saliency
+        folder = store_folder(config.cache) / "saliency"
+        eye = self.eye.settings()
+        how = config.saliency
         self.saliency_stores = {
             name: SaliencyStore(folder, name, how.view, how.reduction, eye["sensor"], config.cells, eye["detector"])
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
@@ -62,10 +66,12 @@ class ComparedLooking(PolicyLooking):
 
     def saliency(self, name: SaliencyModel, index: int) -> Tensor:
         """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""
-        digest, store = self.digest(index), self.saliency_stores[name]
+        digest = self.digest(index)
+        store = self.saliency_stores[name]
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
-            image, how = self.scenes[index].image, self.config.saliency
+            image = self.scenes[index].image
+            how = self.config.saliency
             seen = self.eye.sensor, self.config.sensor.reference, image, self.grid(index)
             saliency = saliency_table(saliency_map(name, self.eye.detector), how.view, how.reduction, *seen)
             if self.config.store:

@@ -19,7 +19,8 @@ class StoredRecords:
     """
 
     def __init__(self, results: SceneResults, scenes: int) -> None:
-        self._results, self._scenes = results, scenes
+        self._results = results
+        self._scenes = scenes
         self._seconds: dict[str, float] | None = None
 
     def __iter__(self) -> Iterator[ResultRecord]:

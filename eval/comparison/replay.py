@@ -21,7 +21,8 @@ def replay(run: ComparedLooking, index: int, record: ResultRecord) -> Scanpath:
     The learned belief of searches is no map of all classes, which is then maintained beside it: that of the recommended
     agent or, if no model is shipped for the eye, one by Kaplan's rule from tempered scores.
     """
-    grid, candidate = run.grid(index), run.candidate(record["policy"], index)
+    grid = run.grid(index)
+    candidate = run.candidate(record["policy"], index)
     cue = record.get("cue")
     cells = torch.tensor([record["cells"]])
     looks = StoredLooks(run.detections(index), grid, None if cue is None else torch.tensor([cue]))

@@ -113,19 +113,9 @@ class HeadRun(SceneRun):
         photographs = make_scenes(config.data, self.eye.detector.classes)
         if not len(photographs):
             raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
-        self.scenes: Scenes = (
-            Panoramas(photographs, width=config.width, count=config.scenes, seed=config.seed)
-            if config.scene == "panorama"
-            else Mosaics(
-                photographs,
-                4,
-                4,
-                tile=(config.width // 4, config.width * 3 // 16),
-                count=config.scenes,
-                seed=config.seed,
-            )
-        )
-        looks, components = {"eye": self.eye.settings(), "fields": config.fields}, len(self.eye.detector.classes) + 1
+        self.scenes = _composed(photographs, config)
+        looks = {"eye": self.eye.settings(), "fields": config.fields}
+        components = len(self.eye.detector.classes) + 1
         self.store = DetectionStore(store_folder(config.cache) / "head", looks, _LOOKS, components)
 
     def depends_on(self) -> dict[str, Any]:
@@ -135,7 +125,8 @@ class HeadRun(SceneRun):
 
     def world(self, index: int) -> World:
         """Return the scene as a world in which the head looks around."""
-        image, speeds = self.scenes[index].image, self.config.speeds
+        image = self.scenes[index].image
+        speeds = self.config.speeds
         if self.config.scene == "panorama":
             return Panorama(image, speeds=speeds)
         return Flat(image, speeds=speeds, degree=image.shape[-1] / _MOSAIC)
@@ -147,7 +138,8 @@ class HeadRun(SceneRun):
 
     def outcomes(self, index: int) -> tuple[list[ResultRecord], dict[str, float]]:
         """Run the searches and the exploration of a scene with every way of moving eye and head; returns records."""
-        watch, config = Stopwatch(), self.config
+        watch = Stopwatch()
+        config = self.config
         views = Views(self.world(index), config.fields, fovea=self.fovea)
         store = self.store if config.store else None
 
@@ -177,7 +169,8 @@ class HeadRun(SceneRun):
 
     def ways(self, gain: LookGain, start: int) -> dict[str, Callable[[int], AcquisitionFunction]]:
         """Every way of moving eye and head, by its name in the tables: its acquisition function after an action."""
-        views, config = gain.views, self.config
+        views = gain.views
+        config = self.config
         pose = start // views.cells
         order = _tiling_order(views, pose)
         shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
@@ -303,6 +296,14 @@ class HeadRun(SceneRun):
         )
 
 
+def _composed(photographs: Scenes, config: HeadConfig) -> Scenes:
+    """Compose scenes of photographs: panoramas, or mosaics of 4 × 4 photographs of 4:3."""
+    if config.scene == "panorama":
+        return Panoramas(photographs, width=config.width, count=config.scenes, seed=config.seed)
+    tile = (config.width // 4, config.width * 3 // 16)
+    return Mosaics(photographs, 4, 4, tile=tile, count=config.scenes, seed=config.seed)
+
+
 def _share_right(probabilities: Tensor, answers: Tensor, weight: Tensor) -> float:
     """Compute the share of the cells whose most probable class is right.
 
@@ -323,9 +324,11 @@ def turns(steps: list[HeadStep], views: Views) -> int:
 
 def _tiling_order(views: Views, pose: int) -> list[int]:
     """List the poses that tile the scene in the order of a scan from `pose` on: row by row, alternating direction."""
-    snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(views.tiling)))]
-    at = snake.index(pose)
-    return snake[at:] + snake[:at]
+    snake: list[int] = []
+    for number, row in enumerate(views.tiling):
+        snake += row if number % 2 == 0 else row[::-1]
+    first = snake.index(pose)
+    return snake[first:] + snake[:first]
 
 
 def _scene_answers(views: Views, places: Boxes, labels: Tensor, classes: int) -> Tensor:
@@ -368,7 +371,8 @@ def _rests_on(views: Views, action: int, places: Boxes) -> Tensor:
     edges = views.view_grid.edges[cell]
     share = torch.linspace(0, 1, 9)
     y, x = torch.meshgrid(share, share, indexing="ij")
-    inside = edges[:2] + torch.stack([x, y], -1).flatten(0, 1) * (edges[2:] - edges[:2]) - 0.5
+    shares = torch.stack([x, y], -1).flatten(0, 1)  # (81, 2), of the sides of the cell
+    inside = edges[:2] + shares * (edges[2:] - edges[:2]) - 0.5
     held = places.contain(views.world.to_scene(inside, views.poses[pose])).any(-1)
     if bool(held.all()):
         return held

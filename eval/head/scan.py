@@ -17,11 +17,15 @@ class Scan(AcquisitionFunction):
 
     def __init__(self, gain: LookGain, order: Sequence[int], dwell: int, action: int) -> None:
         super().__init__()
-        self.gain, self.order, self.dwell, self.action = gain, order, dwell, action
+        self.gain = gain
+        self.order = order
+        self.dwell = dwell
+        self.action = action
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(1, A)`; `OUT` for all poses but the next one."""
-        belief, cells = own(belief, SceneBelief, "belief"), self.gain.views.cells
+        belief = own(belief, SceneBelief, "belief")
+        cells = self.gain.views.cells
         turn = int(belief.looks) // self.dwell
         for _ in self.order:
             pose = self.order[turn % len(self.order)]

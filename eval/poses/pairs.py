@@ -189,7 +189,8 @@ def repeated_texture(stage: Stage) -> Film:
     picture = stage.picture()
     height, width = picture.shape[:2]
     period = int(width / 3840 * stage.number(40, 160))
-    x, y = int(stage.number(0, width - period - 1)), int(stage.number(0, height - period - 1))
+    x = int(stage.number(0, width - period - 1))
+    y = int(stage.number(0, height - period - 1))
     piece = picture[y : y + period, x : x + period]
     tiled = np.tile(piece, (height // period + 1, width // period + 1, 1))[:height, :width]
     irregular = cv2.GaussianBlur(stage.random.normal(0, 1, (height, width, 1)), (0, 0), period / 4)
