@@ -104,7 +104,13 @@ class ActivePerception(MovableModule):
         self.exploring = Strategy(*explore)
         check_cells(grid)
         self.columns, self.rows = grid
-        self._check_models()
+        settings = eye.settings()
+        for model in self.modules():
+            if isinstance(model, FovealObservationModel | Verification):
+                fitted = model.metadata
+                check_same_detector(fitted.get("detector", {}), settings["detector"], model.title)
+                check_sensor(fitted.get("sensor", {}), settings["sensor"], model.title, strict=True)
+                check_grid(fitted.get("training", {}), grid, model.title)
 
     @classmethod
     def recommended(
@@ -224,16 +230,6 @@ class ActivePerception(MovableModule):
         check_options(options, names, "the agent or of semfov.load_detector")
         return cls(**make(*arguments, **options)).eval().requires_grad_(False)
 
-    def _check_models(self) -> None:
-        """Raise `InputError` for a model of the agent that was fitted for another detector, sensor or grid."""
-        settings = self.eye.settings()
-        for model in self.modules():
-            if isinstance(model, FovealObservationModel | Verification):
-                fitted = model.metadata
-                check_same_detector(fitted.get("detector", {}), settings["detector"], model.title)
-                check_sensor(fitted.get("sensor", {}), settings["sensor"], model.title, strict=True)
-                check_grid(fitted.get("training", {}), (self.columns, self.rows), model.title)
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or convert the agent; half precision is for the detector alone, as beliefs and decisions need more."""
         self.eye.detector.check_conversion(fn)
@@ -261,14 +257,10 @@ class ActivePerception(MovableModule):
 
     def __repr__(self) -> str:
         """Write the detector, the sensor and the parts that were fitted in one line."""
-        detector = self.eye.detector.settings()["name"]
-        parts = [
-            f"{detector}, {len(self.classes) - 1} classes",
-            type(self.eye.sensor).__name__,
-            f"cells={(self.columns, self.rows)}",
-            f"fitted={[name for name in ('windows', 'verification') if getattr(self, name) is not None]}",
-        ]
-        return f"{type(self).__name__}({', '.join(parts)})"
+        fitted = [name for name in ("windows", "verification") if getattr(self, name) is not None]
+        detector = f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes"
+        sensor = type(self.eye.sensor).__name__
+        return f"{type(self).__name__}({detector}, {sensor}, cells={(self.columns, self.rows)}, fitted={fitted})"
 
     @property
     def classes(self) -> tuple[str, ...]:

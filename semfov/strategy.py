@@ -106,7 +106,7 @@ class Strategy(nn.Module):
         return Strategy(AnyOf(self.observer, weights), policy), most_probable, weights
 
 
-def _weights_by_index(by_target: Mapping[Any, float], classes: Sequence[str]) -> dict[int, float]:
+def _weights_by_index(by_target: Mapping[str | int, float], classes: Sequence[str]) -> dict[int, float]:
     """Find the weights of the classes 1..K that are meant; raises `InputError` for an unknown class, or one twice."""
     weights: dict[int, float] = {}
     for target, weight in by_target.items():
