@@ -21,7 +21,7 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
     """Bring arguments into the form that the parser understands.
 
     Names of options may have dashes, a flag needs no value, several words or numbers no brackets, and `none` is the
-    empty list.
+    empty list. Words that belong to no option may stand before, between and after the options.
 
     Args:
         arguments: the words of the command line.
@@ -29,27 +29,32 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         options: the options of the parser, with underscores, such as `--stop_below`.
 
     Returns:
-        The words for the parser. Those that it does not know stay as they are.
+        The words for the parser, those that belong to no option first. What it does not know stays as it is.
 
     Raises:
         InputError: an option that takes one value is given twice, or one that takes a file is given no name.
     """
     types = setting_types(config)
     usual: list[str] = []
+    free: list[str] = []  # of which the parser takes only those that stand together
     words = deque(arguments)
     while words:
         word = words.popleft()
         if word == "--":  # what follows it are no options
-            return [*usual, word, *words]
+            return [*usual, word, *free, *words]
         option = _option_of(word)
         if option in options:
             kind = types.get(option[2:], _NO_SETTING)
             _check_once(option, kind, usual)
             value = _value_of(word, kind, words)
             usual.append(option if value is None else f"{option}={kind.in_brackets(value)}")
-        else:
+            if value is None and words and not words[0].startswith("--"):
+                usual.append(words.popleft())
+        elif word.startswith("-") and word != "-":
             usual.append(word)  # left to the parser, with its messages
-    return usual
+        else:
+            free.append(word)
+    return [*free, *usual]
 
 
 _NO_SETTING = SettingType(None)

@@ -318,6 +318,22 @@ def test_options_are_written_as_in_other_commands():
     assert usual_form(["--looks", "--looks"], options.SearchOptions, known) == ["--looks=true", "--looks=true"]
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        "--areas logo:1,2,3,4 price:5,6,7,8 --people 3 a.jpg b.jpg",
+        "a.jpg --areas logo:1,2,3,4 price:5,6,7,8 b.jpg --people 3",
+        "a.jpg b.jpg --people 3 --areas logo:1,2,3,4 price:5,6,7,8",
+        "--people 3 a.jpg --areas logo:1,2,3,4 price:5,6,7,8 -- b.jpg",
+    ],
+)
+def test_pictures_may_stand_before_between_and_after_options(given):
+    parser = make_parser(options.GazeOptions, None, ("pictures", "pictures"))
+    parsed = parser.parse_args(usual_form(given.split(), options.GazeOptions, parser._option_string_actions))
+    assert [str(picture) for picture in parsed.pictures] == ["a.jpg", "b.jpg"]
+    assert (parsed.areas, parsed.people) == ("logo:1,2,3,4 price:5,6,7,8", 3)
+
+
 def test_a_shell_completes_commands_and_options():
     lines = _completion("fish", {"find": ["stop_below"]}).splitlines()
     assert lines == [
