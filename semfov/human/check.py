@@ -22,11 +22,16 @@ from semfov.human.fixations.table import FrameError, PictureError, read_table
 _Reader = Callable[..., list[Fixations]]
 
 _FRAMES_NAMED = 3  # largest number of sizes of frames that are named
+_DAMAGED_NAMED = 3  # largest number of damaged pictures that are named
 _WITHOUT_FRAMES = ("OSIE", "COCO-Search18")  # data sets whose files need not have the size of their frames
 
 
 class _PictureSizes(Mapping[str, tuple[int, int]]):
-    """`(width, height)` of a picture or those in a folder, by names as tables have them: with any path and ending."""
+    """`(width, height)` of a picture or those in a folder, by names as tables have them: with any path and ending.
+
+    Attributes:
+        damage: why pictures that were asked for have no size, by their files.
+    """
 
     def __init__(self, folder: Path, keep: Callable[[Path], bool] | None = None) -> None:
         self._files: dict[str, Path] = {}
@@ -34,6 +39,7 @@ class _PictureSizes(Mapping[str, tuple[int, int]]):
             for name in (path.stem, path.name, path.relative_to(folder).as_posix()):
                 self._files[name.lower()] = path
         self._sizes: dict[Path, tuple[int, int]] = {}
+        self.damage: dict[Path, SemfovError] = {}
 
     def path(self, name: str) -> Path:
         """Find the file of a picture by its name; `KeyError` where there is none."""
@@ -47,8 +53,13 @@ class _PictureSizes(Mapping[str, tuple[int, int]]):
 
     def __getitem__(self, name: str) -> tuple[int, int]:
         path = self.path(name)
-        if path not in self._sizes:
-            self._sizes[path] = picture_size(path)
+        if path not in self._sizes and path not in self.damage:
+            try:
+                self._sizes[path] = picture_size(path)
+            except SemfovError as error:
+                self.damage[path] = error
+        if path in self.damage:
+            raise KeyError(name)
         return self._sizes[path]
 
     def __iter__(self) -> Iterator[str]:
@@ -181,12 +192,20 @@ class _Reading(NamedTuple):
             warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say
             reader = reader_of(path, self.arguments.get("columns"))
             records = self._records(reader, path)
-        lines = [*suspicions(records, self.sizes), *self._suspicions_by_content(records)]
+        lines = [*suspicions(records, self.sizes), *self._damage(), *self._suspicions_by_content(records)]
         usual_frames = ""
         data_set = DATA_SETS.get(reader)
         if data_set in _WITHOUT_FRAMES and "size" not in self.arguments:
             usual_frames = f" (those of {data_set}, or give --size)"
         return FixationReport(_content(records, usual_frames), lines, was_compared=self.sizes is not None)
+
+    def _damage(self) -> list[str]:
+        """Say why pictures cannot be opened, the first of them."""
+        if self.sizes is None:
+            return []
+        errors = [*self.sizes.damage.values()]
+        more = len(errors) - _DAMAGED_NAMED
+        return [*map(str, errors[:_DAMAGED_NAMED]), *([f"{more} more pictures cannot be opened"] if more > 0 else [])]
 
     def _suspicions_by_content(self, records: Sequence[Fixations]) -> list[str]:
         """Compare fixations with where people look in their pictures, if there are pictures."""
@@ -226,7 +245,13 @@ class _Reading(NamedTuple):
         except FrameError as error:
             if self.sizes is None:
                 raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
-            return read_by(reader, path, {**arguments, "size": self.sizes})
+            try:
+                return read_by(reader, path, {**arguments, "size": self.sizes})
+            except InputError:
+                # Whose frames are the pictures cannot be read without them.
+                for damage in self.sizes.damage.values():
+                    raise DataError(f"{damage}; or leave out the lines of this picture, or give --size") from None
+                raise
 
 
 def _content(records: list[Fixations], usual: str) -> str:

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -26,7 +25,7 @@ def suspicions_by_content(
     Args:
         records: the records.
         path_of: file of a picture by its name; raises `KeyError` where there is none.
-        sizes: `(width, height)` of the pictures by their names.
+        sizes: `(width, height)` of the pictures by their names; without those that are missing or damaged.
         quiet: whether to hide the progress bar.
 
     Returns:
@@ -34,7 +33,8 @@ def suspicions_by_content(
     """
     counts: Counter[str] = Counter()
     for record in records:
-        counts[record.picture] += len(record)
+        if record.picture in sizes:
+            counts[record.picture] += len(record)
     # Pictures with most fixations tell most.
     names = sorted(counts, key=lambda name: (-counts[name], name))[:CONTENT_PICTURES]
     if len(names) < FEWEST_PICTURES:
@@ -42,11 +42,14 @@ def suspicions_by_content(
     detector = load_detector(DEFAULT_DETECTOR)
     densities: dict[str, Tensor] = {}
     picture_sizes: dict[str, tuple[int, int]] = {}
+    damage: list[str] = []
     with task_bar(len(names), "where people look", "picture", hidden=quiet) as bar:
         for name in names:
-            with suppress(KeyError, SemfovError):  # a picture that is missing or damaged is named by its size
+            try:
                 image, size = OpenedPicture.of(path_of(name)).viewed(torch.zeros(1))
                 densities[name] = GazePrediction.of(detector, image, size=size).cells
                 picture_sizes[name] = sizes[name]
+            except SemfovError as error:  # its head tells a size, but the rest cannot be decoded
+                damage.append(str(error))
             bar.update()
-    return content_suspicions(records, densities, picture_sizes)
+    return damage + content_suspicions(records, densities, picture_sizes)

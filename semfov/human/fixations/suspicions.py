@@ -234,7 +234,7 @@ def _of_pictures(records: Sequence[Fixations], sizes: Mapping[str, tuple[int, in
     unknown = sorted(pictures - sizes.keys())
     lines = []
     if unknown:
-        lines.append(f"{len(unknown)} of {len(pictures)} pictures are not there, such as {unknown[0]}")
+        lines.append(f"{len(unknown)} of {len(pictures)} pictures are missing or damaged, such as {unknown[0]}")
     if other_frame_of(records) is not None:
         return lines  # of which the frame tells nothing
     smaller = _smaller_pictures(records, sizes)

@@ -129,12 +129,36 @@ def test_pictures_of_a_folder_are_compared_with_the_frames_by_their_names(tmp_pa
     write_table(table, [replace(one, picture=name) for one, name in zip(records, ("a", "C:/c.jpg", "d"), strict=True)])
     assert main(command) == 1
     shown = capsys.readouterr().out
-    assert "1 of 3 pictures are not there, such as d\n" in shown
+    assert "1 of 3 pictures are missing or damaged, such as d\n" in shown
     assert "1 of 3 pictures have other proportions than their frames, such as C:/c.jpg, 400 × 600 in 800 × 600" in shown
     # Without a frame in the table, the pictures are the frames.
     table.write_text("picture,subject,x,y\nb,1,600,400\nc,1,390,590\n")
     assert main(command) == 0
     assert "frames of 400 × 600, 640 × 480" in capsys.readouterr().out
+
+
+def test_damaged_pictures_are_named_and_the_others_are_compared(tmp_path, capsys):
+    folder = tmp_path / "viewed"
+    folder.mkdir()
+    (folder / "0.jpg").write_bytes(b"no picture")
+    for number in range(1, 6):
+        Image.effect_noise(SIZE, 50).save(folder / f"{number}.jpg")
+    whole = (folder / "5.jpg").read_bytes()
+    (folder / "5.jpg").write_bytes(whole[: len(whole) // 2])  # its head tells its size
+    Image.new("L", (400, 600)).save(folder / "2.jpg")
+    table = tmp_path / "t.csv"
+    command = ["check", str(table), "--picture", str(folder)]
+    write_table(table, people(6))
+    assert main(command) == 1
+    shown = capsys.readouterr().out
+    assert "1 of 6 pictures are missing or damaged, such as 0.jpg\n" in shown
+    assert f"suspicious: image {folder / '0.jpg'}: " in shown
+    assert f"suspicious: image {folder / '5.jpg'}: " in shown
+    assert "1 of 6 pictures have other proportions than their frames, such as 2.jpg, 400 × 600 in 800 × 600" in shown
+    # Fixations whose frame is a damaged picture cannot be read.
+    table.write_text("picture,subject,x,y\n0.jpg,1,60,40\n1.jpg,1,390,590\n")
+    assert main(command) == 1
+    assert "; or leave out the lines of this picture, or give --size\n" in capsys.readouterr().err
 
 
 def test_fixations_in_the_pixels_of_smaller_pictures_are_told():
