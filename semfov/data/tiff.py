@@ -248,7 +248,8 @@ class _Tiles:
         separate: whether each channel has a grid of tiles of its own.
 
     Private attributes: `_decoded` keeps strips that are the whole picture, by page and number, as each window would
-    decode them again. `_lock` is held while the place in the file is moved.
+    decode them again. `_inflatable` has page and number of the packed tiles that inflate to their size: each is asked
+    once, as that takes as long as decoding it. `_lock` is held while the place in the file is moved.
 
     Invariant: tiles of a grid cover the picture without overlaps, `columns` by `rows` of them; those of the last column
     and the last row may reach beyond it. `_decoded` is empty for pictures of several tiles.
@@ -261,6 +262,7 @@ class _Tiles:
         self._layers = layers
         self._lock = Lock()
         self._decoded: dict[tuple[int, int], Values] = {}
+        self._inflatable: set[tuple[int, int]] = set()
         width, height = self._size = _size_of(page)
         self._is_one_strip = not page.is_tiled and page.rowsperstrip >= height
         # What is not packed has its rows at known places in the file.
@@ -345,7 +347,9 @@ class _Tiles:
             a_pixel = 2 * samples * self._page.dtype.itemsize + 3
             check_decoding(self._size, a_pixel, stored, f"image {self._path}")
         data = self.read_bytes(layer.dataoffsets[number], stored)
-        self._check_inflation(data, size)
+        if key not in self._inflatable:
+            self._check_inflation(data, size)
+            self._inflatable.add(key)
         tile: Values = self._page.decode(data, number, jpegtables=self._page.jpegtables)[0][0]
         if self._is_one_strip:
             self._decoded[key] = tile

@@ -108,6 +108,25 @@ def test_a_tile_that_is_far_larger_than_its_pixels(tmp_path, kind, monkeypatch):
     tracemalloc.stop()
 
 
+def test_a_tile_is_asked_once_how_far_it_inflates(tmp_path, monkeypatch):
+    path = tmp_path / "a.tif"
+    values = np.random.default_rng(0).integers(256, size=(64, 128, 3), dtype=np.uint8)
+    tifffile.imwrite(path, values, tile=(64, 64), compression="zlib", photometric="rgb")
+    asked = []
+
+    def inflater():
+        asked.append(1)
+        return zlib.decompressobj()
+
+    monkeypatch.setattr("semfov.data.tiff._INFLATED", 100)
+    monkeypatch.setattr("semfov.data.tiff._INFLATERS", {8: inflater})
+    picture = open_large(path)
+    windows = [(0, 0, 128, 64), (10, 5, 50, 40), (30, 0, 90, 64), (0, 0, 128, 64)]
+    for x1, y1, x2, y2 in windows:
+        assert (picture.pixels((x1, y1, x2, y2)) == values[y1:y2, x1:x2]).all()
+    assert len(asked) == 2  # tiles
+
+
 def test_a_tile_that_claims_more_than_is_stored(tmp_path):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, np.zeros((64, 64), np.uint8), tile=(64, 64), compression="zlib")
