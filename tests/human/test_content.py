@@ -90,6 +90,14 @@ def test_a_shift_is_known_within_ten_pixels(shift):
     assert np.abs(np.array(found) - shift).max() <= 10
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_drift_that_leaves_the_pictures_is_not_taken_for_wrong_names(seed):
+    """Those in the last of 16 pictures lie 237 px from where they were made; blobs of people are 35 px wide."""
+    drifted = drawn(lambda points, person, order: points + np.array([13, -9]) * order, seed=seed)
+    (line,) = content_suspicions(drifted, BY_NAME, SIZES)
+    assert "fixations in the second half of each person's pictures lie about" in line
+
+
 def test_names_of_other_pictures_are_noticed():
     moved = NAMES[1:] + NAMES[:1]
     (line,) = content_suspicions(drawn(names=moved), BY_NAME, SIZES)
