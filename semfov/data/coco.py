@@ -4,7 +4,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +14,8 @@ from torch import Tensor
 
 from semfov.data.annotations import Annotations, Entry, Id, read_annotations, warn_of_form
 from semfov.data.classes import canonical_name, class_indices
+from semfov.data.images import SWAPPED, file_orientation, upright_boxes
+from semfov.data.large import picture_size
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Coverage, Scene, Scenes, legal_targets
 from semfov.errors import DataError, check, check_data
@@ -35,8 +37,8 @@ class CocoScenes(Scenes):
     are not in `classes` and, with `crowd="drop"`, boxes of crowds. `repairs` counts the boxes of the whole file that
     were cut or dropped, and a warning of the logger `semfov.data.coco` lists them. Any other error in the file raises.
 
-    Photographs are turned upright by their EXIF orientation, as viewers and programs for annotation show them, and left
-    as they are stored where only the stored pixels have the size that the file states. Where the size does not tell
+    Photographs are turned upright by their EXIF orientation, as viewers and programs for annotation show them. Where
+    only the stored pixels have the size that the file states, boxes are turned with them. Where the size does not tell
     (the stored photograph is square, upside down or mirrored), boxes are those of the upright one.
 
     Args:
@@ -108,6 +110,7 @@ class CocoScenes(Scenes):
         self.ids = [self._packed.ids[row] for row in self._rows]
         names = [self._packed.names[row] for row in self._rows]
         self._files = _files_of(root, names)
+        self._orientations: dict[int, int] = {}  # those that were asked for, by the position of the scene
 
         # Names and sizes tell another copy of the images apart without reading them.
         settings = [file.digest, self.classes, self.ids, max_target_area, coverage, crowd]
@@ -143,17 +146,14 @@ class CocoScenes(Scenes):
         return selected
 
     def __getitem__(self, index: int) -> Scene:
-        """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""
+        """Decode an image, and turn it upright."""
         annotation = self.annotation(index)
         path = self._files[index]
         width, height = annotation.size
         image = read_image(path)
-        if image.shape[-2:] != (height, width):
-            # Some data sets are annotated on the pixels as they are stored.
-            got = f"{image.shape[-1]} × {image.shape[-2]}; use the image that the annotations were made for"
-            image = read_image(path, oriented=False)
-            is_annotated = image.shape[-2:] == (height, width)
-            check_data(is_annotated, f"image {path}", f"{width} × {height} pixels as annotated", got)
+        got = f"{image.shape[-1]} × {image.shape[-2]}; use the image that the annotations were made for"
+        is_annotated = image.shape[-2:] == (height, width)
+        check_data(is_annotated, f"image {path}", f"{width} × {height} pixels as annotated", got)
         name = self._packed.names[self._rows[index]]
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 
@@ -164,9 +164,26 @@ class CocoScenes(Scenes):
             index: position of the scene in the set.
 
         Returns:
-            The objects.
+            The objects, in pixels of the upright photograph.
         """
-        return self._packed.annotation(self._rows[index])
+        annotation = self._packed.annotation(self._rows[index])
+        orientation = self._annotated_orientation(index)
+        if orientation < SWAPPED:
+            return annotation
+        width, height = annotation.size
+        boxes = upright_boxes(annotation.boxes, annotation.size, orientation)
+        return replace(annotation, boxes=boxes, size=(height, width))
+
+    def _annotated_orientation(self, index: int) -> int:
+        """Tell in which EXIF orientation a photograph is annotated: 1 for upright, else that of its stored pixels."""
+        if index not in self._orientations:
+            path = self._files[index]
+            width, height = self._packed.sizes[self._rows[index]]
+            orientation = file_orientation(path)
+            # A square has one size in both frames.
+            is_stored = orientation >= SWAPPED and width != height and picture_size(path) == (height, width)
+            self._orientations[index] = orientation if is_stored else 1
+        return self._orientations[index]
 
     def targets(self, index: int) -> list[int]:
         """List the classes of a scene that may be searched for, 1..K, ascending.

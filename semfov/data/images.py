@@ -541,6 +541,20 @@ def stored_boxes(boxes: Tensor, size: tuple[int, int], orientation: int) -> Tens
     return torch.stack(edges, -1)
 
 
+def upright_boxes(boxes: Tensor, size: tuple[int, int], orientation: int) -> Tensor:
+    """Move boxes in the stored pixels of a picture to where they are once it is turned upright.
+
+    Args:
+        boxes: `(N, 4)`, `(x1, y1, x2, y2)` in pixels.
+        size: `(width, height)` of the stored picture.
+        orientation: EXIF orientation of the file, 1 to 8.
+
+    Returns:
+        `(N, 4)`, in pixels of the upright picture.
+    """
+    return stored_boxes(boxes, size, _INVERSE.get(orientation, orientation))
+
+
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:
     """Convert an image `(3, H, W)`, which is RGB in [0, 1] or bytes, to bytes `(H, W, 3)`."""
     if image.dtype != torch.uint8:

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 
 from semfov import CocoScenes, DataError, read_image
 from semfov.data.annotations import read_annotations, warn_of_form
@@ -267,31 +267,47 @@ def test_a_missing_image_is_an_error_only_if_it_is_used(photographs, make_coco, 
     assert only.ids == [10, 20]  # an image that is not used may be missing
 
 
-@pytest.mark.parametrize(
-    ("orientation", "turns", "height", "frame"),  # quarter turns to the left that make the stored pixels upright
-    [
-        (1, 0, 30, "upright"),
-        (3, 2, 30, "upright"),
-        (6, -1, 30, "upright"),
-        (6, -1, 30, "stored"),
-        (6, -1, 40, "upright"),  # the size of a square does not tell the frame
-        (8, 1, 30, "upright"),
-        (8, 1, 30, "stored"),
-    ],
-)
-def test_pixels_of_a_rotated_photograph_fit_the_annotations(
-    tmp_path, make_coco, coco_dict, orientation, turns, height, frame
-):
+@pytest.mark.parametrize("frame", ["upright", "stored"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_a_photograph_is_shown_upright_with_its_boxes(tmp_path, make_coco, coco_dict, orientation, frame, suffix):
+    """Boxes lie on a white rectangle, whichever frame they were annotated in; Pillow turns the picture."""
     exif = Image.Exif()
     exif[0x0112] = orientation
-    pixels = np.random.default_rng(0).integers(0, 256, (height, 40, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "10.png", exif=exif)
+    stored = np.zeros((30, 40, 3), np.uint8)
+    stored[4:9, 22:37] = 255
+    path = tmp_path / f"10.{suffix}"
+    Image.fromarray(stored).save(path, exif=exif)
+    with Image.open(path) as file:
+        upright = np.asarray(ImageOps.exif_transpose(file))
+    # The size tells stored pixels only where sides are swapped.
+    annotated = stored if frame == "stored" and orientation >= 5 else upright
+    data = coco_dict([(10, "cat", box_of_white(annotated))])
+    data["images"] = [{"id": 10, "file_name": path.name, "width": annotated.shape[1], "height": annotated.shape[0]}]
+    scenes = CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL)
+    scene = scenes[0]
+    assert np.array_equal((scene.image * 255).round().byte().permute(1, 2, 0).numpy(), upright)
+    left, top, width, height = box_of_white(upright)
+    assert scene.boxes.tolist() == [[left, top, left + width, top + height]]
+    annotation = scenes.annotation(0)
+    assert torch.equal(annotation.boxes, scene.boxes)
+    assert annotation.size == (upright.shape[1], upright.shape[0])
+
+
+def box_of_white(pixels):
+    """Left, top, width and height of what is white in a picture."""
+    rows, columns, _ = pixels.nonzero()
+    top, left = int(rows.min()), int(columns.min())
+    return left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top
+
+
+def test_the_size_of_a_square_does_not_tell_its_frame(tmp_path, make_coco, coco_dict):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (40, 40)).save(tmp_path / "10.png", exif=exif)
     data = coco_dict([(10, "cat", (2, 1, 7, 9))])
-    expected = np.rot90(pixels, turns) if frame == "upright" else pixels
-    data["images"] = [{"id": 10, "file_name": "10.png", "width": expected.shape[1], "height": expected.shape[0]}]
-    scene = CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL)[0]
-    assert np.array_equal((scene.image * 255).round().byte().permute(1, 2, 0).numpy(), expected)
-    assert scene.boxes.tolist() == [[2, 1, 9, 10]]
+    data["images"] = [{"id": 10, "file_name": "10.png", "width": 40, "height": 40}]
+    assert CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL)[0].boxes.tolist() == [[2, 1, 9, 10]]
 
 
 def test_annotations_of_another_detector_or_image_size_are_refused(photographs, make_coco, coco_dict):
