@@ -6,7 +6,7 @@ r"""Planted faults: `python -m eval.content` measures what `semfov check` knows 
 Sets of pictures are drawn from a data set of fixations, and each set is read wrongly in thirteen ways, one after the
 other, and rightly. The table has the share of the sets in which the fault is named, of `semfov.human.content` alone and
 of the rules without pictures (`semfov.data.fixations.suspicions`). A model that was fitted to other pictures makes the
-test honest.
+test honest. With `--page PAGE.md` the table `content` of the page is replaced.
 """
 
 import re
@@ -20,13 +20,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from eval.human.viewing import write_tables
 from semfov.data.fixations import Fixations, suspicions
 from semfov.data.reading import read_image
 from semfov.detection.load import load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.human import content_suspicions
-from semfov.human.fixations.reading import read_fixations
+from semfov.human.fixations.reading import frame_of, read_fixations
 from semfov.io.ranges import Seed, Whole
 from semfov.paths.gaze import GazePrediction
 from semfov.runs.command import command
@@ -45,6 +46,7 @@ class ContentConfig(Settings):
 
     Args:
         fixations: file of fixations in pixels of the pictures.
+        frame: frame of a file that has none, as `640x480` (none: that of its format, such as 800x600 of OSIE's files).
         pictures: folder of the pictures.
         detector: the detector whose feature maps the model reads.
         model: file of a model of where people look (none: the one that is shipped for the detector).
@@ -52,9 +54,12 @@ class ContentConfig(Settings):
         sets: number of sets.
         size: number of pictures in a set.
         seed: seed of the generator that draws the sets.
+        page: page with a place for the table (`<!-- table content -->` to `<!-- end -->`); none: it is left alone.
+        out: folder for the table.
     """
 
     fixations: Path = Path("fixations.json")
+    frame: str | None = None
     pictures: Path = Path("images")
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     model: Path | None = None
@@ -62,6 +67,8 @@ class ContentConfig(Settings):
     sets: Whole = 100
     size: Whole = 20
     seed: Seed = 0
+    page: Path | None = None
+    out: Path = Path("runs/content")
 
 
 @dataclass(frozen=True)
@@ -130,14 +137,15 @@ def _deranged(count: int, rng: np.random.Generator) -> list[int]:
             return [int(number) for number in order]
 
 
-def measure(config: ContentConfig) -> str:
+def measure(config: ContentConfig) -> list[str]:
     """Plant all faults in all sets.
 
     Returns:
-        The table.
+        The lines of the table.
     """
     by_picture: dict[str, list[Fixations]] = {}
-    for record in read_fixations(config.fixations):
+    frame = {} if config.frame is None else {"size": frame_of(config.frame)}
+    for record in read_fixations(config.fixations, **frame):
         if record.subject not in config.without and len(record):
             by_picture.setdefault(record.picture, []).append(record)
     names = sorted(by_picture)
@@ -153,7 +161,7 @@ def measure(config: ContentConfig) -> str:
             counts[name].add(fault, lines, suspicions(records, sizes))
     rows = [["fault", "named by content", "offset right within 10 px", "anything suspicious by rules"]]
     rows += [[fault, *of_fault.cells(config.sets)] for fault, of_fault in counts.items()]
-    return "\n".join(table(rows))
+    return table(rows)
 
 
 @dataclass
@@ -222,8 +230,9 @@ def _read_wrongly(
 
 
 def run(config: ContentConfig) -> None:
-    """Print the table."""
-    print(measure(config))
+    """Print the table, and write it."""
+    lines = measure(config)
+    write_tables("\n".join([*lines, ""]), {"content": lines}, config.out, config.page)
 
 
 main = command(run, ContentConfig, __doc__)
