@@ -51,6 +51,11 @@ class DataError(SemfovError):
     """A file (image, annotations, weights, cache) is missing, damaged or of the wrong shape."""
 
 
+def reason_of(error: BaseException) -> str:
+    """Write the message of another library's error on one line, for a message of ours; empty where it has none."""
+    return " ".join(str(error).split())
+
+
 def check(condition: bool, argument: str, expected: str, got: object) -> None:
     """Raise `InputError` unless a condition holds.
 

@@ -21,7 +21,7 @@ from semfov.data.scenes import CLASSES
 from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
 from semfov.data.tone import White
 from semfov.data.windowed import LargePicture
-from semfov.errors import DataError, InputError, SemfovError, check, printable
+from semfov.errors import DataError, InputError, SemfovError, check, printable, reason_of
 from semfov.head import Flat, Panorama
 from semfov.io.files import disk_is_full
 from semfov.settings import How
@@ -119,7 +119,7 @@ class PictureSource(NamedTuple):
             return error
         if not several:
             raise error
-        reason = " ".join(str(error).split()) or "no message"
+        reason = reason_of(error) or "no message"
         return DataError(f"{self.name}: cannot be looked at ({type(error).__name__}: {reason})")
 
 

@@ -25,7 +25,7 @@ from semfov.data.signatures import kind_of
 from semfov.data.tiff_tags import HEIGHT, WHITE_IS_ZERO, WIDTH, TiffTags
 from semfov.data.tone import White
 from semfov.data.windowed import Box, LargePicture
-from semfov.errors import DataError, SemfovError, check_data, check_pixels
+from semfov.errors import DataError, SemfovError, check_data, check_pixels, reason_of
 from semfov.io.files import check_regular
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def _fault(error: Exception, source: Path | str, action: str) -> str:
     if error_name == "DecompressionBombError":
         most = f"expected at most {2 * MAX_PIXELS:,} pixels of a file that is decoded as a whole"
         return f"{most}, got more; convert it to a tiled TIFF"
-    reason = " ".join(str(error).split()) or error_name
+    reason = reason_of(error) or error_name
     if not isinstance(source, Path):
         return f"truncated, damaged or closed, and cannot be {action} ({reason}); open it again or replace it"
     is_unidentified = error_name == "UnidentifiedImageError"

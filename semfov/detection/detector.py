@@ -14,7 +14,7 @@ from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
-from semfov.errors import InputError, check, check_pixels, check_whole, checked_keywords, devices_here
+from semfov.errors import InputError, check, check_pixels, check_whole, checked_keywords, devices_here, reason_of
 from semfov.io.state import StatedModule
 
 FAINT = 0.002  # confidence from which on a candidate is a hint, unless the head has another one
@@ -294,7 +294,7 @@ class Detector(StatedModule, ABC):
             converted = convert(torch.zeros(0))
         except (RuntimeError, AssertionError) as error:
             here = ", ".join(devices_here())
-            reason = " ".join(str(error).split())
+            reason = reason_of(error)
             raise InputError(f"device: expected one that PyTorch has here ({here}), got another: {reason}") from None
         has_parameters = any(True for _ in self.parameters())
         check(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from semfov.detection.onnx_budget import Budget, check_elements, graphs
-from semfov.errors import DataError, check_data
+from semfov.errors import DataError, check_data, reason_of
 from semfov.io.files import inside, reading
 from semfov.io.schema import excerpt
 
@@ -53,7 +53,7 @@ def check_file(path: Path, canvas: tuple[int, int] = USUAL) -> bool:
     except DataError:
         raise
     except Exception as error:  # protobuf's and ONNX's own exceptions share no base class
-        reason = " ".join(str(error).split())[-_MOST_REASON:]
+        reason = reason_of(error)[-_MOST_REASON:]
         raise DataError(f"cannot load the {name}: {reason}") from None
 
 

@@ -25,7 +25,7 @@ from semfov.detection.onnx_check import check_file, stored_bytes
 from semfov.detection.onnx_decoding import COLUMNS, rows_of_images
 from semfov.detection.onnx_input import FLOATS, ImageInput, Sizes, open_sizes, sizes_of_image
 from semfov.detection.onnx_program import Description, Opening, Port, describe, open_session, runtime
-from semfov.errors import DataError, check
+from semfov.errors import DataError, check, reason_of
 
 if TYPE_CHECKING:
     from onnx import GraphProto
@@ -335,7 +335,7 @@ def _stride(shape: Sequence[int], canvas: Canvas) -> int | None:
 
 def _reason(error: Exception) -> str:
     """Shorten onnxruntime's own words to their end, which says most."""
-    text = " ".join(str(error).split()).rpartition("Status Message: ")[2]
+    text = reason_of(error).rpartition("Status Message: ")[2]
     text = re.sub(r"/\S+:\d+ .*?\) ", "", text, count=1)  # where in its source
     return text if len(text) <= _MOST_REASON else f"…{text[-_MOST_REASON:]}"
 

@@ -14,7 +14,7 @@ from semfov.detection.onnx_heads import HEADS
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import Candidates
-from semfov.errors import DataError, InputError, check, needing
+from semfov.errors import DataError, InputError, check, needing, reason_of
 from semfov.io.schema import excerpt
 
 _SOFTMAX = ("detr", "table-transformer", "yolos")
@@ -151,7 +151,7 @@ class TransformersDetector(ModuleDetector):
         except ImportError as error:
             raise InputError(f"detector: {name} needs a package that is not installed: {error}") from error
         except (OSError, ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())[:_MOST_REASON]
+            reason = reason_of(error)[:_MOST_REASON]
             raise DataError(f"cannot load {name!r}: {reason}; check the name, and that it has safetensors") from error
         model.requires_grad_(False)
         return cls(model, classes=classes, name=name, processor=processor)

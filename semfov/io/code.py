@@ -74,7 +74,8 @@ def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path
     while todo:
         name = todo.pop()
         parent = name.rpartition(".")[0]
-        # What is imported from a single file is a class or function, and no module.
+        # What is imported from a single file is a class or function. To look for its file would find none, and take
+        # most of the time. (A few single files make modules all the same, as `os` makes `os.path`.)
         is_no_module = parent in single_files and name not in sys.modules
         if name in visited or is_no_module:
             continue
@@ -83,12 +84,12 @@ def _closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path
         if file is None or file in files:
             continue
         files.add(file)
-        package = name
-        if file.name != "__init__.py":
+        is_package = file.name == "__init__.py"
+        if not is_package:
             single_files.add(name)
-            package = parent  # the one that relative imports start from
+        start_of_relative = name if is_package else parent
         for statement in read_source(file).imports:
-            todo += filter(belongs, statement.modules(package))
+            todo += filter(belongs, statement.modules(start_of_relative))
     return files
 
 

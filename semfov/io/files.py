@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from semfov.errors import DataError, check, check_data
+from semfov.errors import DataError, check, check_data, reason_of
 
 _PART = re.compile(r"\..+\.[0-9a-f]{8}\.part")
 _ABANDONED = 24 * 3600.0  # seconds after which a part of a file is taken for one whose writer was killed
@@ -373,7 +373,7 @@ def read_json(
         content = read_bytes(path, most=most, name=name)
         return json.loads(content, object_pairs_hook=_with_unique_names if unique else None)
     except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise DataError(f"{name or path}: cannot be read as JSON ({reason}); correct or replace the file") from None
 
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
-from semfov.errors import DataError, InputError, check, lookup
+from semfov.errors import DataError, InputError, check, lookup, reason_of
 from semfov.io.compatibility import Settings, check_grid, check_same_detector, check_sensor
 from semfov.io.files import JsonObject
 from semfov.io.schema import Json, Object, Schema, Text
@@ -105,7 +105,7 @@ class Pretrained(StatedModule):
                 cls._check_content(tensors, record)
                 model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
-            reason = " ".join(str(error).split())
+            reason = reason_of(error)
             raise DataError(f"{path}: not a complete {cls.title} ({reason})") from None
         return model.eval()
 

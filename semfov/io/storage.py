@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.errors import DataError
+from semfov.errors import DataError, reason_of
 from semfov.io.files import JsonObject, check_regular, write_bytes
 from semfov.io.schema import Schema
 from semfov.version import __version__
@@ -96,7 +96,7 @@ def _read_unverified(path: str | PathLike[str]) -> tuple[dict[str, Tensor], obje
     except FileNotFoundError:
         raise DataError(f"{path}: no such file; check the path") from None
     except (OSError, SafetensorError, ValueError, RecursionError, TypeError, AttributeError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
     except KeyError:
         raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.errors import InputError, check, values_known
+from semfov.errors import InputError, check, reason_of, values_known
 
 
 def as_numbers(values: object, argument: str) -> Tensor:
@@ -118,5 +118,5 @@ def _as_tensor(values: object, argument: str) -> Tensor:
             array = array.copy()  # torch warns of memory that it may not write to
         return torch.as_tensor(array)
     except (TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise InputError(f"{argument}: expected numbers, got {type(values).__name__} ({reason[:100]})") from None

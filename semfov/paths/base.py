@@ -22,7 +22,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
-from semfov.errors import DataError, InputError, check
+from semfov.errors import DataError, InputError, check, reason_of
 from semfov.paths.conversion import Conversion, Values
 from semfov.paths.files import PLAIN, Format, SharedFields
 from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
@@ -314,7 +314,7 @@ class Record(Conversion):
             plain = {name: record.get(name) for name in PLAIN}
             fields = {**plain, **shared, **cls._fields(tensors, record, shared)}
         except InputError as error:
-            got = " ".join(str(error).split())
+            got = reason_of(error)
             raise DataError(f"{path}: expected a complete {cls._format.kind}, got: {got}") from None
         # What a record derives from its looks is in the file, too, and no argument.
         arguments = {field.name for field in fields_of(cls) if field.init}
