@@ -13,12 +13,11 @@ _HEADS = (b"II*\0", b"MM\0*")
 _MOST_PAGES = 8  # below the first one that are looked at; cameras write two or three
 
 
-def check_no_raw(path: str | PathLike[str], name: str) -> None:
+def check_no_raw(path: str | PathLike[str]) -> None:
     """Raise `DataError` for a raw file of a camera, whose thumbnail would be taken for the picture.
 
     Args:
         path: the file, of any kind.
-        name: of the picture, for the message.
     """
     photometrics: list[int] = []
     if not Path(path).is_file():
@@ -26,9 +25,12 @@ def check_no_raw(path: str | PathLike[str], name: str) -> None:
     # What is no TIFF, or is damaged, is refused where it is decoded.
     with suppress(Exception), Path(path).open("rb") as file:
         photometrics = _photometrics_of(file)
-    is_raw = any(photometric in _RAW for photometric in photometrics)
-    remedy = "convert it to JPEG or TIFF by the camera's program or a raw converter"
-    check_data(not is_raw, name, "a picture", f"the raw values of a camera (such as DNG or NEF); {remedy}")
+    is_raw = not set(photometrics).isdisjoint(_RAW)
+    got = (
+        "the raw values of a camera (such as DNG or NEF); convert it to JPEG or TIFF by the camera's program or a raw "
+        "converter"
+    )
+    check_data(not is_raw, f"image {Path(path)}", "a picture", got)
 
 
 def _photometrics_of(file: BinaryIO) -> list[int]:

@@ -4,18 +4,19 @@ import re
 from pathlib import Path
 from typing import Literal
 
+from semfov.data.signatures import Marks, name_by_marks
 from semfov.io.files import reading
 
 Container = Literal["animation", "avi", "matroska", "mp4", "text", "other"]
 
-_MARKS: dict[tuple[int, bytes], Container] = {
+_MARKS: Marks[Container] = {
     (0, b"GIF8"): "animation",
     (8, b"WEBP"): "animation",
     (8, b"AVI "): "avi",
     (0, b"\x1a\x45\xdf\xa3"): "matroska",
     (4, b"ftyp"): "mp4",
 }
-"""Bytes that tell a container, with their place in the file. WebM is Matroska."""
+"""Containers by their marks. WebM is Matroska."""
 
 _LIST = re.compile(rb"(\xef\xbb\xbf)?(#EXTM3U|ffconcat|<|v=0)")
 """The first bytes of a list of films, whatever follows."""
@@ -34,9 +35,9 @@ def container_of(path: Path) -> Container:
         head = file.read(_HEAD)
     if _LIST.match(head):
         return "text"
-    for (place, mark), kind in _MARKS.items():
-        if head.startswith(mark, place):
-            return kind
+    container = name_by_marks(head, _MARKS)
+    if container is not None:
+        return container
     return "text" if _TEXT.fullmatch(head) else "other"
 
 

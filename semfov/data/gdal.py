@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Protocol, Self, TypedDict, Unpack
 import numpy as np
 
 from semfov.data.images import check_proportion
+from semfov.data.signatures import kind_of
 from semfov.data.tone import Values
 from semfov.errors import DataError, check_data
-from semfov.io.files import reading
 
 if TYPE_CHECKING:
     from rasterio.control import GroundControlPoint
@@ -34,17 +34,8 @@ _SETTINGS = {"GDAL_CACHEMAX": _BLOCKS, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DI
 _PATH = re.compile(r"""["=@,]\s*(/|~|\.{1,2}[/\\]|[A-Za-z]+:[/\\])""")
 """The beginning of a path in the words of a reference system."""
 
-_SIGNATURES = {
-    b"II*\0": "GTiff",
-    b"MM\0*": "GTiff",
-    b"II+\0": "GTiff",
-    b"MM\0+": "GTiff",
-    b"\0\0\0\x0cjP  ": "JP2OpenJPEG",
-    b"\xff\x4f\xff\x51": "JP2OpenJPEG",
-    b"\x89PNG\r\n\x1a\n": "PNG",
-    b"\xff\xd8\xff": "JPEG",
-}
-"""Drivers by the first bytes of the files that they read."""
+_DRIVERS = {"TIFF": "GTiff", "JPEG2000": "JP2OpenJPEG", "PNG": "PNG", "JPEG": "JPEG"}
+"""Drivers by the kinds of files that they read (`kind_of`)."""
 
 
 Bands = int | Sequence[int]
@@ -123,12 +114,8 @@ def raster_settings() -> AbstractContextManager[object]:
 
 def driver_of(path: Path) -> str | None:
     """Tell the only driver that may read a file, by its first bytes; None for other files than pictures."""
-    with reading(path), path.open("rb") as opened:
-        head = opened.read(8)
-    for signature, driver in _SIGNATURES.items():
-        if head.startswith(signature):
-            return driver
-    return None
+    kind, _ = kind_of(path)
+    return _DRIVERS.get(kind)
 
 
 def open_file(path: str | PathLike[str], driver: str) -> Dataset:

@@ -211,7 +211,7 @@ def _open_raster(path: str | PathLike[str], white: White | None, bands: ChosenBa
 def _open_tiff(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
     """Open a TIFF by the first reader that has all of it: tifffile, GDAL or Pillow."""
     with quiet_decoders:
-        check_no_raw(path, f"image {Path(path)}")
+        check_no_raw(path)
     if _is_converted(path):
         expected = f"None for {path}, which is turned, or of other colours than grey and RGB"
         check(bands is None, "bands", expected, f"{bands}; convert it")

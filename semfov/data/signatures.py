@@ -1,25 +1,32 @@
 """Kinds of files by their first bytes, so that a file that is no picture here is refused by its name."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from semfov.io.files import reading
+
+_Name = TypeVar("_Name", bound=str)
+
+Marks = Mapping[tuple[int, bytes], _Name]
+"""Names by bytes that tell them, with their place in the file; of two that a file has, the first counts."""
 
 _READ = {
     (0, b"\xff\xd8\xff"): "JPEG",
     (0, b"\x89PNG\r\n\x1a\n"): "PNG",
     (0, b"GIF8"): "GIF",
     (0, b"BM"): "BMP",
-    (8, b"WEBP"): "WEBP",
-    (4, b"ftypavif"): "AVIF",
-    (4, b"ftypavis"): "AVIF",
     (0, b"\0\0\0\x0cjP  "): "JPEG2000",
     (0, b"\xff\x4f\xff\x51"): "JPEG2000",
     (0, b"II*\0"): "TIFF",
     (0, b"MM\0*"): "TIFF",
     (0, b"II+\0"): "TIFF",
     (0, b"MM\0+"): "TIFF",
+    (8, b"WEBP"): "WEBP",
+    (4, b"ftypavif"): "AVIF",
+    (4, b"ftypavis"): "AVIF",
 }
-"""Formats of photographs that Pillow reads by itself, by bytes and their place in the file."""
+"""Formats of photographs that Pillow reads by itself. A TIFF may have any bytes at other places, so its marks lead."""
 
 _OTHERS = {
     (0, b"\xff\x0a"): "JPEG XL",
@@ -62,6 +69,15 @@ _OTHERS = {
 _HEAD = 160  # bytes that tell a kind
 
 
+def name_by_marks(head: bytes, marks: Marks[_Name]) -> _Name | None:
+    """Find the name whose mark the first bytes of a file have; None where they have none.
+
+    >>> name_by_marks(b"GIF89a", {(0, b"BM"): "BMP", (0, b"GIF8"): "GIF"})
+    'GIF'
+    """
+    return next((name for (place, mark), name in marks.items() if head.startswith(mark, place)), None)
+
+
 def kind_of(path: Path) -> tuple[str, bool]:
     """Tell the kind of a file by its first bytes.
 
@@ -78,8 +94,7 @@ def kind_of(path: Path) -> tuple[str, bool]:
         head = file.read(_HEAD)
     if not head:
         return "an empty file", False
-    for kinds, is_read in ((_READ, True), (_OTHERS, False)):
-        for (place, mark), name in kinds.items():
-            if head.startswith(mark, place):
-                return name, is_read
-    return "", False
+    name = name_by_marks(head, _READ)
+    if name is not None:
+        return name, True
+    return name_by_marks(head, _OTHERS) or "", False

@@ -18,7 +18,7 @@ from semfov.errors import InputError, check, check_pixels, check_whole, checked_
 from semfov.io.state import StatedModule
 
 FAINT = 0.002  # confidence from which on a candidate is a hint, unless the head has another one
-_LARGEST = 65_536  # largest side of a canvas in pixels
+LARGEST_SIDE = 65_536  # of a canvas in pixels
 
 
 class Detector(StatedModule, ABC):
@@ -79,9 +79,9 @@ class Detector(StatedModule, ABC):
     ) -> None:
         super().__init__()
         for side in input_size:
-            check_whole(side, "input_size", 1, _LARGEST)
+            check_whole(side, "input_size", 1, LARGEST_SIDE)
         if stride is not None:
-            check_whole(stride, "stride", 1, _LARGEST)
+            check_whole(stride, "stride", 1, LARGEST_SIDE)
         self.name = name
         self.classes = classes
         self.input_size = input_size

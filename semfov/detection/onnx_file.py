@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 import yaml
 
+from semfov.data.images import MAX_PIXELS
 from semfov.detection.class_names import names_in_order
 from semfov.detection.onnx_cells import STRIDES, Canvas, cells
 from semfov.detection.onnx_check import check_file
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     import onnx
 
 _MOST_BYTES = 2**20  # largest number of bytes of a settings file
-_MOST_PIXELS = 89_478_485  # largest number of pixels of a canvas, the same as for pictures that are read
 _COARSEST = 32  # pixels; maps of this stride are doubled and added to finer ones
 _NAMES = "class_names", "labels", "character", "names"  # keys of metadata with names of classes, as exporters have them
 METADATA_KEY = "semfov"  # key of the settings, as JSON, in the metadata of models that semfov exports
@@ -67,12 +67,11 @@ def check_canvas(name: str, size: Canvas) -> None:
         size: `(width, height)` in pixels.
 
     Raises:
-        DataError: it has more than `_MOST_PIXELS` pixels.
+        DataError: it has more than `MAX_PIXELS` pixels.
     """
     width, height = size
-    check_data(
-        width * height <= _MOST_PIXELS, name, f"a canvas of at most {_MOST_PIXELS:,} pixels", f"{width} x {height}"
-    )
+    expected = f"a canvas of at most {MAX_PIXELS:,} pixels"
+    check_data(width * height <= MAX_PIXELS, name, expected, f"{width} x {height}")
 
 
 def read_settings(path: Path, metadata: Mapping[str, str]) -> OnnxSettings:

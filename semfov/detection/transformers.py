@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from semfov.detection.class_names import keep_classes
-from semfov.detection.detector import check_images
+from semfov.detection.detector import LARGEST_SIDE, check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.onnx_heads import HEADS
 from semfov.detection.placement import Placement, letterbox
@@ -27,7 +27,6 @@ _EDGES = {"shortest_edge": 800, "longest_edge": 1333}
 _MOST = ("max_height", "max_width")
 _SQUARE = {"height": 640, "width": 640}
 _FORMS_OF_SIZE = ({"height", "width"}, {*_MOST}, {*_EDGES}, {"shortest_edge"}, {"longest_edge"})
-_LARGEST = 65_536  # side of a canvas in pixels
 _MOST_REASON = 300  # largest number of characters of a reason that a message has
 
 ProcessorSettings = Mapping[str, Any]
@@ -212,7 +211,7 @@ def _named_sides(stated: object, settings: ProcessorSettings) -> Mapping[str, in
 
 def _is_side(value: object) -> bool:
     """Tell whether a value is a side of a canvas in pixels; True is a whole number for Python, and no side."""
-    return type(value) is int and 0 < value <= _LARGEST
+    return type(value) is int and 0 < value <= LARGEST_SIDE
 
 
 def _largest_canvas(size: Mapping[str, int]) -> tuple[int, int]:
