@@ -19,7 +19,6 @@ from eval.stream.ways import AllSlices, Live, Oracle, RoundRobin, TrackedSlices,
 from semfov.agents.window_episode import LIKELY
 from semfov.agents.windows import ZoomAgent, window_eye
 from semfov.data.classes import class_index
-from semfov.data.scene import Annotation
 from semfov.detection.objects import Objects
 from semfov.errors import check
 from semfov.io.ranges import Count, Positive, Range, Seed, Whole
@@ -219,8 +218,7 @@ def judged_objects(objects: Objects, frame: Frame, target: int) -> ResultRecord:
     Those with a score of one half or more are listed, as the agent lists objects.
     """
     annotation = frame.annotation
-    mine = annotation.labels == target
-    truth = Annotation(annotation.boxes[mine], annotation.labels[mine], annotation.crowd[mine], annotation.size)
+    truth = annotation.take(annotation.labels == target)
     right = right_boxes(replace(objects, boxes=within(objects.boxes, annotation.size)), truth)
     counts = right >= 0
     listed = counts & (objects.scores >= LIKELY)

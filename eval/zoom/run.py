@@ -246,10 +246,7 @@ class ZoomRun(WindowLooking, SceneRun):
         annotation = self.scenes.annotation(index)
         if self.target is None:
             return annotation
-        of_target = annotation.labels == self.target
-        return Annotation(
-            annotation.boxes[of_target], annotation.labels[of_target], annotation.crowd[of_target], annotation.size
-        )
+        return annotation.take(annotation.labels == self.target)
 
     def _objects(
         self, index: int, seen: Mapping[str, list[WindowLook]], paths: Mapping[int, ZoomPath]

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeGuard, cast
 
 import torch
 
@@ -131,14 +131,28 @@ def read_annotations(path: str | PathLike[str]) -> Annotations:
 def _box_polygons(data: Entry) -> None:
     """Give the objects without `bbox` the box around their polygons, where they have some."""
     entries = data.get("annotations")
-    for entry in entries if isinstance(entries, list) else []:
-        if isinstance(entry, dict) and entry.get("bbox") in (None, []) and _are_polygons(entry.get("segmentation")):
-            xs = [x for polygon in entry["segmentation"] for x in polygon[::2]]
-            ys = [y for polygon in entry["segmentation"] for y in polygon[1::2]]
-            entry["bbox"] = [min(xs), min(ys), max(xs) - min(xs), max(ys) - min(ys)]
+    if not isinstance(entries, list):
+        return  # it is refused where all entries are checked
+    for entry in entries:
+        if isinstance(entry, dict) and entry.get("bbox") in (None, []):
+            polygons = entry.get("segmentation")
+            if _are_polygons(polygons):
+                entry["bbox"] = _box_around(polygons)
 
 
-def _are_polygons(value: object) -> bool:
+def _box_around(polygons: Sequence[Sequence[float]]) -> list[float]:
+    """Find the box `[x, y, width, height]` around polygons `[x, y, x, y, …]`."""
+    xs: list[float] = []
+    ys: list[float] = []
+    for polygon in polygons:
+        xs += polygon[::2]
+        ys += polygon[1::2]
+    left = min(xs)
+    top = min(ys)
+    return [left, top, max(xs) - left, max(ys) - top]
+
+
+def _are_polygons(value: object) -> TypeGuard[list[list[float]]]:
     """Tell whether a segmentation is a list of polygons, each as `[x, y, x, y, …]`; it may be run lengths, too."""
     if not isinstance(value, list) or not value:
         return False
@@ -230,20 +244,26 @@ def _checked(data: Entry, key: str, name: str, fields: Mapping[str, _Field]) -> 
 
 
 def _fault_of(entry: object, fields: Mapping[str, _Field]) -> str | None:
-    """Say which field of an entry is not as expected; None if all are, after numbers in texts were read."""
+    """Say which field of an entry is not as expected; None if all are. Numbers in texts take their place."""
     if not isinstance(entry, dict):
         return f"expected an object, got {excerpt(entry)}"
     # There are many entries, so that the message is made where it is needed.
     for field, (accepts, expected) in fields.items():
-        if accepts(entry.get(field)):
-            continue
-        # Programs that read tables write their numbers as texts.
         value = entry.get(field)
-        numbers = [_number_of(each) for each in value] if isinstance(value, list) else _number_of(value)
+        if accepts(value):
+            continue
+        numbers = _numbers_of(value)
         if not accepts(numbers):
             return f"expected {field} to be {expected}, got {_shown(entry, field)}"
         entry[field] = numbers
     return None
+
+
+def _numbers_of(value: object) -> object:
+    """Read a number, or a list of them, from texts, as programs that read tables write them; other values stay."""
+    if isinstance(value, list):
+        return [_number_of(item) for item in value]
+    return _number_of(value)
 
 
 def _number_of(value: object) -> object:

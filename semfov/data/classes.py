@@ -200,13 +200,17 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         return matches[0] + 1
     words = _between_commas(name)
     if len(words) > 1:
-        # An unknown one of them is told alone.
-        known = [*dict.fromkeys(known_class(word, classes, argument) for word in words)]
-        if len(known) == 1:
-            return list(classes).index(known[0]) + 1
-        raise InputError(f"{argument}: expected one class, got {' and '.join(known)}")
+        return _common_index(words, classes, argument)
     suggestions = [classes[place] for place in matches] or _similar_classes(name, classes)
     raise InputError(_unknown(argument, name, suggestions, classes))
+
+
+def _common_index(words: Sequence[str], classes: Sequence[str], argument: str) -> int:
+    """Look up the class that all words name; raises `InputError` where they name several, or for an unknown word."""
+    indices = [class_index(word, classes, argument) for word in words]
+    names = list(dict.fromkeys(classes[index - 1] for index in indices))
+    check(len(names) == 1, argument, "one class", " and ".join(names))
+    return indices[0]
 
 
 def several_known(text: str, classes: Sequence[str]) -> list[str]:

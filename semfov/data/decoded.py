@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.tone import Values, White, between, black_and_white
-
-_ROWS = 64  # that are converted at once: more leave the cache of the processor
+from semfov.data.tone import ROWS_AT_ONCE, Values, White, between, black_and_white
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class Decoded:
     def _parts(self) -> list[slice]:
         """List the rows that are converted at once."""
         height = self.shape[0]
-        return [slice(top, min(top + _ROWS, height)) for top in range(0, height, _ROWS)]
+        return [slice(top, min(top + ROWS_AT_ONCE, height)) for top in range(0, height, ROWS_AT_ONCE)]
 
     def _shades(self, values: Values) -> Values:
         """Leave out an alpha."""
@@ -78,17 +76,28 @@ class Decoded:
 
     def _shown(self, values: Values, limits: tuple[float, float] | None) -> NDArray[np.float32]:
         """Convert values to [0, 1], over white, `(h, W, 3)` or `(h, W, 1)`."""
+        pixels = self._over_white(self._scaled(values, limits), values)
+        return 1 - pixels if self.white_is_zero else pixels
+
+    def _scaled(self, values: Values, limits: tuple[float, float] | None) -> NDArray[np.float32]:
+        """Scale the colours to [0, 1], without the alpha."""
         shades = self._shades(values)
-        full_range = (0.0, float(self.most))
         if limits is None and values.dtype == np.uint8:
-            pixels = np.divide(shades, np.float32(self.most), dtype=np.float32)  # takes a tenth of the time
-        else:
-            pixels = between(shades, full_range if limits is None else limits)
+            return np.divide(shades, np.float32(self.most), dtype=np.float32)  # takes a tenth of the time
+        return between(shades, self._full_range if limits is None else limits)
+
+    def _over_white(self, pixels: NDArray[np.float32], values: Values) -> NDArray[np.float32]:
+        """Blend pixels in [0, 1] with white by the alpha in their values, or where these are transparent."""
         if self.has_alpha:
             # Where black and white are stated, they are those of the colours, and not of the alpha.
-            alpha = between(values[..., -1:], full_range)
-            pixels = pixels * alpha + (1 - alpha)
-        elif self.transparent is not None:
-            is_transparent = (values == np.array(self.transparent)).all(-1, keepdims=True)
-            pixels = np.where(is_transparent, np.float32(1), pixels)
-        return 1 - pixels if self.white_is_zero else pixels
+            alpha = between(values[..., -1:], self._full_range)
+            return pixels * alpha + (1 - alpha)
+        if self.transparent is None:
+            return pixels
+        is_transparent = (values == np.array(self.transparent)).all(-1, keepdims=True)
+        return np.where(is_transparent, np.float32(1), pixels)
+
+    @property
+    def _full_range(self) -> tuple[float, float]:
+        """The values that are black and white where nothing is said, and of an alpha."""
+        return 0.0, float(self.most)

@@ -102,9 +102,9 @@ def _height(row: Sequence[Scene]) -> int:
 
 def _single(scenes: EmbeddedScenes, index: int) -> Scene:
     """Read a scene without the boxes of crowds."""
-    scene = scenes[index]
-    is_single = ~scenes.annotation(index).crowd
-    return replace(scene, boxes=scene.boxes[is_single], labels=scene.labels[is_single])
+    annotation = scenes.annotation(index)
+    singles = annotation.take(~annotation.crowd)
+    return replace(scenes[index], boxes=singles.boxes, labels=singles.labels)
 
 
 def example_with(target: str | None, classes: Sequence[str]) -> str:

@@ -101,9 +101,9 @@ def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: 
     return torch.from_numpy(pixels)
 
 
-def _largest_grey(image: "Image") -> int:
+def _largest_grey(tags: TiffTags) -> int:
     """Tell the largest value of a grey picture of 16 bits; of a TIFF of 12 bits it is 4095."""
-    return 4095 if TiffTags.of_image(image).bits == (12,) else 65535
+    return 4095 if tags.bits == (12,) else 65535
 
 
 def _halves(image: "ImageFile") -> int:
@@ -436,21 +436,32 @@ def _decoded(image: "Image", path: str | PathLike[str] | None, *, upright: bool)
         The decoded picture.
     """
     if path is not None and is_deep(cast("ImageFile", image)):
-        with open_pillow(path) as again:
-            values = DeepValues.of((cast("ImageFile", image), again), partial(_loaded, upright=upright))
-        has_alpha = values.shape[-1] in (2, 4)
-        transparent = None if has_alpha else image.info.get("transparency")
-        return Decoded(values.shape[:2], values.rows, values.most, has_alpha, transparent)
+        return _decoded_deep(cast("ImageFile", image), path, upright=upright)
+    # What the tags say is read before Pillow decodes the picture, and perhaps changes its mode.
+    tags = TiffTags.of_image(image)
+    largest = _largest_grey(tags)
     # Pillow turns white-is-zero TIFFs of 8 bits into black-is-zero, but not those of 16.
-    is_inverted = image.mode in SIXTEEN_BITS and TiffTags.of_image(image).photometric == WHITE_IS_ZERO
-    largest = _largest_grey(image)
+    is_inverted = image.mode in SIXTEEN_BITS and tags.photometric == WHITE_IS_ZERO
     loaded = _loaded(image, upright=upright)
     shape = loaded.height, loaded.width
-    if loaded.mode in (*SIXTEEN_BITS, "F"):
-        most = 1 if loaded.mode == "F" else largest
-        transparent = loaded.info.get("transparency")
-        return Decoded(shape, lambda rows: rows_of(loaded, rows)[..., None], most, False, transparent, is_inverted)
-    return Decoded(shape, lambda rows: np.asarray(_over_white(cut(loaded, rows)).convert("RGB")), _MOST_OF_BYTES)
+    if loaded.mode not in (*SIXTEEN_BITS, "F"):
+        return Decoded(shape, lambda rows: np.asarray(_over_white(cut(loaded, rows)).convert("RGB")), _MOST_OF_BYTES)
+    return Decoded(
+        shape,
+        lambda rows: rows_of(loaded, rows)[..., None],
+        most=1 if loaded.mode == "F" else largest,
+        transparent=loaded.info.get("transparency"),
+        white_is_zero=is_inverted,
+    )
+
+
+def _decoded_deep(image: "ImageFile", path: str | PathLike[str], *, upright: bool) -> Decoded:
+    """Decode a picture that `is_deep`, whose file Pillow opens a second time for the lower halves of its values."""
+    with open_pillow(path) as again:
+        values = DeepValues.of((image, again), partial(_loaded, upright=upright))
+    has_alpha = values.shape[-1] in (2, 4)
+    transparent = None if has_alpha else image.info.get("transparency")
+    return Decoded(values.shape[:2], values.rows, values.most, has_alpha, transparent)
 
 
 def _over_white(image: "Image") -> "Image":

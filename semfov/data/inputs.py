@@ -252,13 +252,12 @@ def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
     for channels in (3, 1):
         is_first = batch.shape[1] == channels
         is_last = batch.shape[-1] == channels
-        if is_first and is_last and not choose:
-            got = f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
-            raise InputError(f"{argument}: expected {_SHAPES}, got {got}")
-        if is_first:
-            return batch.expand(-1, 3, -1, -1)
-        if is_last:
-            return batch.movedim(-1, 1).expand(-1, 3, -1, -1)
+        is_ambiguous = is_first and is_last and not choose
+        got = f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
+        check(not is_ambiguous, argument, _SHAPES, got)
+        if is_first or is_last:
+            channels_first = batch if is_first else batch.movedim(-1, 1)
+            return channels_first.expand(-1, 3, -1, -1)
     has_alpha = 4 in (shape[-1], shape[-3])
     remedy = "; drop the fourth channel, or give the Pillow image" if has_alpha else ""
     raise InputError(f"{argument}: expected {_SHAPES}, with 3 channels or 1, got shape {shape}{remedy}")

@@ -35,6 +35,17 @@ class Annotation:
     crowd: Tensor
     size: tuple[int, int]
 
+    def take(self, rows: Tensor) -> "Annotation":
+        """Take some of the objects.
+
+        Args:
+            rows: their numbers, or a boolean `(M,)`.
+
+        Returns:
+            The objects, in the order of the rows.
+        """
+        return Annotation(self.boxes[rows], self.labels[rows], self.crowd[rows], self.size)
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -4,6 +4,7 @@ They need no data set and no network. Sources and licences are in `semfov/data/p
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -73,12 +74,11 @@ class _Part(NamedTuple):
         boxes = objects.boxes.clamp(corner, end)
         in_part = _areas(boxes) >= _LEAST_SEEN * _areas(objects.boxes)
         width = right - left
-        height = bottom - top
-        x1, y1, x2, y2 = (boxes[in_part] - corner).unbind(-1)
+        x1, y1, x2, y2 = (boxes - corner).unbind(-1)
         if self.mirrored:
             x1, x2 = width - x2, width - x1
-        visible = torch.stack([x1, y1, x2, y2], -1)
-        return Annotation(visible, objects.labels[in_part], objects.crowd[in_part], (width, height))
+        boxes_in_part = torch.stack([x1, y1, x2, y2], -1)
+        return Annotation(boxes_in_part, objects.labels, objects.crowd, (width, bottom - top)).take(in_part)
 
     def image(self) -> Tensor:
         """Cut out the pixels, `(3, H, W)`."""
@@ -157,9 +157,8 @@ class EmbeddedScenes(ComposedScenes):
             The objects.
         """
         objects = self.part(index).objects()
-        labels = self._labels[objects.labels]
-        is_known = labels > 0
-        return Annotation(objects.boxes[is_known], labels[is_known], objects.crowd[is_known], objects.size)
+        objects = replace(objects, labels=self._labels[objects.labels])
+        return objects.take(objects.labels > 0)
 
     def digest(self, index: int) -> str:
         """Compute a sha256 of the photograph and the part of it that a scene is.

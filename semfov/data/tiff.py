@@ -447,13 +447,19 @@ def _layers_of(file: "TiffFile", page: _Page) -> tuple[Sequence[_Layer], int]:
     # A page of several samples has its channels in itself.
     if page.samplesperpixel > 1 or not 2 <= channels <= _MOST_LAYERS:
         return [page], pictures
+    layers = _pages_alike(pages, _first_picture(axes, lengths), page.shape)
+    return layers or [page], pictures
+
+
+def _pages_alike(pages: Sequence[_Layer | None], numbers: Sequence[int], shape: tuple[int, ...]) -> list[_Layer]:
+    """List the pages of some numbers; none where one of them is not in the file, or of another shape."""
     layers: list[_Layer] = []
-    for number in _first_picture(axes, lengths):
+    for number in numbers:
         layer = pages[number]
-        if layer is None or layer.shape != page.shape:
-            return [page], pictures  # a channel that is not in the file, or of another size
+        if layer is None or layer.shape != shape:
+            return []
         layers.append(layer)
-    return layers, pictures
+    return layers
 
 
 def _first_picture(axes: str, lengths: tuple[int, ...]) -> list[int]:

@@ -16,7 +16,7 @@ Values = NDArray[Any]
 """Numbers of a picture in the type of its file, of any shape."""
 
 _PERCENTILES = 1.0, 99.0  # of the values, which are black and white for `auto`
-_ROWS = 64  # of a picture that are converted at once: more leave the cache of the processor
+ROWS_AT_ONCE = 64  # of a picture, whose values are converted: more leave the cache of the processor
 
 
 def check_white(white: White | None) -> None:
@@ -92,8 +92,8 @@ def bytes_between(values: Values, tone: tuple[float, float] | None) -> NDArray[n
     if values.dtype == np.uint8 and tone is None:
         return values
     shown = np.empty(values.shape, np.uint8)
-    for top in range(0, len(values), _ROWS):
-        rows = slice(top, top + _ROWS)
+    for top in range(0, len(values), ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
         if tone is None:
             # Rounded to the nearest byte, in whole numbers.
             shown[rows] = (values[rows].astype(np.uint32) * 255 + 32767) // 65535

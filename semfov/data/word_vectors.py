@@ -131,9 +131,9 @@ def _read_vectors(path: Path, wanted: frozenset[str]) -> dict[str, Tensor]:
                 size = int(rest)
                 continue
             key = word.lower()
-            # A word in lower case takes precedence; in upper case it may be a proper name.
-            is_less_common = key in vectors and word != key
-            if key not in wanted or is_less_common:
+            # Of two spellings, the one in lower case counts: in upper case, a word may be a proper name.
+            is_wanted = key in wanted and (word == key or key not in vectors)
+            if not is_wanted:
                 continue
             values = _numbers(rest)
             if size is None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from semfov.belief.grid import check_cells
 from semfov.belief.observers import Observer
-from semfov.data import Annotation, Scenes, class_index
+from semfov.data import Scenes, class_index
 from semfov.data.large import open_large
 from semfov.data.mosaics import Mosaics
 from semfov.data.pictures import Pictures
@@ -381,11 +381,8 @@ class ZoomScenery(_Surroundings[WindowEye]):
         if not self.annotated:
             return any(float(look.show[target - 1]) >= SCORE_THRESHOLD for look in looks)
         annotation = self.pictures.annotation(scene)
-        is_target = annotation.labels == target  # (M,)
-        objects = Annotation(
-            annotation.boxes[is_target], annotation.labels[is_target], annotation.crowd[is_target], annotation.size
-        )
-        return bool(found_in(looks, objects, target).any())
+        targets = annotation.take(annotation.labels == target)
+        return bool(found_in(looks, targets, target).any())
 
     def share(self, looks: Sequence[WindowLook], scene: int) -> float:
         """Compute the share of a picture's objects that looks have found; without annotations their number."""

@@ -65,7 +65,7 @@ def test_a_photograph_whose_decoding_was_interrupted_is_decoded_anew(tmp_path, m
         return over_white(rows)
 
     monkeypatch.setattr(images, "_over_white", interrupted)
-    monkeypatch.setattr(decoded, "_ROWS", 100)
+    monkeypatch.setattr(decoded, "ROWS_AT_ONCE", 100)
     with pytest.raises(KeyboardInterrupt):
         picture.pixels((0, 0, 20, 600))
     assert np.array_equal(picture.pixels((0, 0, 20, 600)), array)

@@ -118,18 +118,10 @@ def as_array(values: object, argument: str, *, finite: bool = False) -> NDArray[
     Raises:
         InputError: there is something else than real numbers.
     """
-    plain = values
-    if isinstance(plain, Tensor):
-        plain = plain.detach().cpu()
-        if plain.dtype == torch.bfloat16:
-            plain = plain.float()  # NumPy has no such numbers
     try:
-        array = np.asarray(plain)
-        numbers = array.astype(np.float64) if array.dtype.kind in "buifO" else None
+        numbers = _doubles_of(values)
     except OverflowError:
         raise InputError(f"{argument}: expected finite numbers, got one that is larger than any float") from None
-    except (TypeError, ValueError, RuntimeError):
-        numbers = None
     if numbers is None:
         kind = getattr(values, "dtype", None)
         got = type(values).__name__ + ("" if kind is None else f" of {kind}")
@@ -137,6 +129,20 @@ def as_array(values: object, argument: str, *, finite: bool = False) -> NDArray[
     if finite:
         check(bool(np.isfinite(numbers).all()), argument, "finite numbers", "infinite ones or NaN; leave these out")
     return numbers
+
+
+def _doubles_of(values: object) -> NDArray[np.float64] | None:
+    """Convert numbers to an array; None for other things, and `OverflowError` for one that is larger than any float."""
+    if isinstance(values, Tensor):
+        values = values.detach().cpu()
+        if values.dtype == torch.bfloat16:
+            values = values.float()  # NumPy has no such numbers
+    try:
+        array = np.asarray(values)
+        # Booleans, whole numbers, floats, and objects, as which NumPy takes whole numbers of more than 64 bits.
+        return array.astype(np.float64) if array.dtype.kind in "buifO" else None
+    except (TypeError, ValueError, RuntimeError):
+        return None
 
 
 def as_path(points: object, argument: str, *, least: int = 0) -> NDArray[np.float64]:
