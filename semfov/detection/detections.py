@@ -78,21 +78,22 @@ class Detections:
         check_shape(self.scores, "scores", None, None)
         check(self.mask.dtype == torch.bool, "mask", "a boolean tensor", self.mask.dtype)
         lead = self.mask.shape
-        check(
-            self.boxes.shape[:-1] == lead and self.scores.shape[:-1] == lead,
-            "boxes, scores, mask",
-            "the same leading dimensions",
-            (tuple(self.boxes.shape), tuple(self.scores.shape), tuple(lead)),
-        )
+        have_lead = self.boxes.shape[:-1] == lead and self.scores.shape[:-1] == lead
+        shapes = tuple(self.boxes.shape), tuple(self.scores.shape), tuple(lead)
+        check(have_lead, "boxes, scores, mask", "the same leading dimensions", shapes)
         if self.confidence is None:
-            classes = self.scores[..., 1:]
-            best = classes.amax(-1) if classes.shape[-1] else classes.sum(-1)
-            object.__setattr__(self, "confidence", best * self.mask)
+            object.__setattr__(self, "confidence", self._best_of_rows())
         check(self.confidence.shape == lead, "confidence", f"shape {tuple(lead)}", tuple(self.confidence.shape))
         if self.highest is None:
             object.__setattr__(self, "highest", self._highest_of_rows())
         by_class = (*lead[:-1], self.scores.shape[-1])
         check(self.highest.shape == by_class, "highest", f"shape {by_class}", tuple(self.highest.shape))
+
+    def _best_of_rows(self) -> Tensor:
+        """Find the largest score of a class of each detection, `(..., L)`; 0 without classes, and for padding."""
+        classes = self.scores[..., 1:]
+        best = classes.amax(-1) if classes.shape[-1] else classes.sum(-1)
+        return best * self.mask
 
     def _highest_of_rows(self) -> Tensor:
         """Find the highest score of each class among the detections, `(..., K+1)`; 0 without detections."""

@@ -80,11 +80,18 @@ def coco_results(
     check(_is_id(image_id), "image_id", "the whole number of an image, or text", repr(image_id))
     image_id = _plain_id(image_id)
     size = boxes[:, 2:] - boxes[:, :2]
-    placed = torch.cat([boxes[:, :2], size], -1).double()
-    return [
-        {"image_id": image_id, "category_id": ids[label], "bbox": [*map(pixels, box)], "score": digits(score)}
-        for label, box, score in zip(labels.tolist(), placed.tolist(), scores.double().tolist(), strict=True)
-    ]
+    bboxes = torch.cat([boxes[:, :2], size], -1).double()  # left upper corner, width and height
+    results: list[CocoResult] = []
+    for label, bbox, score in zip(labels.tolist(), bboxes.tolist(), scores.double().tolist(), strict=True):
+        results.append(
+            {
+                "image_id": image_id,
+                "category_id": ids[label],
+                "bbox": [pixels(number) for number in bbox],
+                "score": digits(score),
+            }
+        )
+    return results
 
 
 def category_ids(

@@ -120,15 +120,10 @@ def _head_maps(steps: Sequence[NetworkStep], strides: Mapping[str, int]) -> dict
     end = _backbone_end(steps, strides, order)
     # The first tensor that a convolution reads is its map; the others are weights.
     readers = Counter(step.reads[0] for step in steps if step.convolution and step.reads)
-    read: dict[int, str] = {}
-    shared: dict[int, str] = {}
-    for name, stride in strides.items():
-        if order[name] < end:
-            continue
-        if readers[name] > 0:
-            read[stride] = name
-        if readers[name] > 1:
-            shared[stride] = name
+    maps_after = [(name, stride) for name, stride in strides.items() if order[name] >= end]
+    # Of the maps of one stride, the last one replaces those before it.
+    read = {stride: name for name, stride in maps_after if readers[name] > 0}
+    shared = {stride: name for name, stride in maps_after if readers[name] > 1}
     # Boxes and scores come from a map that two convolutions read, so that such a map replaces any other.
     return {**read, **shared}
 

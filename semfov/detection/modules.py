@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.detection.class_names import named_outputs
+from semfov.detection.class_names import keep_classes, named_outputs
 from semfov.detection.detector import Detector
 from semfov.detection.feature_maps import choose_layers, no_features, record_maps, stride_of
 from semfov.detection.placement import Placement
@@ -68,6 +68,10 @@ class ModuleDetector(Detector):
             for feature_map in returned:
                 maps[f"{place}{stride_of(canvas.shape[-1], feature_map.shape[-1])}"] = feature_map
         return candidates, {layer: maps[layer] for layer in choose_layers(layers, [*maps], self.name)}
+
+    def _of_classes(self, candidates: Candidates) -> Candidates:
+        """Keep the scores that stand for a class."""
+        return keep_classes(candidates, self._places, self._count)
 
     def _pixels(self, canvas: Tensor) -> Tensor:
         """Convert a canvas to the precision of the network; raises `InputError` for anything else."""

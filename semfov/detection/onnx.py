@@ -194,21 +194,20 @@ class OnnxDetector(Detector):
         candidates = HEADS[self.head].decode(outputs, size, self._scores, 0.0 if is_whole else least)
         count = candidates.boxes.shape[1]
         check_data(count <= _MOST_BOXES, self.name, f"at most {_MOST_BOXES:,} boxes", f"{count:,}")
+        are_known = values_known(candidates.boxes, candidates.classes)  # not in a graph that is traced
         # A wrong head shows in the first pass, so later ones spend no time on it.
-        is_first = not self._first_checked and values_known(candidates.boxes, candidates.classes)
-        if is_first:
+        if are_known and not self._first_checked:
             self._check_first(outputs, candidates, size)
         if self.logits:
             candidates = _with_scores(candidates, Tensor.sigmoid)
-        is_known = values_known(candidates.boxes)
-        if is_known:
-            are_finite = all(map(math.isfinite, _range(candidates.boxes)))
-            remedy = f"others with head {self.head!r}; check that head= names the model's head"
-            check_data(are_finite, self.name, "finite boxes", remedy)
-            candidates = self._rounded_scores(candidates)
-        self._first_checked |= is_first
-        candidates = keep_classes(candidates, self._places, self._scores)
-        return candidates.as_checked() if is_known else candidates
+        if not are_known:
+            return keep_classes(candidates, self._places, self._scores)
+        are_finite = all(map(math.isfinite, _range(candidates.boxes)))
+        remedy = f"others with head {self.head!r}; check that head= names the model's head"
+        check_data(are_finite, self.name, "finite boxes", remedy)
+        candidates = self._rounded_scores(candidates)
+        self._first_checked = True
+        return keep_classes(candidates, self._places, self._scores).as_checked()
 
     def _rounded_scores(self, candidates: Candidates) -> Candidates:
         """Clamp scores that rounding has put a little outside [0, 1], with one warning."""
@@ -339,18 +338,13 @@ def load_onnx(
         InputError: an option does not fit the model, or something that nothing says cannot be found out.
         DataError: the file is damaged, or takes too much memory or work.
     """
-    file, published_name = _find_file(fspath(name_or_path), weights)
-    path = file
-    if published_name in _ONNX_MODELS and input_size is not None:
-        path = with_input_size(file, _sides(input_size))
-    digest = sha256(path) if path.is_file() else ""
+    file = _find_file(fspath(name_or_path), weights, input_size)
     # The budget of a published file is known to suffice, and to read it again takes as long as its first pass.
-    is_known = digest in NETWORKS
-    open_ended = False if is_known else None
-    session = OnnxSession(path, threads=threads, device=device, providers=providers, open_ended=open_ended)
+    open_ended = False if file.is_known else None
+    session = OnnxSession(file.opened, threads=threads, device=device, providers=providers, open_ended=open_ended)
     settings = _overridden(
-        read_settings(file, session.metadata),
-        name=published_name,
+        read_settings(file.given, session.metadata),
+        name=file.published,
         head=head,
         classes=classes,
         input_size=input_size,
@@ -358,37 +352,70 @@ def load_onnx(
         logits=logits,
     )
     size = _canvas_size(session, settings.get("input_size"))
-    if None in session.shape[2:] and not is_known:
-        check_file(path, size)  # the sizes inside follow from the canvas, which is known only now
+    if None in session.shape[2:] and not file.is_known:
+        check_file(file.opened, size)  # the sizes inside follow from the canvas, which is known only now
     outputs = session.probe(size)
-    published = published_name is not None
-    published_weights = WEIGHTS.get(published_name or "")
-    if "head" not in settings and published_weights is not None and published_weights.sha256 == digest:
-        # To find it out takes as long as the first look.
-        settings["head"] = str(published_weights.head)
-    if "head" not in settings:
-        count = _class_count(settings.get("classes"), published=published)
-        settings["head"] = _recognised_head(session, outputs, size, count)
-    head = lookup(settings["head"], HEADS, "head")
+    head_name = settings.get("head", file.known_head)
+    if head_name is None:
+        count = _class_count(settings.get("classes"), published=file.published is not None)
+        head_name = _recognised_head(session, outputs, size, count)
+    head = lookup(head_name, HEADS, "head")
     preprocessing = _merged_preprocessing(_usual_preprocessing(head, session), settings, preprocessing)
-    names = _class_names(file, head, outputs, size, settings.get("classes"), published=published)
+    names = _class_names(file, head, outputs, size, settings.get("classes"))
     detector = OnnxDetector(
         session,
         head,
         names,
-        name=settings.get("name") or file.stem,
+        name=settings.get("name") or file.given.stem,
         input_size=size,
         stride=settings.get("stride"),
         preprocessing=preprocessing,
         logits=settings.get("logits", False),
         background=settings.get("background"),
-        digest=digest if is_known else _model_digest(file),
+        digest=file.digest if file.is_known else _model_digest(file.given),
     )
     detector.selection = replace(detector.selection, per_class=settings.get("per_class", False))
     return detector
 
 
-def _find_file(name: str, weights: str | PathLike[str] | None) -> tuple[Path, str | None]:
+class _ModelFile(NamedTuple):
+    """The file of a model, and what is known of it.
+
+    Attributes:
+        given: the file, beside which its settings may lie.
+        opened: the file that is opened: a copy with another input size, or the same.
+        published: name of the published model that it is; None for others.
+        digest: sha256 of the file that is opened; `""` if it is missing.
+    """
+
+    given: Path
+    opened: Path
+    published: str | None
+    digest: str
+
+    @property
+    def is_known(self) -> bool:
+        """Whether models are shipped for exactly this file."""
+        return self.digest in NETWORKS
+
+    @property
+    def known_head(self) -> str | None:
+        """The head of a published file, which would take as long as the first look to find out; None for others."""
+        weights = WEIGHTS.get(self.published or "")
+        return weights.head if weights is not None and weights.sha256 == self.digest else None
+
+
+def _find_file(name: str, weights: str | PathLike[str] | None, input_size: int | tuple[int, int] | None) -> _ModelFile:
+    """Find the file of a model, and make the copy of a published one that has another input size."""
+    given, published = _given_file(name, weights)
+    opened = given
+    if published is not None and input_size is not None:
+        opened = with_input_size(given, _sides(input_size))
+    digest = sha256(opened) if opened.is_file() else ""
+    return _ModelFile(given, opened, published, digest)
+
+
+def _given_file(name: str, weights: str | PathLike[str] | None) -> tuple[Path, str | None]:
     """Find the file of a model by its path, or by the name of a published one; with the name, if it is published."""
     if name in _ONNX_MODELS:
         weights_file = fetch(name) if weights is None else Path(weights)
@@ -453,23 +480,20 @@ def _merged_preprocessing(
 
 
 def _class_names(
-    file: Path,
+    file: _ModelFile,
     head: str,
     outputs: Mapping[str, Tensor],
     size: Canvas,
     stated: Sequence[str] | None,
-    *,
-    published: bool,
 ) -> Sequence[str]:
     """Find a name for each score of a head.
 
     Args:
-        file: the ONNX file, for a file of names beside it.
+        file: the model, for a file of names beside it; a published one has the classes of COCO.
         head: name of the head.
         outputs: the outputs for one canvas, whose scores are counted.
         size: `(width, height)` of the canvas.
         stated: names in the settings.
-        published: whether the model is a published one, with the classes of COCO.
 
     Returns:
         The names.
@@ -478,8 +502,8 @@ def _class_names(
         InputError: the head does not fit the outputs, or there are no names, or others than scores.
     """
     nearby = None
-    if stated is None and not published:
-        nearby = names_beside(file)
+    if stated is None and file.published is None:
+        nearby = names_beside(file.given)
     names = stated
     # Outputs of a network that selects boxes itself do not tell how many classes there are; a file of names does.
     if names is None and HEADS[head].selects:
@@ -487,12 +511,12 @@ def _class_names(
     scores = _score_count(head, outputs, size, names)
     if HEADS[head].selects:
         warnings.warn(
-            f"{file.name} selects boxes itself and returns one class of each, so all other scores are 0; exported with "
-            "end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
+            f"{file.given.name} selects boxes itself and returns one class of each, so all other scores are 0; "
+            "exported with end2end=False (and without NMS or top-k) it has all scores, from which beliefs learn more",
             stacklevel=3,
         )
     if names is None:
-        names = _unstated_names(nearby, scores, file)
+        names = _unstated_names(nearby, scores, file.given)
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return names
 

@@ -69,6 +69,11 @@ class _Tensor(NamedTuple):
     sizes: _Sizes
     width: int
 
+    @staticmethod
+    def of(sizes: Iterable[int], kind: int) -> _Tensor:
+        """Describe a tensor by its shape and its kind in ONNX."""
+        return _Tensor(tuple(sizes), _width(kind))
+
     @property
     def numbers(self) -> int:
         """Number of its elements."""
@@ -122,12 +127,12 @@ class Budget:
             sizes = dims(value)
             check_elements(f"{name}: tensor {excerpt(value.name)}", sizes)
             if _has_known_sizes(value):
-                tensors[value.name] = _Tensor(tuple(sizes), _width(value.type.tensor_type.elem_type))
+                tensors[value.name] = _Tensor.of(sizes, value.type.tensor_type.elem_type)
         for stored in inferred.initializer:
-            tensors[stored.name] = _Tensor(tuple(stored.dims), _width(stored.data_type))
+            tensors[stored.name] = _Tensor.of(stored.dims, stored.data_type)
         for sparse in model.graph.sparse_initializer:
             # Its values are those that are not 0; a node that reads it reads them all.
-            tensors[sparse.values.name] = _Tensor(tuple(sparse.dims), _width(sparse.values.data_type))
+            tensors[sparse.values.name] = _Tensor.of(sparse.dims, sparse.values.data_type)
         return Budget(name, model.graph, tensors)
 
     def check(self, stored: int) -> None:
@@ -139,9 +144,10 @@ class Budget:
         Raises:
             DataError: it takes more than a model with such files may.
         """
-        most, got = _MOST_BYTES.of(stored), self.bytes()
+        most = _MOST_BYTES.of(stored)
+        needed = self.bytes()
         expected = f"at most {most:,} bytes of tensors together, for {stored:,} stored"
-        check_data(got <= most, self.name, expected, f"{got:,}; give a smaller input_size, or replace the file")
+        check_data(needed <= most, self.name, expected, f"{needed:,}; give a smaller input_size, or replace the file")
 
     def is_open(self, stored: int) -> bool:
         """Tell whether nothing in the file says that a pass ends soon.

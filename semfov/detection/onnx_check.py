@@ -151,21 +151,37 @@ def _without_functions(model: ModelProto, name: str) -> ModelProto:
     """Put the functions of a model where they are called, unless these would be too many nodes."""
     import onnx.inliner
 
-    bodies = {(function.domain, function.name): function.node for function in model.functions}
-    # Nodes of each function, counted once, as functions that call each other twice grow exponentially.
-    counts: dict[_Function, int] = {}
-
-    def count(nodes: Iterable[NodeProto], callers: tuple[_Function, ...] = ()) -> int:
-        total = 0
-        for node in nodes:
-            function = node.domain, node.op_type
-            got = f"{excerpt(node.op_type)}, which calls itself"
-            check_data(function not in callers, name, "functions that end", got)
-            if function in bodies and function not in counts:
-                counts[function] = count(bodies[function], (*callers, function))
-            total += counts.get(function, 1) + sum(count(graph.node, callers) for graph in graphs(node))
-        return total
-
-    nodes = count(model.graph.node)
+    nodes = _NodeCounter(model, name).count(model.graph.node)
     _check_count(name, nodes, _MOST_NODES, "nodes")
     return onnx.inliner.inline_local_functions(model) if model.functions else model
+
+
+class _NodeCounter:
+    """A counter of the nodes that a model has once its functions are put where they are called.
+
+    Private attributes: `_bodies` has the nodes of each function, and `_counts` how many they become. Each function is
+    counted once, as functions that call each other twice grow exponentially.
+    """
+
+    def __init__(self, model: ModelProto, name: str) -> None:
+        self._name = name
+        self._bodies = {(function.domain, function.name): function.node for function in model.functions}
+        self._counts: dict[_Function, int] = {}
+
+    def count(self, nodes: Iterable[NodeProto], callers: tuple[_Function, ...] = ()) -> int:
+        """Count what nodes become in functions that call each other; raises `DataError` for one that calls itself."""
+        total = 0
+        for node in nodes:
+            total += self._count_of_call((node.domain, node.op_type), callers)
+            total += sum(self.count(graph.node, callers) for graph in graphs(node))
+        return total
+
+    def _count_of_call(self, function: _Function, callers: tuple[_Function, ...]) -> int:
+        """Count what the call of a function becomes; an operation of ONNX itself stays one node."""
+        _, name = function
+        check_data(function not in callers, self._name, "functions that end", f"{excerpt(name)}, which calls itself")
+        if function not in self._bodies:
+            return 1
+        if function not in self._counts:
+            self._counts[function] = self.count(self._bodies[function], (*callers, function))
+        return self._counts[function]

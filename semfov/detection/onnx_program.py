@@ -15,8 +15,8 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from types import ModuleType
 from typing import IO, TYPE_CHECKING, TypedDict, cast
 
@@ -203,30 +203,49 @@ def main() -> None:
         os.dup2(nowhere, stream)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the other side decides
     with suppress(EOFError, BrokenPipeError):
-        first, given = receive(source)
-        opening, seconds = cast(Opening, first["opening"]), cast(float, first["seconds"])
-        model = given[0].tobytes() if given else None
-        _limit_process(opening["process"])
+        first, arrays = receive(source)
+        _limit_process(cast(Opening, first["opening"])["process"])
         runtime()  # takes long where it was never read from the disk, which is not the model's fault
-        # Ends the process after the time, from a thread of its own that waits for no operation.
-        faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
-        try:
-            session = open_session(opening, model)
-            send(sink, {"description": describe(session)})
-        except Exception as error:  # onnxruntime's own exceptions share no base class
-            send(sink, {"error": str(error)})
-            return
-        while True:
-            faulthandler.cancel_dump_traceback_later()
+        with _ending_late(first, nowhere):
+            session = _answer_with_description(first, arrays, sink)
+        while session is not None:
             request, arrays = receive(source)
-            faulthandler.dump_traceback_later(cast(float, request["seconds"]), exit=True, file=nowhere)
-            names = cast(list[str], request["inputs"])
-            try:
-                found = session.run(cast(list[str], request["outputs"]), dict(zip(names, arrays, strict=True)))
-            except Exception as error:
-                send(sink, {"error": str(error)})
-            else:
-                send(sink, {}, [np.asarray(array) for array in found])
+            with _ending_late(request, nowhere):
+                _answer_with_outputs(session, request, arrays, sink)
+
+
+@contextmanager
+def _ending_late(message: Message, nowhere: int) -> Iterator[None]:
+    """End the process if a block takes longer than the `seconds` of a message."""
+    # From a thread of its own, which waits for no operation.
+    faulthandler.dump_traceback_later(cast(float, message["seconds"]), exit=True, file=nowhere)
+    yield
+    faulthandler.cancel_dump_traceback_later()
+
+
+def _answer_with_description(message: Message, arrays: Sequence[Numbers], sink: IO[bytes]) -> InferenceSession | None:
+    """Open the model of the first message, and send its description; None for one that cannot be opened."""
+    model = arrays[0].tobytes() if arrays else None
+    try:
+        session = open_session(cast(Opening, message["opening"]), model)
+        send(sink, {"description": describe(session)})
+    except Exception as error:  # onnxruntime's own exceptions share no base class
+        send(sink, {"error": str(error)})
+        return None
+    return session
+
+
+def _answer_with_outputs(
+    session: InferenceSession, message: Message, arrays: Sequence[Numbers], sink: IO[bytes]
+) -> None:
+    """Run the model on the inputs of a message, and send the outputs that it names."""
+    names = cast(list[str], message["inputs"])
+    try:
+        outputs = session.run(cast(list[str], message["outputs"]), dict(zip(names, arrays, strict=True)))
+    except Exception as error:
+        send(sink, {"error": str(error)})
+    else:
+        send(sink, {}, [np.asarray(output) for output in outputs])
 
 
 def _limit_process(most: int | None) -> None:

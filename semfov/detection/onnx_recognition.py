@@ -50,17 +50,22 @@ def recognise(signature: Signature, run: Callable[[], _Outputs] | None = None) -
     # Outputs with YOLOX's own names are YOLOX's, even where the values do not tell which form they have.
     if len(names) == 1 or names == ["yolox", "yolox-decoded"]:
         return names[0]
-    remedy = _classes_instead(signature) if not names else ""
-    if not remedy:
-        outputs = {name: torch.zeros(shape) for name, shape in signature.outputs} if run is None else run()
-        remedy = remedy_of_head(outputs, signature.canvas, signature.classes)
-    raise InputError(_unrecognised(signature, names, remedy))
+    raise InputError(_unrecognised(signature, names, _remedy(signature, names, run)))
 
 
 def _placing_boxes(names: list[str], outputs: _Outputs, signature: Signature) -> list[str]:
     """List the heads that place boxes on the canvas; all, if none does, so that a message names them."""
     placing = [name for name in names if _reads(HEADS[name], outputs, signature.canvas, signature.classes)]
     return placing or names
+
+
+def _remedy(signature: Signature, names: Sequence[str], run: Callable[[], _Outputs] | None) -> str:
+    """Say what to do about a model that none or several heads fit, those of some names; `run` as for `recognise`."""
+    classes = "" if names else _classes_instead(signature)
+    if classes:
+        return classes
+    outputs = {name: torch.zeros(shape) for name, shape in signature.outputs} if run is None else run()
+    return remedy_of_head(outputs, signature.canvas, signature.classes)
 
 
 def _unrecognised(signature: Signature, names: Sequence[str], remedy: str) -> str:
@@ -106,12 +111,14 @@ def _reads(head: Head, outputs: _Outputs, canvas: Canvas, classes: int | None) -
     """Tell whether a head finds boxes on the canvas in outputs, with a score for each class."""
     try:
         candidates = head.decode(outputs, canvas, classes)
-        boxes, scores = candidates.boxes, candidates.classes
     except MISFITS:
         return False
-    has_forms = boxes.ndim == 3 and scores.ndim == 3 and boxes.shape[:2] == scores.shape[:2] and boxes.shape[2] == 4
-    has_scores = has_forms and scores.shape[2] > 0 and classes in (None, scores.shape[2])
-    return has_scores and not axes_exchanged(boxes, canvas) and misplacement(boxes, canvas) is None
+    boxes = candidates.boxes
+    scores = candidates.classes
+    has_forms = boxes.ndim == 3 and scores.ndim == 3 and boxes.shape == (*scores.shape[:2], 4)
+    if not has_forms or scores.shape[2] == 0 or classes not in (None, scores.shape[2]):
+        return False
+    return not axes_exchanged(boxes, canvas) and misplacement(boxes, canvas) is None
 
 
 def _check_has_scores(signature: Signature) -> None:

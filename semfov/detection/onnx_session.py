@@ -107,16 +107,7 @@ class OnnxSession:
             open_ended=self.open_ended,
         )
         self._further = tuple(further)
-        # A model with further outputs is given in memory, and has no file; its weights stay where they are.
-        opening: Opening = {
-            "path": None if self._further else fspath(self.path),
-            "folder": fspath(self.path.parent),
-            "threads": self.threads,
-            "providers": _chosen_providers(torch.device(device), self.providers),
-            "spinning": spinning,
-            "tensors": _MOST_MEMORY if self.open_ended else None,
-            "process": None,
-        }
+        opening = self._opening(_chosen_providers(torch.device(device), self.providers), spinning=spinning)
         try:
             self._session, description = self._open(opening)
         except UnicodeDecodeError as error:
@@ -132,6 +123,18 @@ class OnnxSession:
         self.takes_bytes = self._inputs.image.takes_bytes
         batch = self.shape[0]
         check(batch is None or batch <= _MOST_BATCH, "batch", f"at most {_MOST_BATCH} images at once", batch)
+
+    def _opening(self, providers: Sequence[Provider], *, spinning: bool) -> Opening:
+        """Say how the model is opened: by its file, or from memory where it is given further outputs."""
+        return {
+            "path": None if self._further else fspath(self.path),
+            "folder": fspath(self.path.parent),  # in which its weights may stay
+            "threads": self.threads,
+            "providers": providers,
+            "spinning": spinning,
+            "tensors": _MOST_MEMORY if self.open_ended else None,
+            "process": None,
+        }
 
     def _open(self, opening: Opening) -> tuple[InferenceSession | ModelApart, Description]:
         """Open the model, an open-ended one in a process of its own, and read what onnxruntime says of it."""
@@ -228,14 +231,14 @@ class OnnxSession:
             raise DataError(f"{self.path.name}: fails on images of shape {tuple(image.shape)}: {reason}") from error
         outputs = {}
         for (name, sizes), array in zip(self.outputs, arrays, strict=True):
+            rows = torch.from_numpy(array)
             if _is_flat(sizes):
-                outputs[name] = rows_of_images(torch.from_numpy(array), len(image))
-                continue
-            has_rows = array.shape[:1] == (len(image),)
+                rows = rows_of_images(rows, len(image))
+            has_rows = rows.shape[:1] == (len(image),)
             expected = f"a row for each of {len(image)} images"
             got = f"shape {array.shape}; {_WITHOUT_SELECTION}"
             check(has_rows, f"{self.path.name}: output {name!r}", expected, got)
-            outputs[name] = torch.from_numpy(array)
+            outputs[name] = rows
         return outputs
 
     def __reduce__(self) -> tuple[Callable[[], OnnxSession], tuple[()]]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
-from semfov.detection.class_names import COCO_CATEGORIES, coco_categories, keep_classes
+from semfov.detection.class_names import COCO_CATEGORIES, coco_categories
 from semfov.detection.detector import check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.placement import Placement
@@ -67,7 +67,8 @@ class TorchvisionDetector(ModuleDetector):
             check(is_coco, "classes", "the names of the model's outputs after the first, background", None)
             classes = coco_categories()[first:]
         decoder, softmax = _decoder_of(model)
-        check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
+        possible = (1,) if softmax else (0, 1)  # of a softmax, output 0 is background
+        check(first in possible, "first", "1, or 0 for models with sigmoids", first)
         transform: _Model = model.transform
         has_fixed_size = transform.fixed_size is not None
         canvas = tuple(transform.fixed_size) if has_fixed_size else (transform.max_size, transform.max_size)
@@ -128,7 +129,7 @@ class TorchvisionDetector(ModuleDetector):
 
         Shapes: boxes `(N, 4)` or `(N, C, 4)`, scores `(N, C)`.
         """
-        candidates = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
+        candidates = self._of_classes(Candidates(boxes, scores[:, self.first :]))
         if boxes.ndim == 2:
             return candidates
         # A detection has one box for all its scores: the one of its best class.

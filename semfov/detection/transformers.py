@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from semfov.detection.class_names import keep_classes
 from semfov.detection.detector import LARGEST_SIDE, check_images
 from semfov.detection.modules import ModuleDetector, edge_scale, module_digest, resized_images
 from semfov.detection.onnx_heads import HEADS
@@ -57,11 +56,7 @@ class TransformersDetector(ModuleDetector):
             classes = [config.id2label[index] for index in sorted(config.id2label)]
         settings = _with_usual_settings(processor or {}, config.model_type)
         size = _processor_size(settings)
-        has_softmax = config.model_type in _SOFTMAX
-        if not has_softmax:
-            # A model of another kind that is trained without focal loss would have a softmax, too.
-            focal_loss = getattr(config, "use_focal_loss", True)
-            check(bool(focal_loss), "model", "scores trained with focal loss", f"use_focal_loss={focal_loss}")
+        has_softmax = _has_softmax(config)
         resizes = bool(settings.get("do_resize", True))
         stretches = resizes and "height" in size
         super().__init__(
@@ -95,7 +90,7 @@ class TransformersDetector(ModuleDetector):
         queries = {name: getattr(outputs, name).to(canvas.dtype) for name in ("logits", "pred_boxes")}
         head = HEADS["detr" if self.softmax else "rtdetr"]
         candidates = head.decode(queries, (canvas.shape[-1], canvas.shape[-2]), self._count)
-        return keep_classes(candidates, self._places, self._count)
+        return self._of_classes(candidates)
 
     def feature_modules(self) -> dict[str, nn.Module]:
         """Find the convolutional backbone; a model of another kind has none."""
@@ -163,6 +158,16 @@ def _check_model(model: nn.Module) -> None:
     takes_text = "input_ids" in inspect.signature(model.forward).parameters
     expected = "a model for object detection with classes of its own, such as RTDetrForObjectDetection"
     check(detects and not takes_text, "detector", expected, type(model).__name__)
+
+
+def _has_softmax(config: Any) -> bool:
+    """Tell by the configuration of a model whether its scores are a softmax over the classes and "no object"."""
+    if config.model_type in _SOFTMAX:
+        return True
+    # A model of another kind that is trained without focal loss would have a softmax, too.
+    focal_loss = getattr(config, "use_focal_loss", True)
+    check(bool(focal_loss), "model", "scores trained with focal loss", f"use_focal_loss={focal_loss}")
+    return False
 
 
 def _with_usual_settings(processor: ProcessorSettings, kind: str) -> dict[str, Any]:

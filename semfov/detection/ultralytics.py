@@ -5,7 +5,6 @@ from typing import cast
 
 from torch import Tensor, nn
 
-from semfov.detection.class_names import keep_classes
 from semfov.detection.modules import ModuleDetector, module_digest
 from semfov.detection.onnx_decoding import decode_yolov8
 from semfov.detection.scores import Candidates
@@ -56,7 +55,7 @@ class UltralyticsDetector(ModuleDetector):
         expected = f"a network that returns all class scores of each box, (B, {channels}, N)"
         remedy = "use a detection model whose head selects no boxes (end2end off)"
         check(len(shape) == 3 and shape[1] == channels, "detector", expected, f"{shape}; {remedy}")
-        return keep_classes(decode_yolov8(columns.to(canvas.dtype)), self._places, self._count)
+        return self._of_classes(decode_yolov8(columns.to(canvas.dtype)))
 
 
 def _network_of(model: nn.Module) -> nn.Module:

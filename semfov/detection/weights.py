@@ -245,12 +245,7 @@ def fetch(name: str) -> Path:
     faults = [] if entry.sources else ["no source has this file"]
     for source in entry.sources:
         try:
-            with replacing(path) as temporary:
-                source.fetch(temporary)
-                size = temporary.stat().st_size
-                digest = sha256(temporary)
-                check_data(size == entry.size, entry.file, f"{entry.size} bytes", size)
-                check_data(digest == entry.sha256, entry.file, f"sha256 {entry.sha256}", digest)
+            _fetch_from(source, entry, path)
         except DataError as error:
             faults.append(str(error))
         else:
@@ -260,3 +255,13 @@ def fetch(name: str) -> Path:
         f"cannot fetch the weights {name!r} ({'; '.join(faults)}); put {entry.file} ({entry.size} bytes, sha256 "
         f"{entry.sha256}) into {path.parent}, or give its path as weights={remark}"
     )
+
+
+def _fetch_from(source: _Address | _SourceDistribution, entry: _Weights, path: Path) -> None:
+    """Download weights to a path; raises `DataError` where a source has no such file, or another one."""
+    with replacing(path) as temporary:
+        source.fetch(temporary)
+        size = temporary.stat().st_size
+        check_data(size == entry.size, entry.file, f"{entry.size} bytes", size)
+        digest = sha256(temporary)
+        check_data(digest == entry.sha256, entry.file, f"sha256 {entry.sha256}", digest)
