@@ -125,10 +125,11 @@ class CocoScenes(Scenes):
         chosen = {str(image) for image in ids}
         missing = sorted(chosen - set(image_ids))
         if missing:
-            named = ", ".join([*missing[:5], "…"] if len(missing) > 5 else missing)
+            first = ", ".join(missing[:5])
+            others = ", …" if len(missing) > 5 else ""
             raise DataError(
                 f"{self._name}: expected an image for each of {len(chosen)} ids, got none for {len(missing)} of them: "
-                f"{named}; correct ids or the annotations"
+                f"{first}{others}; correct ids or the annotations"
             )
         return [row for row, image in enumerate(image_ids) if image in chosen]
 
@@ -271,14 +272,7 @@ class _Packed:
         self.sizes = [_size_of(file, image, path) for image in self.ids]
         self.repairs: Counter[str] = Counter()
 
-        # The N entries of all images, row after row.
-        entries: list[Entry] = []
-        counts: list[int] = []
-        for image in self.ids:
-            entries_of_image = file.objects[image]
-            entries.extend(entries_of_image)
-            counts.append(len(entries_of_image))
-        rows = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts, dtype=torch.int64))
+        entries, rows = _entries_by_row(file, self.ids)
         categories = [entry["category_id"] for entry in entries]
         label = torch.tensor([labels[category] for category in categories], dtype=torch.int64)
         crowd = torch.tensor([bool(entry["iscrowd"]) for entry in entries], dtype=torch.bool)
@@ -320,6 +314,17 @@ class _Packed:
         labels = self._labels[objects].clone()
         crowd = self._crowd[objects].clone()
         return Annotation(boxes, labels, crowd, self.sizes[row])
+
+
+def _entries_by_row(file: Annotations, ids: Sequence[Id]) -> tuple[list[Entry], Tensor]:
+    """List the N entries of all images, row after row, and the row of each, `(N,)`."""
+    entries: list[Entry] = []
+    rows: list[int] = []
+    for row, image in enumerate(ids):
+        entries_of_image = file.objects[image]
+        entries += entries_of_image
+        rows += [row] * len(entries_of_image)
+    return entries, torch.tensor(rows, dtype=torch.int64)
 
 
 def _bboxes_of(entries: Sequence[Entry]) -> Tensor:

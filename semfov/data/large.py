@@ -70,7 +70,8 @@ def open_large(
         check(white is None and bands is None, "white", "None for a picture that is open; give it to open_large", white)
         return source
     if isinstance(source, str | PathLike):
-        _check_no_bands(None if _has_windows(source) else bands)
+        if not _has_windows(source):
+            _check_no_bands(bands)
         return _open_file(source, white, bands)
     _check_no_bands(bands)
     return ArrayPicture(_bytes_of(source, color, white))

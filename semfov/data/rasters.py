@@ -85,15 +85,11 @@ class RasterPicture(LargePicture):
         """Read a window from the overviews of the file, or from a copy where it has none."""
         if not self._has_overviews:
             return super()._reduced(box, reduction)
-        # Edges at multiples of the reduction, so that neighbouring windows meet.
-        x1, y1, x2, y2 = box
+        # Outwards to multiples of the reduction, so that neighbouring windows meet.
+        left, top = (edge // reduction * reduction for edge in box[:2])
+        right, bottom = (-(-edge // reduction) * reduction for edge in box[2:])
         width, height = self.size
-        outwards = (
-            x1 // reduction * reduction,
-            y1 // reduction * reduction,
-            min(-(-x2 // reduction) * reduction, width),
-            min(-(-y2 // reduction) * reduction, height),
-        )
+        outwards = left, top, min(right, width), min(bottom, height)
         return torch.from_numpy(self.pixels(outwards, reduction)).permute(2, 0, 1)
 
     def _values(self, box: Box, reduction: int = 1) -> Values:

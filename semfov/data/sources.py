@@ -84,14 +84,19 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
     files = sorted(path for path in visible if path.suffix.lower() in PHOTOGRAPHS)
     if recursive:
         files = _of_others(files, source)
-    photographs(visible, str(source))
+    photographs(visible, str(source))  # warns of the other files
     _warn_of_mosaics(source)
-    if files:
-        return files
+    if not files:
+        raise DataError(_without_photographs(source, recursive=recursive, frames=frames))
+    return files
+
+
+def _without_photographs(folder: Path, *, recursive: bool, frames: bool) -> str:
+    """Write that a folder has no photographs; the arguments are those of `picture_files`."""
     if frames:
-        raise DataError(f"source: expected frames (.jpg, .png, .tif, …) in {source}, got none")
+        return f"source: expected frames (.jpg, .png, .tif, …) in {folder}, got none"
     hint = "or in a folder in it" if recursive else "and recursive=True also searches the folders in it"
-    raise DataError(f"picture: expected photographs (.jpg, .png, .tif, …) in {source}, {hint}, got none")
+    return f"picture: expected photographs (.jpg, .png, .tif, …) in {folder}, {hint}, got none"
 
 
 def _visible_files(folder: Path, *, recursive: bool) -> list[Path]:

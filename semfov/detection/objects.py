@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from semfov.data.classes import class_index
+from semfov.data.classes import amount, class_index
 from semfov.data.inputs import as_positions
 from semfov.errors import InputError, check, check_number, check_shape
 from semfov.words import OBJECTS, OtherWords
@@ -60,7 +60,7 @@ class Objects(OtherWords):
 
     def __repr__(self) -> str:
         """Write the number of objects, and a line for each of the most confident ones."""
-        lines = [f"{len(self)} object{'s' if len(self) != 1 else ''}"]
+        lines = [amount(len(self), "object")]
         shown = self[:_PRINTED]
         labels = shown.labels.tolist()
         scores = shown.scores.tolist()
@@ -179,7 +179,7 @@ def merge_boxes(
     for name, number in (("score", score), ("iou", iou), ("inside", inside)):
         check_number(number, name, 0, 1)
     count = len(corners)
-    if windows is None or not count:
+    if windows is None or not count:  # one look shows all boxes, and cuts none
         looks = torch.zeros(count).long()
         cut = torch.zeros(count).bool()
         sharpness = torch.zeros(count)

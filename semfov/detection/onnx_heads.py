@@ -47,6 +47,7 @@ _NANODET = Preprocessing(
     channels="bgr", scale=255.0, mean=(103.53, 116.28, 123.675), std=(57.375, 57.12, 58.395), stretch=True
 )
 
+_SELECTED_BY_DETR = {"labels", "boxes", "scores"}  # outputs of RT-DETR with its own selection
 _DISTANCE_CHANNELS = 32  # of NanoDet-Plus: 8 bins for each side of a box
 
 
@@ -305,31 +306,35 @@ class _EndToEnd(_RowsHead):
         return decode_end_to_end(_single(outputs), classes)
 
 
-class _EndToEndDetr(Head):
-    """RT-DETR with its own selection: the outputs `boxes`, `scores` and `labels` of `decode_selected`."""
+class _SelectionHead(Head):
+    """Base of networks that select boxes themselves, with the outputs of `decode_selected`."""
+
+    selects = True
+
+    def recognises(self, signature: Signature) -> bool:
+        return signature.layout == "selection"
+
+    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
+        return decode_selected(outputs, classes)
+
+
+class _EndToEndDetr(_SelectionHead):
+    """RT-DETR with its own selection: the outputs `boxes`, `scores` and `labels`."""
 
     name = "end2end-detr"
     preprocessing = _STRETCH
-    selects = True
 
     def recognises(self, signature: Signature) -> bool:
-        return signature.layout == "selection" and {*signature.shapes} == {"labels", "boxes", "scores"}
-
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
-        return decode_selected(outputs, classes)
+        return super().recognises(signature) and {*signature.shapes} == _SELECTED_BY_DETR
 
 
-class _EndToEndNms(Head):
-    """A network with non-maximum suppression, by mmdeploy or TensorRT: the outputs of `decode_selected`."""
+class _EndToEndNms(_SelectionHead):
+    """A network with non-maximum suppression, by mmdeploy or TensorRT: outputs by other names."""
 
     name = "end2end-nms"
-    selects = True
 
     def recognises(self, signature: Signature) -> bool:
-        return signature.layout == "selection" and {*signature.shapes} != {"labels", "boxes", "scores"}
-
-    def decode(self, outputs: _Outputs, canvas: Canvas, classes: int | None, least: float = 0.0) -> Candidates:
-        return decode_selected(outputs, classes)
+        return super().recognises(signature) and {*signature.shapes} != _SELECTED_BY_DETR
 
 
 class _DistanceMaps(_CellsHead):

@@ -99,13 +99,7 @@ def letterbox(
     check(image.is_floating_point(), "image", "floating-point pixels in [0, 1]", image.dtype)
     check(height > 0 and width > 0, "image", "at least one pixel", tuple(image.shape))
     columns, rows = size if stretch else _size_within(size, width, height)
-    # Networks with convolutions alone take a canvas of any size that their strides divide.
-    if stride is None:
-        horizontal = size[0] - columns
-        vertical = size[1] - rows
-    else:
-        horizontal = -columns % stride
-        vertical = -rows % stride
+    horizontal, vertical = _padding(size, (columns, rows), stride)
     left = 0 if corner else horizontal // 2
     top = 0 if corner else vertical // 2
     right = horizontal - left
@@ -114,6 +108,14 @@ def letterbox(
     canvas = F.pad(resized, (left, right, top, bottom), value=fill)
     scale = (columns / width, rows / height)
     return canvas, Placement((width, height), scale, (left, top))
+
+
+def _padding(canvas: tuple[int, int], content: tuple[int, int], stride: int | None) -> tuple[int, int]:
+    """Compute how many pixels, along x and y, pad content to a canvas, or to the next multiples of a stride."""
+    if stride is None:
+        return canvas[0] - content[0], canvas[1] - content[1]
+    # Networks with convolutions alone take a canvas of any size that their strides divide.
+    return -content[0] % stride, -content[1] % stride
 
 
 def _size_within(size: tuple[int, int], width: int, height: int) -> tuple[int, int]:

@@ -150,7 +150,7 @@ def _select_of_image(
     remaining = suppress(boxes, confidence, labels, selection)
 
     survivors = confident[remaining]
-    if faint is None:  # the vectors of few boxes are read, so no others are computed
+    if faint is None:  # as in windows, which find their hints themselves: only the vectors of survivors are read
         scores = score_vectors(candidates.take(image, index[survivors]), policy)
         highest = _highest(scores)
     else:

@@ -19,6 +19,15 @@ Runtime = Literal["auto", "torch", "onnxruntime"]
 _RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
 
+def _check_multiples(size: tuple[int, int], stride: int | None, step: int) -> None:
+    """Raise `InputError` unless the sides of a canvas, and the stride of its padding, are multiples of a step."""
+    are_multiples = all(_is_multiple(side, step) for side in size)
+    check(are_multiples, "input_size", f"a multiple of {step} along both axes", size)
+    if stride is not None:
+        can_pad = isinstance(stride, int) and _is_multiple(stride, step)
+        check(can_pad, "stride", f"None or a multiple of {step}", repr(stride))
+
+
 def _is_multiple(side: int, step: int) -> bool:
     """Tell whether a side in pixels is a multiple of a step, and not 0."""
     return side > 0 and side % step == 0
@@ -122,12 +131,7 @@ class YoloV3(Detector):
     ) -> None:
         check(runtime in _RUNTIMES, "runtime", " or ".join(map(repr, _RUNTIMES)), repr(runtime))
         size = network.input_size if input_size is None else input_size
-        multiple = f"a multiple of {network.stride}"
-        are_multiples = all(_is_multiple(side, network.stride) for side in size)
-        check(are_multiples, "input_size", f"{multiple} along both axes", size)
-        if stride is not None:
-            can_pad = isinstance(stride, int) and _is_multiple(stride, network.stride)
-            check(can_pad, "stride", f"None or {multiple}", repr(stride))
+        _check_multiples(size, stride, network.stride)
         for head in network.heads:
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
         super().__init__(name, classes, size, stride=stride, digest=digest)

@@ -273,10 +273,9 @@ def open_scenery(
     check(is_source, "scenes", "a folder or `Scenes` (count= says how many)", scenes)
     check_cells(grid)
     if config is None:
-        folder = Path(scenes) if isinstance(scenes, str | Path) else None
         usual_shifts = 30 if task == "search" else 20
         config = RunConfig(
-            data=DataConfig(folder, _path(annotations), count, min_instances=0, scene_seed=seed),
+            data=DataConfig(_folder_of(scenes), _path(annotations), count, min_instances=0, scene_seed=seed),
             detector=DetectorConfig(detector, _path(weights)),
             sensor=SensorConfig(sensor),
             belief=BeliefConfig(columns=grid[0], rows=grid[1]),
@@ -289,6 +288,11 @@ def open_scenery(
     # One belief is kept, that of the first policy.
     config = replace(config, policies=config.policies[:1])
     return Scenery(_SceneLooking(config, task, scenes, mosaics, tiles), targets, reopen)
+
+
+def _folder_of(source: _Source) -> Path | None:
+    """Return the folder of scenes that are given by it; None for others."""
+    return Path(source) if isinstance(source, str | Path) else None
 
 
 def _path(name: str | Path | None) -> Path | None:
@@ -472,9 +476,8 @@ def open_zoom_scenery(
     check_whole(passes, "passes", 2, 100_000)
     data = DataConfig(limit=count, min_instances=0, max_target_area=None, scene_seed=seed)
     if annotations is not None:
-        folder = Path(scenes) if isinstance(scenes, str | Path) else None
         # Objects that fill more than a fifth of a photograph are no targets of a search.
-        data = replace(data, root=folder, annotations=Path(annotations), max_target_area=0.2)
+        data = replace(data, root=_folder_of(scenes), annotations=Path(annotations), max_target_area=0.2)
     if mosaics is None:
         # Embedded scenes are too small to look at closely.
         mosaics = 8 if scenes is None else 0

@@ -105,11 +105,8 @@ def check_same_detector(fitted: Settings, detector: Settings, what: str) -> None
     if not detector or not fitted:
         return
     if not _is_same_network(fitted, detector):
-        got = _described(detector)
-        remedy = "fit a model for this detector, or use the one it was fitted for"
-        if fitted.get("name") == detector.get("name"):
-            got, remedy = _other_file(detector)
-        raise InputError(f"detector: the {what} was fitted for {_described(fitted)}, got {got}; {remedy}")
+        got = _other_network(fitted, detector)
+        raise InputError(f"detector: the {what} was fitted for {_described(fitted)}, got {got}")
     check_background(fitted, detector.get("background"), what)
     differences = "; ".join(_differences(fitted, detector, _NOT_COMPARED))
     if differences:
@@ -132,13 +129,15 @@ def _described(detector: Settings) -> str:
     return f"{detector.get('name')!r}{file}"
 
 
-def _other_file(detector: Settings) -> tuple[str, str]:
-    """Describe a detector with the name of the fit and another file, and what to do."""
+def _other_network(fitted: Settings, detector: Settings) -> str:
+    """Describe a detector with another network than that of the fit, and what to do."""
+    if fitted.get("name") != detector.get("name"):
+        return f"{_described(detector)}; fit a model for this detector, or use the one it was fitted for"
     network = NETWORKS.get(str(detector.get("digest")))
     if network is None:
         remedy = "give its own file as weights=, or fit models to this one (semfov fit FILE)"
-        return "the file of another network under this name", remedy
-    return f"the file of {network!r} under this name", f"name the detector {network!r}, with this file as weights="
+        return f"the file of another network under this name; {remedy}"
+    return f"the file of {network!r} under this name; name the detector {network!r}, with this file as weights="
 
 
 def check_sensor(fitted: Settings, sensor: Settings, what: str, *, strict: bool = False) -> None:
@@ -182,13 +181,14 @@ def check_grid(fitted: Settings, grid: tuple[int, int], what: str) -> None:
     rows = fitted.get("rows")
     if columns is None or rows is None:
         return
-    is_alike = columns / 2 <= grid[0] <= 2 * columns and rows / 2 <= grid[1] <= 2 * rows
-    if is_alike:
+    are_columns_alike = columns / 2 <= grid[0] <= 2 * columns
+    are_rows_alike = rows / 2 <= grid[1] <= 2 * rows
+    if are_columns_alike and are_rows_alike:
         return
+    fit = f"python -m train.fit_search, with --columns {grid[0]} --rows {grid[1]}"
     raise InputError(
-        f"grid: the {what} was fitted on {columns} × {rows} cells and is valid for half to twice as many "
-        f"along each side, got {grid[0]} × {grid[1]}; use grid={(columns, rows)}, or fit models on such a grid (python "
-        f"-m train.fit_search, with --columns {grid[0]} --rows {grid[1]})"
+        f"grid: the {what} was fitted on {columns} × {rows} cells and is valid for half to twice as many along each "
+        f"side, got {grid[0]} × {grid[1]}; use grid={(columns, rows)}, or fit models on such a grid ({fit})"
     )
 
 
