@@ -218,11 +218,12 @@ def _fault(error: Exception, source: Path | str, action: str) -> str:
         return f"truncated, damaged or closed, and cannot be {action} ({reason}); open it again or replace it"
     is_unidentified = error_name == "UnidentifiedImageError"
     kind, is_read = kind_of(source)
-    is_named = kind != "" or is_unidentified
-    if is_named and not is_read:
+    # Bytes that tell no kind, such as those of a PPM, are still a picture where Pillow has identified it.
+    is_other_kind = kind != "" or is_unidentified
+    if is_other_kind and not is_read:
         return _of_another_kind(kind)
     if is_unidentified:
-        reason = f"as {kind}"
+        reason = f"as {kind}"  # Pillow's own words name the open file alone
     return f"truncated, damaged or of an unsupported kind, and cannot be {action} ({reason}); replace it"
 
 

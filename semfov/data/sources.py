@@ -5,7 +5,7 @@ import time
 import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType, ModuleType
@@ -122,9 +122,8 @@ def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
     written = [path for path in files if _is_made_here(path)]
     if written:
         name = printable(str(written[0]))
-        text = (
-            f"{len(written)} pictures that semfov has written, such as {name}, are left out; name them, or their folder"
-        )
+        pictures = f"{len(written)} pictures that semfov has written"
+        text = f"{pictures}, such as {name}, are left out; name them, or their folder"
         if len(written) == 1:
             text = f"1 picture that semfov has written, {name}, is left out; name it or its folder"
         warnings.warn(f"{source}: {text}, to look there", stacklevel=3)
@@ -154,17 +153,20 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
     """
     kinds = {"", ".vrt", *PHOTOGRAPHS}
     foreign_files = {path for path in paths if path.suffix.lower() not in kinds and path.is_file()}
-    if not foreign_files:
-        return list(paths)
-    name = printable(min(foreign_files).name)
-    text = f"{len(foreign_files)} files are no photographs and are left out, such as {name}"
-    if len(foreign_files) == 1:
+    if foreign_files:
+        warnings.warn(f"{where}: {_without_foreign(foreign_files)}", stacklevel=3)
+    return [path for path in paths if path not in foreign_files]
+
+
+def _without_foreign(files: Set[Path]) -> str:
+    """Write that files are left out, as they are no photographs."""
+    name = printable(min(files).name)
+    text = f"{len(files)} files are no photographs and are left out, such as {name}"
+    if len(files) == 1:
         text = f"1 file is no photograph and is left out, {name}"
     # `search`, `find` and `explore` take photographs alone.
-    if any(path.suffix.lower() in VIDEOS for path in foreign_files):
-        text += "; `semfov live` takes videos"
-    warnings.warn(f"{where}: {text}", stacklevel=3)
-    return [path for path in paths if path not in foreign_files]
+    has_videos = any(path.suffix.lower() in VIDEOS for path in files)
+    return f"{text}; `semfov live` takes videos" if has_videos else text
 
 
 class Stream(NamedTuple):

@@ -181,8 +181,7 @@ class Mosaic:
         """
         window = options["window"]
         height, width = options["out_shape"][-2:]
-        background = 0 if band.nodata is None else _as_kind(np.array(band.nodata), band.kind)
-        canvas = np.full((height, width), background, band.kind)
+        canvas = _empty_canvas(band, (height, width))
         x_scale = width / window.width
         y_scale = height / window.height
         is_reduced = max(x_scale, y_scale) < 1
@@ -264,6 +263,12 @@ def _converted(source: Source, file: Dataset, values: Values) -> Values:
     if (source.ratio, source.offset) != (1.0, 0.0):
         values = values * source.ratio + source.offset
     return values
+
+
+def _empty_canvas(band: Band, shape: tuple[int, ...]) -> Values:
+    """Make the canvas of a band that no source covers."""
+    background = 0 if band.nodata is None else _as_kind(np.array(band.nodata), band.kind)
+    return np.full(shape, background, band.kind)
 
 
 def open_raster(path: str | PathLike[str]) -> Mosaic | Dataset:

@@ -138,11 +138,15 @@ def _read_vectors(path: Path, wanted: frozenset[str]) -> dict[str, Tensor]:
             values = _numbers(rest)
             if size is None:
                 size = len(values)
-            is_vector = len(values) == size > 0 and all(map(math.isfinite, values))
-            expected = f"a word and {size or 'some'} numbers"
-            check_data(is_vector, f"{path}, line {number}", expected, f"{line[:60]!r}")
+            _check_vector(values, size, f"{path}, line {number}", line)
             vectors[key] = torch.tensor(values)
     return vectors
+
+
+def _check_vector(values: Sequence[float], size: int, where: str, line: str) -> None:
+    """Raise `DataError` for a line whose numbers are no vector of the common size."""
+    is_vector = len(values) == size > 0 and all(map(math.isfinite, values))
+    check_data(is_vector, where, f"a word and {size or 'some'} numbers", f"{line[:60]!r}")
 
 
 def _lines(file: IO[str]) -> Iterator[str]:

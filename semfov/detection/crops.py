@@ -69,6 +69,7 @@ def _merge_fixation(
     crop = crop[index]
     score, label = rows.scores[index, 1:].detach().max(-1)
     is_cut = ~in_full[index, crop]
+    # The finest crop is the first, and the sharpest.
     distinct = unlike(
         boxes[index].cpu(), score.cpu(), label.cpu(), looks=crop.cpu(), cut=is_cut.cpu(), sharpness=-crop.cpu()
     )

@@ -191,6 +191,7 @@ class _NetworkGraph(Graph):
         lengths = self.constant([2, 2, 1, head.classes])
         shift, size, objectness, classes = self.add_several("Split", cells, lengths, outputs=4, axis=3)
 
+        # The centre is (scale σ(t) - (scale - 1) / 2 + i) s, with the column or row i of the cell and its step s.
         share = self.add("Sigmoid", shift)
         place_in_cell = self.add("Mul", share, self.constant(float(head.scale)))
         cell = self._corners(source)
@@ -198,6 +199,7 @@ class _NetworkGraph(Graph):
         place = self.add("Add", place_in_cell, corner)
         centre = self.add("Mul", place, self.constant(step))
 
+        # Half of the size is p exp(t) / 2, with the anchor p.
         half_anchors = (torch.tensor(head.anchors) / 2).float()
         growth = self.add("Exp", size)
         half = self.add("Mul", growth, self.constant(half_anchors))

@@ -310,23 +310,27 @@ def with_input_size(path: Path, canvas: Canvas) -> Path:
     check(all(side % _COARSEST == 0 for side in canvas), "input_size", f"multiples of {_COARSEST} pixels", canvas)
     check_file(path)
     model = onnx.load(path)
-    rows, columns = model.graph.input[0].type.tensor_type.shape.dim[2:4]
+    rows, columns = model.graph.input[0].type.tensor_type.shape.dim[2:4]  # of (B, 3, H, W)
     size = columns.dim_value, rows.dim_value
     if size == canvas:
         return path
     _resize_shapes(model.graph, size, canvas)
     columns.dim_value, rows.dim_value = canvas
-    # What the file says of sizes inside, and of the number of boxes, is that of the former input.
-    del model.graph.value_info[:]
-    for output in model.graph.output:
-        for side in output.type.tensor_type.shape.dim[1:2]:
-            side.Clear()
+    _forget_sizes(model.graph)
     content = model.SerializeToString()
     digest = hashlib.sha256(content).hexdigest()
-    new = cache_folder() / "resized" / f"{path.stem}-{canvas[0]}x{canvas[1]}-{digest[:16]}.onnx"
-    if not new.is_file() or sha256(new) != digest:
-        write_bytes(new, content)
-    return new
+    copy = cache_folder() / "resized" / f"{path.stem}-{canvas[0]}x{canvas[1]}-{digest[:16]}.onnx"
+    if not copy.is_file() or sha256(copy) != digest:
+        write_bytes(copy, content)
+    return copy
+
+
+def _forget_sizes(graph: onnx.GraphProto) -> None:
+    """Delete what a model says of the sizes inside it, and of the number of boxes: they follow from its input."""
+    del graph.value_info[:]
+    for output in graph.output:
+        for boxes in output.type.tensor_type.shape.dim[1:2]:  # of (B, N, …), if it is stated
+            boxes.Clear()
 
 
 def _resize_shapes(graph: onnx.GraphProto, size: Canvas, canvas: Canvas) -> None:
