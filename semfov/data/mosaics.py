@@ -127,8 +127,10 @@ class Mosaics(ComposedScenes):
         for tile in self.tiles(index):
             objects = self.scenes.annotation(tile.scene)
             x1, y1, x2, y2 = tile.box
-            scale = objects.boxes.new_tensor([(x2 - x1) / objects.size[0], (y2 - y1) / objects.size[1]] * 2)
-            boxes.append(objects.boxes * scale + objects.boxes.new_tensor([x1, y1] * 2))
+            width, height = objects.size
+            scale = objects.boxes.new_tensor([(x2 - x1) / width, (y2 - y1) / height] * 2)
+            corner = objects.boxes.new_tensor([x1, y1] * 2)
+            boxes.append(objects.boxes * scale + corner)
             labels.append(objects.labels)
             crowd.append(objects.crowd)
         return Annotation(torch.cat(boxes), torch.cat(labels), torch.cat(crowd), self.size)

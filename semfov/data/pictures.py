@@ -44,8 +44,11 @@ class Pictures(Scenes):
         return json_sha256([(name, self.digest(index)) for index, name in enumerate(self.ids)])
 
     def __getitem__(self, index: int) -> Scene:
-        image = read_image(self._path(self.ids[index]))
-        return Scene(self.ids[index], self.ids[index], image, torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64))
+        name = self.ids[index]
+        image = read_image(self._path(name))
+        height, width = image.shape[-2:]
+        objects = _no_objects((width, height))
+        return Scene(name, name, image, objects.boxes, objects.labels)
 
     def digest(self, index: int) -> str:
         """Compute the sha256 of a file's content."""
@@ -57,8 +60,7 @@ class Pictures(Scenes):
         if index not in self._sizes:
             height, width = read_image(self._path(self.ids[index])).shape[-2:]
             self._sizes[index] = width, height
-        labels = torch.zeros(0, dtype=torch.int64)
-        return Annotation(torch.zeros(0, 4), labels, labels.bool(), self._sizes[index])
+        return _no_objects(self._sizes[index])
 
     def targets(self, index: int) -> list[int]:
         """Return an empty list: no objects are known."""
@@ -67,3 +69,9 @@ class Pictures(Scenes):
     def _path(self, name: str) -> Path:
         """Find the file of a name; one's own folder may hold links to photographs elsewhere."""
         return inside(self.root, name, links=True)
+
+
+def _no_objects(size: tuple[int, int]) -> Annotation:
+    """Make the annotation of a picture of `(width, height)` whose objects are not known."""
+    labels = torch.zeros(0, dtype=torch.int64)
+    return Annotation(torch.zeros(0, 4), labels, labels.bool(), size)

@@ -192,7 +192,9 @@ def _union_area(x1: Tensor, y1: Tensor, x2: Tensor, y2: Tensor) -> Tensor:
 
 def boxes_meet(box: Sequence[float], other: Sequence[float]) -> bool:
     """Tell whether two boxes `(x1, y1, x2, y2)` have an area in common."""
-    return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]
+    x1, y1, x2, y2 = box
+    left, top, right, bottom = other
+    return x1 < right and left < x2 and y1 < bottom and top < y2
 
 
 def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage: Coverage = "sum") -> list[int]:

@@ -307,7 +307,9 @@ def _of_transposed_convolution(_: NodeProto, inputs: list[_Sizes], output: _Size
 
 def _of_steps(_: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:
     """Count all weights of a recurrent layer for each step of each item."""
-    return math.prod(inputs[0][:2]) * (math.prod(inputs[1]) + math.prod(inputs[2]))
+    sequences, weights, recurrent_weights = inputs[:3]
+    items_and_steps = math.prod(sequences[:2])
+    return items_and_steps * (math.prod(weights) + math.prod(recurrent_weights))
 
 
 def _of_sums(node: NodeProto, inputs: list[_Sizes], output: _Sizes) -> int:

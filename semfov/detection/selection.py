@@ -224,7 +224,8 @@ def remaining_rows(
         Their indices, most confident first.
     """
     # A box without area overlaps none, so nothing would suppress it.
-    with_area = ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])).nonzero()[0]
+    x1, y1, x2, y2 = boxes.T
+    with_area = ((x2 > x1) & (y2 > y1)).nonzero()[0]
     order = with_area[(-confidence[with_area]).argsort(kind="stable")]
     return order[_remaining_ranks(boxes[order], labels[order], selection)]
 
