@@ -56,7 +56,7 @@ class TransformersDetector(ModuleDetector):
             classes = [config.id2label[index] for index in sorted(config.id2label)]
         settings = _with_usual_settings(processor or {}, config.model_type)
         size = _processor_size(settings)
-        has_softmax = _has_softmax(config)
+        has_softmax = _has_softmax(config.model_type, focal_loss=getattr(config, "use_focal_loss", True))
         resizes = bool(settings.get("do_resize", True))
         stretches = resizes and "height" in size
         super().__init__(
@@ -160,12 +160,11 @@ def _check_model(model: nn.Module) -> None:
     check(detects and not takes_text, "detector", expected, type(model).__name__)
 
 
-def _has_softmax(config: Any) -> bool:
-    """Tell by the configuration of a model whether its scores are a softmax over the classes and "no object"."""
-    if config.model_type in _SOFTMAX:
+def _has_softmax(kind: str, *, focal_loss: object) -> bool:
+    """Tell whether the scores of a kind of model are a softmax over the classes and "no object"."""
+    if kind in _SOFTMAX:
         return True
     # A model of another kind that is trained without focal loss would have a softmax, too.
-    focal_loss = getattr(config, "use_focal_loss", True)
     check(bool(focal_loss), "model", "scores trained with focal loss", f"use_focal_loss={focal_loss}")
     return False
 
