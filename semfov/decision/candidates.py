@@ -132,8 +132,8 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Find what an earlier look shows of a candidate as closely as a closer look would; None where none does."""
         return None
 
-    def is_judged(self, candidate: CandidatePlace) -> bool:
-        """Tell whether no closer look says more than the look behind a candidate, whose probability stays as it is."""
+    def shows_nothing_new(self, candidate: CandidatePlace) -> bool:
+        """Tell whether no look shows more of a candidate than the one behind the probability of the picture."""
         return False
 
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:

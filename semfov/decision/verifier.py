@@ -166,10 +166,10 @@ class Verifier(Generic[LookType]):
         candidate = self.candidate
         assert candidate is not None
         features, box = self.places.examine(candidate, detections)
-        if self.places.is_judged(candidate):
-            look = self.places.record(box, candidate.probability, self.places.presence)
-        else:
-            look = self.places.record(box, *self._verified(features))
+        place, presence = self._verified(features)
+        if self.places.shows_nothing_new(candidate):
+            presence = self.places.presence
+        look = self.places.record(box, place, presence)
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [verdict for verdict in self.verdicts if not self._is_replaced(verdict, look)]
         self.verdicts.append(_Verdict(look))

@@ -124,7 +124,8 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). In a stream scores fade, and
     places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
 
-    An object that fills the picture needs no closer look: its place keeps the probability p, and the picture P.
+    An object that fills the picture needs no closer look. Its place is verified, and the picture keeps its P, as the
+    same look says nothing new of it.
 
     Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
     that of the whole, unless other frames have passed since. `_scored` has the boxes of the target that looks have
@@ -179,8 +180,8 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         look = self._shown.get(self._showing(candidate))
         return None if look is None else look.detections
 
-    def is_judged(self, candidate: CandidatePlace) -> bool:
-        """Tell whether the look at the whole shows a place as closely as any: it says nothing new a second time."""
+    def shows_nothing_new(self, candidate: CandidatePlace) -> bool:
+        """Tell whether the look at the whole shows a candidate as closely as any look."""
         return self._showing(candidate) == Window.overview(self._lattice)
 
     def _showing(self, candidate: CandidatePlace) -> Window:

@@ -420,24 +420,29 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
 
 
 @pytest.mark.parametrize("share", [0.5, 0.1])
-def test_a_place_that_fills_the_photograph_keeps_its_probability(share):
-    """No closer look at it is made, and what the look at the whole says is not taken as evidence a second time."""
+def test_a_place_that_fills_the_photograph_leaves_the_picture_its_probability(share):
+    """No closer look at it is made, and what the look at the whole says is not counted a second time."""
     boxes = torch.tensor([[[10.0, 10, 180, 140], [60.0, 60, 80, 80]]])
     whole = Detections(boxes, torch.tensor([[[0, 0.9, 0], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
     prior = Prior(share, fitted=0.4)
     judge = Verifier(Alike(), PhotographPlaces(1, OVER, prior=prior), Thresholds(0.5, 1e-4), most=9)
     judge.see(TargetFacts(whole, 1, 0.8, 0.9, 0.0))
+
+    def verified(candidate, detections):
+        before = prior.inverse.at_place(candidate.probability, prior(0.8))
+        features, _ = closer_features(0.8, before, candidate.evidence, detections, candidate.box, 1)
+        place, presence = Alike()(features).sigmoid().tolist()
+        return prior.at_place(place, presence), prior(presence)
+
     large = judge.candidate
     look = judge.examine(judge.shown)
-    assert (look.place, look.presence) == pytest.approx((prior(0.8), prior(0.8)), abs=1e-6)
-    assert look.place == large.probability
-    # A place that a closer look shows better is verified.
+    assert look.place == pytest.approx(verified(large, whole)[0], abs=1e-6)
+    assert look.presence == prior(0.8)
+    # A closer look at another place tells of the picture, too.
     small = judge.candidate
     closely = Detections(boxes[:, 1:] + 1, torch.tensor([[[0, 0.9, 0]]]), torch.ones(1, 1).bool())
-    before = prior.inverse.at_place(small.probability, prior(0.8))
-    verified, _ = closer_features(0.8, before, 0.3, closely, small.box, 1)
-    expected = Alike()(verified).sigmoid().tolist()
-    assert judge.examine(closely).presence == pytest.approx(prior(expected[1]), abs=1e-6)
+    look = judge.examine(closely)
+    assert (look.place, look.presence) == pytest.approx(verified(small, closely), abs=1e-6)
 
 
 @pytest.mark.parametrize(("rate", "passes"), [(0.0, 1), (2.5, 2)])
@@ -776,6 +781,6 @@ def test_an_object_that_fills_a_large_picture_needs_no_closer_look():
             assert judge.shown is None
             continue
         look = judge.examine(judge.shown)
-        assert (look.index, look.place, look.presence) == (0, pytest.approx(0.8, abs=1e-6), 0.8)
+        assert (look.index, look.presence) == (0, 0.8)
         judge.end()
         assert judge.candidate is None or judge.shown is None  # a small place takes a pass
