@@ -4,6 +4,9 @@ A rule is a function here, which `_rule` registers under its name. `semfov.belie
 name, and studies by `BeliefConfig.fusion` (`semfov.runs.config`), whose type lists the names. `SemanticSearch` and
 `SemanticMap` always fuse by Kaplan's rule. Policies that simulate looks (`semfov.gaze.acquisition.lookahead`, and
 `PredictedTargetPosterior`) do so by Kaplan's rule, too, whatever rule fuses the looks that are made.
+
+A rule takes no settings. One with a number needs a field of `BeliefConfig`, which `_make_semantic` of
+`semfov.runs.policy_looking` gives to `Semantic`.
 """
 
 import math

@@ -29,7 +29,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True, white: White
     The EXIF orientation is applied, so the image has the orientation that viewers show. Grey images get three equal
     channels, CMYK and YCbCr are converted to RGB, and transparent pixels are blended with white. Grey images of 16 bits
     keep their precision (TIFFs: without `white`). The first frame of an animation, or page of a TIFF, is read. Colour
-    profiles are not applied.
+    profiles (ICC) are not applied.
 
     Args:
         path: a file of JPEG, JPEG 2000, PNG, WebP, AVIF, TIFF, GIF, BMP or PPM, whatever its name, and of HEIF where

@@ -27,6 +27,8 @@ _LOOK_COSTS: dict[Task, float] = {"search": 0.05, "exploration": 0.01}  # cost o
 class GazeSettings:
     """What looks cost and bring, and what observations contain.
 
+    A new setting is also a keyword of the environments (`semfov.envs.environment`, `semfov.envs.vector`).
+
     Args:
         look_cost: cost of a look, subtracted from the reward; None takes the default of the task.
         find: reward for finding the target, or for a complete result.

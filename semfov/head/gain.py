@@ -134,8 +134,8 @@ class ExploreGain(LookGain):
     .. math:: G(h, f) = \sum_{x \text{ seen}} |x| \, E[\Delta \mid f](x) + u \sum_{x \text{ not}} |x| \, a(d_{h,f}(x))
 
     For cells that were seen before, the gain is that of `semfov.acquisition.ExpectedGain`. For the others it is u times
-    the acuity of the fovea there. After a turn of the head the eye lands on one of nine cells. All cells of a view are
-    valued where the head stays.
+    the acuity of the fovea there (`Views.acuity`). After a turn of the head the eye lands on one of nine cells. All
+    cells of a view are valued where the head stays.
 
     Args:
         views: the possible views and fixations.

@@ -226,6 +226,8 @@ class Views:
     def acuity(self, distance: Tensor) -> Tensor:
         """Compute the relative acuity of the fovea, 1 / (1 + d / σ).
 
+        It values cells that were never seen; those that were, `semfov.gaze.acquisition.closer_look.acuity` values.
+
         Args:
             distance: `(...)`, d; infinite for cells that were never seen.
 
