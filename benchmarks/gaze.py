@@ -51,7 +51,12 @@ class BareGaze:
     """
 
     def __init__(
-        self, path: str, detector: OnnxDetector, model: FixationDensity, size: tuple[int, int], threads: int
+        self,
+        path: str,
+        detector: OnnxDetector,
+        model: FixationDensity,
+        size: tuple[int, int],
+        threads: int,
     ) -> None:
         graph = onnx.load(path)
         named = landmarks(detector.session.steps(detector.input_size))

@@ -104,7 +104,13 @@ def strategies(classes: Sequence[str]) -> dict[str, Strategy]:
 
 
 def scanpath(
-    eye: Eye, view: View, grid: semfov.Grid, strategy: Strategy, fixations: int, seed: int, clock: Clock
+    eye: Eye,
+    view: View,
+    grid: semfov.Grid,
+    strategy: Strategy,
+    fixations: int,
+    seed: int,
+    clock: Clock,
 ) -> list[float]:
     """Milliseconds per fixation of each of `STAGES`, over one scanpath."""
     generator = torch.Generator().manual_seed(seed)

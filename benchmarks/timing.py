@@ -65,7 +65,11 @@ class Measured:
 
 
 def interleaved(
-    runs: Mapping[str, Run], seconds: float, clock: Clock = time.perf_counter, least: int = 5, times: int = 1
+    runs: Mapping[str, Run],
+    seconds: float,
+    clock: Clock = time.perf_counter,
+    least: int = 5,
+    times: int = 1,
 ) -> dict[str, list[float]]:
     """Time programs in turn; the first repetition is a warm-up and does not count.
 

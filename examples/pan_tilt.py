@@ -64,7 +64,13 @@ class SimulatedCamera(PanTiltCamera):
     interval = 1 / 15
 
     def __init__(
-        self, panorama: semfov.Panorama, *, delay: float = 0.3, noise: float = 0.5, reports: bool = True, seed: int = 0
+        self,
+        panorama: semfov.Panorama,
+        *,
+        delay: float = 0.3,
+        noise: float = 0.5,
+        reports: bool = True,
+        seed: int = 0,
     ) -> None:
         self.panorama = panorama
         self.delay = delay

@@ -49,7 +49,13 @@ def header(stamp: Any, frame: str) -> _Values:
 
 
 def detection_array(
-    detections: Detections, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
+    detections: Detections,
+    classes: Sequence[str],
+    *,
+    stamp: Any,
+    frame: str,
+    least: float = 0.1,
+    most: int = 5,
 ) -> _Values:
     """Make a `vision_msgs/Detection2DArray`: boxes in pixels, each with its most likely classes."""
     mask = detections.mask

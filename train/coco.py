@@ -63,7 +63,14 @@ def _download_coco(split: str, root: str | os.PathLike[str], *, address: str = _
 
 
 def _fetch_split(
-    split: str, root: Path, images: _Archive, annotations: _Archive, *, address: str, keep: bool, pause: float = 1.0
+    split: str,
+    root: Path,
+    images: _Archive,
+    annotations: _Archive,
+    *,
+    address: str,
+    keep: bool,
+    pause: float = 1.0,
 ) -> None:
     """`_download_coco` for any pair of archives; `pause` is in seconds before a failed transfer is tried again."""
     instances = f"annotations/instances_{split}.json"

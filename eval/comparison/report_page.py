@@ -67,7 +67,11 @@ def write_run_report(
 
 
 def _section(
-    title: str, label: str, policies: dict[str, Curve], others: Mapping[str, FloatArray], shifts: Sequence[int]
+    title: str,
+    label: str,
+    policies: dict[str, Curve],
+    others: Mapping[str, FloatArray],
+    shifts: Sequence[int],
 ) -> str:
     """Draw the curves of policies and of others, with a table of their values after some numbers of gaze shifts."""
     first = next(iter(policies.values()))

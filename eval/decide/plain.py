@@ -49,7 +49,13 @@ class PlainDecisions(NamedTuple):
 
 
 def plain_looks(
-    eye: Eye, image: Tensor, whole: Detections, target: int, grid: Grid, goal: Tensor, most: int = 2
+    eye: Eye,
+    image: Tensor,
+    whole: Detections,
+    target: int,
+    grid: Grid,
+    goal: Tensor,
+    most: int = 2,
 ) -> list[ResultRecord]:
     """Take closer looks at the best detections of the target that do not overlap by half.
 

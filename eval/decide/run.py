@@ -534,7 +534,12 @@ def _by_closer_looks(step: Step, verifier: Verifier[Step], close_up: LookAt) -> 
 
 
 def _search_steps(
-    looks: Looks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
+    looks: Looks,
+    strategy: Strategy,
+    target: int,
+    start: Tensor,
+    noise: Tensor,
+    rule: Callable[[Step], Tensor],
 ) -> list[Step]:
     """Run one search until it decides or all looks are spent.
 

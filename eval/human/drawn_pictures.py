@@ -43,7 +43,11 @@ def _words(rng: np.random.Generator, count: int) -> str:
 
 
 def _paragraph(
-    draw: ImageDraw.ImageDraw, rng: np.random.Generator, box: tuple[int, int, int, int], size: int, family: str
+    draw: ImageDraw.ImageDraw,
+    rng: np.random.Generator,
+    box: tuple[int, int, int, int],
+    size: int,
+    family: str,
 ) -> None:
     """Fill a box with lines of text."""
     left, top, right, bottom = box

@@ -39,7 +39,12 @@ _HEAD = ["", f"{_SHARP}: NSS", "bits", f"{_SEEN}: NSS", "bits", "sharp less seen
 
 
 def glimpsed(
-    name: str, source: MapSource, root: Path, store: FoldStore, folds: Sequence[Fold], pictures: Sequence[int]
+    name: str,
+    source: MapSource,
+    root: Path,
+    store: FoldStore,
+    folds: Sequence[Fold],
+    pictures: Sequence[int],
 ) -> dict[str, Tensor]:
     """Score a model on the sharp picture, and on what a fovea has seen so far, of held-out pictures of data set 1.
 
@@ -98,7 +103,11 @@ def views_of(image: Tensor, source: MapSource) -> tuple[FeatureMaps, Tensor]:
 
 
 def so_far(
-    model: FixationDensity, views: FeatureMaps, fixations: Tensor, size: tuple[int, int], events: Events
+    model: FixationDensity,
+    views: FeatureMaps,
+    fixations: Tensor,
+    size: tuple[int, int],
+    events: Events,
 ) -> Tensor:
     """Return the map of what was seen before each event, `(E, rows, columns)`."""
     with torch.inference_mode():

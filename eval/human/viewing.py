@@ -111,7 +111,12 @@ class _Compared:
     """
 
     def __init__(
-        self, config: ViewingConfig, name: str, source: MapSource, fit: GazeFit, fingerprint: Sequence[str]
+        self,
+        config: ViewingConfig,
+        name: str,
+        source: MapSource,
+        fit: GazeFit,
+        fingerprint: Sequence[str],
     ) -> None:
         self.config = config
         self.name = name

@@ -87,7 +87,13 @@ class ByteTrack:
 
 
 def _join(
-    tracks: list[_Track], rows: NDArray[np.intp], boxes: _Floats, scores: _Floats, least: float, *, fuses: bool
+    tracks: list[_Track],
+    rows: NDArray[np.intp],
+    boxes: _Floats,
+    scores: _Floats,
+    least: float,
+    *,
+    fuses: bool,
 ) -> tuple[list[_Track], NDArray[np.intp]]:
     """Join tracks to detections by overlap, and update them; returns the tracks and detections that are left."""
     if not tracks or not len(rows):

@@ -62,7 +62,12 @@ class Identities:
         self._moving = 0
 
     def step(
-        self, true_ids: Tensor, true_boxes: Tensor, ids: Tensor, boxes: Tensor, moving: Tensor | None = None
+        self,
+        true_ids: Tensor,
+        true_boxes: Tensor,
+        ids: Tensor,
+        boxes: Tensor,
+        moving: Tensor | None = None,
     ) -> None:
         """Take the next frame.
 

@@ -342,7 +342,13 @@ def _layout(columns: int, rows: int, extent: Tensor) -> _Layout:
 
 @constant
 def _layout_of_size(
-    columns: int, rows: int, width: float, height: float, exact: torch.dtype, dtype: torch.dtype, device: torch.device
+    columns: int,
+    rows: int,
+    width: float,
+    height: float,
+    exact: torch.dtype,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> _Layout:
     """Lay out the cells over an image of one size, with numbers of the dtype `exact`, then converted to `dtype`."""
     extent = torch.tensor([width, height], dtype=torch.promote_types(exact, torch.float32))

@@ -179,7 +179,13 @@ class _Calls:
         return pillow(scene.image), usual if task == "search" else _EVERY, usual, number + 1
 
     def look(
-        self, path: str | None, target: str, task: str, passes: float, prior: str = "", visitor: str = ""
+        self,
+        path: str | None,
+        target: str,
+        task: str,
+        passes: float,
+        prior: str = "",
+        visitor: str = "",
     ) -> tuple[str, str]:
         """Look at a picture; `stop` of the same visitor ends it.
 
@@ -424,7 +430,12 @@ def _connect_agent(page: "gradio.Blocks", calls: _Calls, panel: _Panel, views: _
     import gradio
 
     def look(
-        path: str | None, target: str, task: str, passes: float, prior: str, request: gradio.Request
+        path: str | None,
+        target: str,
+        task: str,
+        passes: float,
+        prior: str,
+        request: gradio.Request,
     ) -> tuple[object, str]:
         words, page_of_record = calls.look(path, target, task, passes, prior, request.session_hash)
         return gradio.update(value=words, visible=bool(words)), page_of_record

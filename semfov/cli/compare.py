@@ -90,7 +90,12 @@ def _ways(options: CompareOptions, agent: ActivePerception, labels: tuple[int, .
 
 
 def _look_at_all(
-    sources: Sequence[PictureSource], eye: WindowEye, ways: dict[str, Way], scores: Scores, *, quiet: bool
+    sources: Sequence[PictureSource],
+    eye: WindowEye,
+    ways: dict[str, Way],
+    scores: Scores,
+    *,
+    quiet: bool,
 ) -> int:
     """Look at all pictures in all ways; returns how many were skipped, each with its reason."""
     skipped = 0

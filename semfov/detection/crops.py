@@ -16,7 +16,12 @@ _BORDER = 2.0  # boxes that come this near to a border of their crop, in the det
 
 
 def merge_crops(
-    detections: Detections, windows: Tensor, crops: int, side: int, size: tuple[int, int], limit: int
+    detections: Detections,
+    windows: Tensor,
+    crops: int,
+    side: int,
+    size: tuple[int, int],
+    limit: int,
 ) -> Detections:
     """Merge the detections in the crops of each fixation.
 

@@ -63,7 +63,11 @@ def named_detections(
 
 
 def coco_results(
-    image_id: int | str, boxes: Tensor, labels: Tensor, scores: Tensor, ids: Mapping[int, int | str]
+    image_id: int | str,
+    boxes: Tensor,
+    labels: Tensor,
+    scores: Tensor,
+    ids: Mapping[int, int | str],
 ) -> list[CocoResult]:
     """Make COCO results of boxes.
 

@@ -76,7 +76,12 @@ def box_counts(canvas: Canvas) -> dict[int, CellBoxes]:
 
 @constant
 def cell_grid(
-    count: int, canvas: Canvas, strides: tuple[int, ...], offset: float, dtype: torch.dtype, device: torch.device
+    count: int,
+    canvas: Canvas,
+    strides: tuple[int, ...],
+    offset: float,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> Tensor:
     """List column, row and stride of every cell of all levels.
 

@@ -75,7 +75,12 @@ class _Surroundings(Generic[_Eye]):
     """
 
     def __init__(
-        self, pictures: Scenes, eye: _Eye, shifts: int, targets: _Targets, reopen: Callable[[], object]
+        self,
+        pictures: Scenes,
+        eye: _Eye,
+        shifts: int,
+        targets: _Targets,
+        reopen: Callable[[], object],
     ) -> None:
         names = eye.detector.classes
         check(pictures.classes == names, "scenes", "the classes of the detector", f"{len(pictures.classes)} others")

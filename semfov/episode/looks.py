@@ -95,7 +95,13 @@ class LiveLooks(Looks):
     """
 
     def __init__(
-        self, eye: Eye, view: View, grid: Grid, target: int | None = None, *, device: torch.device | None = None
+        self,
+        eye: Eye,
+        view: View,
+        grid: Grid,
+        target: int | None = None,
+        *,
+        device: torch.device | None = None,
     ) -> None:
         self.eye = eye
         self.view = view

@@ -75,7 +75,11 @@ def fitted_density(fit: GazeFit, groups: Sequence[Viewed], pictures: _Pictures, 
 
 
 def _fit_map(
-    model: FixationDensity, groups: Sequence[Viewed], pictures: _Pictures, fit: GazeFit, title: str = "map"
+    model: FixationDensity,
+    groups: Sequence[Viewed],
+    pictures: _Pictures,
+    fit: GazeFit,
+    title: str = "map",
 ) -> None:
     """Fit map and weight of the centre bias to fixations; each readout has its likelihood and reads random channels."""
     generator = torch.Generator().manual_seed(fit.seed)
@@ -229,7 +233,12 @@ def _events_on(events: Events, corner: tuple[int, int], size: tuple[int, int], g
 
 
 def _saccade_loss(
-    model: FixationDensity, maps: Tensor, centre: Tensor, events: Events, size: tuple[int, int], corner: tuple[int, int]
+    model: FixationDensity,
+    maps: Tensor,
+    centre: Tensor,
+    events: Events,
+    size: tuple[int, int],
+    corner: tuple[int, int],
 ) -> Tensor:
     """Average the negative log likelihood of events by all terms, on every second row and column of cells."""
     terms = {"map": _for_events(maps, events), "centre bias": centre[None]}

@@ -29,7 +29,11 @@ _CellsOfLook = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
 
 
 def fit_published(
-    eye: Eye | WindowEye, scenes: Scenes, statistics: DirichletStatistics, edges: Sequence[float], **options: Any
+    eye: Eye | WindowEye,
+    scenes: Scenes,
+    statistics: DirichletStatistics,
+    edges: Sequence[float],
+    **options: Any,
 ) -> FovealObservationModel:
     """Fit Dirichlet distributions to the scores of each class and level; those with few detections are shrunk.
 

@@ -162,7 +162,11 @@ def _classes_held(pictures: Scenes, classes: int) -> Tensor:
 
 
 def _look_at(
-    pictures: Scenes, looked: Sequence[int], eye: WindowEye, evidence: PhotographEvidence, config: FitMosaicsConfig
+    pictures: Scenes,
+    looked: Sequence[int],
+    eye: WindowEye,
+    evidence: PhotographEvidence,
+    config: FitMosaicsConfig,
 ) -> _PhotographLooks:
     """Look at the whole of photographs and at all their slices, and draw searches of them."""
     scores: list[Tensor] = []

@@ -135,7 +135,11 @@ def explorations_of_kinds(
 
 
 def _explore(
-    model: GlimpseEvidence, looks: StoredWindowLooks, annotation: Annotation, target: int | None, passes: int
+    model: GlimpseEvidence,
+    looks: StoredWindowLooks,
+    annotation: Annotation,
+    target: int | None,
+    passes: int,
 ) -> Exploration:
     """Explore a picture for all classes, or for a target."""
     window_looks: list[WindowLook] = []

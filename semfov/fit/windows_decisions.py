@@ -102,7 +102,11 @@ class MosaicSearch(TargetSearch[TargetFacts]):
 
 @torch.inference_mode()
 def search_pictures(
-    model: GlimpseEvidence, pictures: Scenes, opened: Sequence[StoredWindowLooks], config: FitMosaicsConfig, title: str
+    model: GlimpseEvidence,
+    pictures: Scenes,
+    opened: Sequence[StoredWindowLooks],
+    config: FitMosaicsConfig,
+    title: str,
 ) -> list[MosaicSearch]:
     """Search every picture for some present classes and for as many absent ones.
 

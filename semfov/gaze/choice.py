@@ -181,7 +181,13 @@ def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance
 
 
 def soft_fixation(
-    logits: Tensor, visited: Tensor, centres: Tensor, noise: Tensor, *, temperature: float = 1.0, hard: bool = True
+    logits: Tensor,
+    visited: Tensor,
+    centres: Tensor,
+    noise: Tensor,
+    *,
+    temperature: float = 1.0,
+    hard: bool = True,
 ) -> tuple[Tensor, Tensor]:
     r"""Draw a fixation by Gumbel-softmax over the cells not visited (Jang, Gu and Poole, 2017).
 

@@ -72,7 +72,11 @@ def corners_stay(cv2: ModuleType, first: GreyFrame, second: GreyFrame, most: flo
 
 
 def rival_between(
-    cv2: ModuleType, first: GreyFrame, second: GreyFrame, similarity: NDArray[np.float64], part: NDArray[np.uint8]
+    cv2: ModuleType,
+    first: GreyFrame,
+    second: GreyFrame,
+    similarity: NDArray[np.float64],
+    part: NDArray[np.uint8],
 ) -> NDArray[np.float64] | None:
     """Find the motion that corners have in common in a part of a frame that does not move as the rest does.
 

@@ -71,7 +71,12 @@ class FoveaLooks:
         return self._add((x, y), _whole_picture(self.grid), detections, stages, value, cell, is_closer=False)
 
     def look_closely(
-        self, cell: int, region: Sequence[float], detections: Detections, stages: Mapping[str, float], value: float
+        self,
+        cell: int,
+        region: Sequence[float],
+        detections: Detections,
+        stages: Mapping[str, float],
+        value: float,
     ) -> FoveaLook:
         """Add a closer look, after which the belief is what it was before.
 
@@ -124,7 +129,12 @@ def _whole_picture(grid: Grid) -> Box:
 
 
 def moment_look(
-    grid: Grid, number: int, cell: int, detections: Detections, probability: Tensor, stages: Mapping[str, float]
+    grid: Grid,
+    number: int,
+    cell: int,
+    detections: Detections,
+    probability: Tensor,
+    stages: Mapping[str, float],
 ) -> FoveaLook:
     """Make the complete look at a frame of a stream, the only one of its moment.
 

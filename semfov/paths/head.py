@@ -127,7 +127,13 @@ class HeadLook(RecordedLook):
 
 
 def head_look(
-    views: Views, action: int, in_view: Detections, map_after: Tensor, number: int, seconds: float, value: float
+    views: Views,
+    action: int,
+    in_view: Detections,
+    map_after: Tensor,
+    number: int,
+    seconds: float,
+    value: float,
 ) -> HeadLook:
     """Make the complete look of a head; its region is the smallest box around what it shows.
 

@@ -111,7 +111,12 @@ class Trace:
         return self._fovea.fixate(number, fixation[0].tolist(), detections, stages, value, probability, presence)
 
     def look_closely(
-        self, cell: int, region: Sequence[float], detections: Detections, stages: Mapping[str, float], value: float
+        self,
+        cell: int,
+        region: Sequence[float],
+        detections: Detections,
+        stages: Mapping[str, float],
+        value: float,
     ) -> FoveaLook:
         """Add a closer look (`FoveaLooks.look_closely`)."""
         return self._fovea.look_closely(cell, region, detections, stages, value)

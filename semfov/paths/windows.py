@@ -217,7 +217,11 @@ class LookAtWindow(RecordedLook):
 
 
 def look_at_window(
-    shown: WindowLook, lattice: Lattice, number: int, seconds: float | None = None, value: float = math.inf
+    shown: WindowLook,
+    lattice: Lattice,
+    number: int,
+    seconds: float | None = None,
+    value: float = math.inf,
 ) -> LookAtWindow:
     """Make the complete look at a window.
 

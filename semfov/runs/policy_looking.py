@@ -122,7 +122,12 @@ def _belief_settings(policy: PolicyConfig) -> PolicyConfig:
 
 
 def _make_strategy(
-    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, model: Callable[[str], Any], fovea: float
+    policy: PolicyConfig,
+    task: Task,
+    belief: BeliefConfig,
+    components: int,
+    model: Callable[[str], Any],
+    fovea: float,
 ) -> Strategy:
     """Build the observer and the policy that settings describe.
 

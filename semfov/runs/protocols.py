@@ -44,7 +44,12 @@ _Outcome = tuple[list[int], int]
 
 
 def episodes_of(
-    scenes: Scenes, index: int, columns: int, rows: int, protocol: ProtocolConfig, targets: Sequence[int] | None = None
+    scenes: Scenes,
+    index: int,
+    columns: int,
+    rows: int,
+    protocol: ProtocolConfig,
+    targets: Sequence[int] | None = None,
 ) -> list[Trial]:
     """Draw all searches of one scene: `starts` for every target, from cells that no object of it overlaps.
 
@@ -222,7 +227,13 @@ def choose_searches(
 
 
 def run_episodes(
-    episodes: Sequence[Trial], strategy: Strategy, looks: StoredLooks, noise: Tensor, *, shifts: int, batch: int
+    episodes: Sequence[Trial],
+    strategy: Strategy,
+    looks: StoredLooks,
+    noise: Tensor,
+    *,
+    shifts: int,
+    batch: int,
 ) -> list[_Outcome]:
     """Run searches of one scene, each until its target is found or its shifts are spent.
 

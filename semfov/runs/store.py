@@ -122,7 +122,11 @@ class DetectionStore(SceneStore):
 
 
 def cell_store(
-    folder: Path, settings: Mapping[str, object], columns: int, rows: int, components: int | None = None
+    folder: Path,
+    settings: Mapping[str, object],
+    columns: int,
+    rows: int,
+    components: int | None = None,
 ) -> DetectionStore:
     """Open a store of looks from the cells of a grid, and of closer looks."""
     # The cell centres in a picture of odd size identify the way in which a grid is laid out.
@@ -180,7 +184,11 @@ class RememberedLooks(Generic[_Action, _StoredLook]):
 
 
 def look_everywhere(
-    eye: Eye, image: Callable[[], Tensor], grid: Grid, store: DetectionStore | None, digest: Callable[[], str]
+    eye: Eye,
+    image: Callable[[], Tensor],
+    grid: Grid,
+    store: DetectionStore | None,
+    digest: Callable[[], str],
 ) -> Detections:
     """Detect from every cell of a photograph `(1, 3, H, W)`, read from a store, or computed and stored."""
     looks = RememberedLooks(lambda: photograph_looks(eye, image, grid), store, digest)

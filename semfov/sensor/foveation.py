@@ -211,7 +211,11 @@ def _foveate_in_blocks(images: Tensor | Bands, fovea: Fovea, levels: int, conven
 
 
 def _foveate_block(
-    images: Tensor | Bands, fovea: Fovea, levels: int, convention: Convention, into: Tensor | None = None
+    images: Tensor | Bands,
+    fovea: Fovea,
+    levels: int,
+    convention: Convention,
+    into: Tensor | None = None,
 ) -> Tensor:
     """Foveate images on a CPU at once, by the faster one of two ways; arguments and result as of `_foveate_large`."""
     if isinstance(images, Tensor) and fovea.count[1] == 1 and min(images.shape[-2:]) >= _LARGE:

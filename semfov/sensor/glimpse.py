@@ -21,7 +21,12 @@ _Length = TypeVar("_Length", float, Tensor)
 
 
 def glimpse(
-    image: Tensor, boxes: Tensor, size: tuple[int, int], *, padding_mode: _Padding = "zeros", fill_value: float = 0.0
+    image: Tensor,
+    boxes: Tensor,
+    size: tuple[int, int],
+    *,
+    padding_mode: _Padding = "zeros",
+    fill_value: float = 0.0,
 ) -> Tensor:
     r"""Resample windows of an image to one size.
 

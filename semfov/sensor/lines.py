@@ -136,7 +136,13 @@ class Lines:
 
 
 def banded(
-    taps: Taps, count: int, tile: int, shift: int, reach: int, dtype: torch.dtype, device: torch.device
+    taps: Taps,
+    count: int,
+    tile: int,
+    shift: int,
+    reach: int,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> Lines:
     """Make the matrix of a filter.
 
@@ -243,7 +249,12 @@ def _filter_planes(planes: Tensor, down: Lines, across: Lines) -> Tensor:
 
 
 def difference(
-    planes: Tensor, others: Tensor, down: Lines, across: Lines, weights: tuple[Tensor, Tensor], result: Tensor
+    planes: Tensor,
+    others: Tensor,
+    down: Lines,
+    across: Lines,
+    weights: tuple[Tensor, Tensor],
+    result: Tensor,
 ) -> None:
     """Filter planes of one image, minus those of another times the weights of rows and of columns.
 
@@ -341,7 +352,11 @@ def _passes(
 
 
 def _products(
-    lines: Lines, number: int, width: int, source: tuple[int, int, int], target: tuple[int, int, int]
+    lines: Lines,
+    number: int,
+    width: int,
+    source: tuple[int, int, int],
+    target: tuple[int, int, int],
 ) -> list[_Product]:
     """List the products that filter the columns of planes.
 

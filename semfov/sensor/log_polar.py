@@ -70,7 +70,12 @@ class _Retina:
 
 
 def log_polar(
-    image: Tensor | _Levels, gaze: Tensor, *, fovea: float, spacing: float = 1.0, pooling: float = 1.0
+    image: Tensor | _Levels,
+    gaze: Tensor,
+    *,
+    fovea: float,
+    spacing: float = 1.0,
+    pooling: float = 1.0,
 ) -> Tensor:
     r"""Compute cortical images: the responses of receptors on rings around a fixation.
 

@@ -262,7 +262,11 @@ def _reducing(
 
 @constant
 def expanding(
-    before: tuple[int, int], after: tuple[int, int], convention: Convention, dtype: torch.dtype, device: torch.device
+    before: tuple[int, int],
+    after: tuple[int, int],
+    convention: Convention,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> tuple[Lines, Lines]:
     """Make the matrices of `pyrup` for the columns and the rows of an image.
 

@@ -144,7 +144,12 @@ def _write_gif(frames: Sequence[_Frame], file: BinaryIO, seconds: float, hold: f
 
 
 def write_webp(
-    frames: Sequence[PillowImage], file: BinaryIO, seconds: Sequence[float], quality: int, *, effort: int = 4
+    frames: Sequence[PillowImage],
+    file: BinaryIO,
+    seconds: Sequence[float],
+    quality: int,
+    *,
+    effort: int = 4,
 ) -> None:
     """Write frames as an animated WebP that repeats.
 

@@ -215,7 +215,12 @@ def draw_look(
 
 
 def draw_tags(
-    axes: Axes, tags: Sequence[Tag], frame: tuple[float, float], obstacles: Sequence[LabelBox], *, many: bool = False
+    axes: Axes,
+    tags: Sequence[Tag],
+    frame: tuple[float, float],
+    obstacles: Sequence[LabelBox],
+    *,
+    many: bool = False,
 ) -> list[Artist]:
     """Write the labels of boxes, so that none covers another.
 

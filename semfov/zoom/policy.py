@@ -47,7 +47,12 @@ def best_find(
 
 
 def _better(
-    best: WindowChoice | None, values: Cells, level: int, lattice: Lattice, done: set[Window], beside: Window | None
+    best: WindowChoice | None,
+    values: Cells,
+    level: int,
+    lattice: Lattice,
+    done: set[Window],
+    beside: Window | None,
 ) -> WindowChoice | None:
     """Choose the better of a choice and the best window of a level that was not looked at; values `(down, across)`."""
     if beside is not None:

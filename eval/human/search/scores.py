@@ -91,7 +91,13 @@ class People:
     """
 
     def __init__(
-        self, searches: Sequence[Fixations], grid: Grid, *, longest: int, bandwidth: float, bootstrap: int
+        self,
+        searches: Sequence[Fixations],
+        grid: Grid,
+        *,
+        longest: int,
+        bandwidth: float,
+        bootstrap: int,
     ) -> None:
         self.searches = list(searches)
         self.grid = grid

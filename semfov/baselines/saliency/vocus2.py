@@ -26,7 +26,11 @@ class _Twin(NamedTuple):
 
 
 def _twin_pyramids(
-    channels: Tensor, centre_sigma: float = 2.0, surround_sigma: float = 6.0, layers: int = 5, scales: int = 2
+    channels: Tensor,
+    centre_sigma: float = 2.0,
+    surround_sigma: float = 6.0,
+    layers: int = 5,
+    scales: int = 2,
 ) -> list[list[_Twin]]:
     r"""Compute centre and surround pyramids (Frintrop, Werner and Martin García, 2015, section 3.2).
 
@@ -209,7 +213,12 @@ class VOCUS2(nn.Module):
 
 
 def _check_settings(
-    centre_sigma: float, surround_sigma: float, layers: int, scales: int, fusion: str, color_space: str
+    centre_sigma: float,
+    surround_sigma: float,
+    layers: int,
+    scales: int,
+    fusion: str,
+    color_space: str,
 ) -> None:
     """Raise `InputError` unless the settings of `vocus2_saliency` are in their range."""
     check(centre_sigma > 0, "centre_sigma", "a positive number of pixels", centre_sigma)

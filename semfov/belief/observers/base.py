@@ -178,7 +178,12 @@ class Observer(nn.Module, ABC):
         )
 
     def forward(
-        self, belief: Belief, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None
+        self,
+        belief: Belief,
+        detections: Detections,
+        fixation: Tensor,
+        grid: Grid,
+        target: int | None = None,
     ) -> Belief:
         """Weigh looks and update the belief with them.
 
