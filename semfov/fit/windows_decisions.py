@@ -85,12 +85,16 @@ class MosaicSearch(TargetSearch[TargetFacts]):
 
     def look(self, index: int, number: int) -> TargetFacts:
         after = self.known[index]
-        presence = self.model.anywhere(torch.tensor(after.best), after.case).sigmoid()
+        best = torch.tensor(after.best)
+        whole = self.known[0].look.show[self.target - 1]
+        presence = self.model.presence(best, after.case, whole, torch.tensor(self.target)).sigmoid()
         return TargetFacts(after.look.detections, number, float(presence), after.best, after.hit_chance)
 
     def candidates(self) -> CandidateBoxes:
         assert self.model.thresholds is not None
-        return CandidateBoxes(self.target, self.model.thresholds.confirm, self.source.lattice)
+        places = CandidateBoxes(self.target, self.model.thresholds.confirm, self.source.lattice)
+        places.keep_whole(0, self.known[0].look.detections)
+        return places
 
     def close_up(self, box: Tensor) -> Detections:
         return look_closely(self.source, box).detections

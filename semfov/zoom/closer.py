@@ -128,8 +128,9 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     same look says nothing new of it.
 
     Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
-    that of the whole, unless other frames have passed since. `_scored` has the boxes of the target that looks have
-    shown, where they lie in the present frame, and `_looks` the time of each of these looks, with its number of boxes.
+    that of the whole, unless other frames or a motion of the camera have followed. `_scored` has the boxes of the
+    target that looks have shown, where they lie in the present frame, and `_looks` the time of each of these looks,
+    with its number of boxes.
 
     Invariant: `_scored` has the boxes of `_looks`, in their order. `_most_evident`, once it was computed, is that of
     `_scored`, the examined places and the present time. What changes one of these calls `_change`.
@@ -165,8 +166,6 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         self._next = look.next_index
         self.detections = look.detections
         self.presence = self.prior(look.presence)
-        if look.next_index == 1:
-            self._shown[Window.overview(self._lattice)] = _ShownWindow(0, look.detections)
         scores = look.detections.scores[0, :, self.target]
         of_target = look.detections.mask[0] & (scores >= self.least)
         if bool(of_target.any()):
@@ -175,17 +174,27 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
             self._looks.append((self._now, len(boxes)))
             self._scored = self._scored.joined(_Scored(boxes, scores[of_target], in_view))
 
+    def keep_whole(self, number: int, detections: Detections) -> None:
+        """Keep what the look at the whole of the present frame shows: no closer look at what fills it is needed.
+
+        Args:
+            number: number of the look in the path, from 0.
+            detections: what it shows, a batch of one.
+        """
+        self._shown[Window.overview(self._lattice)] = _ShownWindow(number, detections)
+
     def shown_at(self, candidate: CandidatePlace) -> Detections | None:
         """Find what the look at the window of a place showed; None where there was none."""
         look = self._shown.get(self._showing(candidate))
         return None if look is None else look.detections
 
     def shows_nothing_new(self, candidate: CandidatePlace) -> bool:
-        """Tell whether the look at the whole shows a candidate as closely as any look."""
-        return self._showing(candidate) == Window.overview(self._lattice)
+        """Tell whether the look at the whole of this frame, which is kept, shows a candidate as closely as any look."""
+        window = self._showing(candidate)
+        return window == Window.overview(self._lattice) and window in self._shown
 
     def _showing(self, candidate: CandidatePlace) -> Window:
-        """Choose the window of a closer look at a place, or the whole photograph where it shows no more."""
+        """Choose the window of a closer look at a place, or the whole picture where it shows no more."""
         window = closer_window(self._lattice, candidate.box, self._window)
         x1, y1, x2, y2 = window.region(self._lattice)
         if (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size):
@@ -255,6 +264,7 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     def follow(self, camera: CameraStep, size: tuple[int, int]) -> None:
         """Carry the boxes of the target along, too."""
         self._change()
+        self._shown.clear()
         super().follow(camera, size)
         scenes = self._lost_boxes.follow(
             [self._scored], camera, lambda scenes, motion: [boxes.moved(motion, size) for boxes in scenes]
@@ -317,7 +327,7 @@ class PhotographPlaces(CandidateBoxes):
     def see(self, look: TargetFacts) -> None:
         """Take in a look at the whole photograph."""
         super().see(look)
-        self._shown[Window.overview(self._lattice)] = _ShownWindow(look.next_index - 1, look.detections)
+        self.keep_whole(look.next_index - 1, look.detections)
 
     @property
     def hit_chance(self) -> float:
@@ -342,7 +352,7 @@ class PhotographPlaces(CandidateBoxes):
         return Detections(detections.boxes, detections.scores, others, detections.confidence * others)
 
     def _forget_windows(self) -> None:
-        # The look at the whole is made anew in each frame.
+        """Forget what closer looks at earlier frames showed; the look at the whole is made anew in each frame."""
         if self.forgetting.rate:
             self._shown = {window: shown for window, shown in self._shown.items() if window.within is None}
 

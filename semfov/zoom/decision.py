@@ -144,8 +144,17 @@ class SearchFacts:
         photograph = self.belief.photograph
         if photograph is not None:
             return float(photograph.presence(best, target).sigmoid())
-        whole = torch.tensor(self.looks[0].score)
-        return float(self.belief.evidence.presence(best, self.case(hit_chance), whole, target).sigmoid())
+        case = self.case(hit_chance)
+        evidence = self.belief.evidence
+        whole = self._score_of_whole
+        if whole is None:
+            return float(evidence.anywhere(best, case).sigmoid())
+        return float(evidence.presence(best, case, torch.tensor(whole), target).sigmoid())
+
+    @property
+    def _score_of_whole(self) -> float | None:
+        """Highest score of the target in the look at the whole; None where a stream's camera has left it behind."""
+        return next((facts.score for facts in self.looks if facts.look.window.level == 0), None)
 
 
 CLOSER = 100  # largest number of closer looks in a large picture: as many as there are passes for
@@ -299,11 +308,19 @@ class DecisionsByPresence(WindowDecisions):
 class DecisionsByCloserLooks(DecisionsByPresence):
     """Decisions of a search by closer looks at the places that seem to hold the target (`semfov.decision.Verifier`)."""
 
-    def __init__(self, belief: ZoomBelief, prior: Prior, verifier: Verifier[TargetFacts]) -> None:
+    def __init__(
+        self, belief: ZoomBelief, prior: Prior, verifier: Verifier[TargetFacts], places: CandidateBoxes
+    ) -> None:
         super().__init__(belief, verifier.thresholds, prior)
         self.frame = belief.lattice.size
         self.verifier = verifier
+        self.places = places  # those of the verifier
         self.criterion = verifier.criterion
+
+    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
+        if step.look.window.is_overview:
+            self.places.keep_whole(number - 1, step.look.candidates)
+        super().see(step, number, room)
 
     def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""
@@ -391,13 +408,13 @@ def decisions_of(
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
     thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.stop_below)
     verifier = Verifier(verification, places, thresholds_of_places, most)
-    return DecisionsByCloserLooks(belief, prior, verifier)
+    return DecisionsByCloserLooks(belief, prior, verifier, places)
 
 
 def _prior_of(prior: PriorLike, photograph: PhotographEvidence | None, target: int) -> Prior:
     """Compare the share that was given with that of the fit, which for large pictures is one half."""
     if photograph is None:
-        # `GlimpseEvidence.anywhere` does not know the class, so that all classes have the mean share.
+        # `GlimpseEvidence.presence` takes a target in half of the searches, for all classes.
         return Prior.of(prior, EVEN)
     shares = photograph.shares
     return Prior.of(prior, None if shares is None else float(shares[target - 1]))

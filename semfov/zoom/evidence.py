@@ -1,7 +1,8 @@
 r"""Learned evidence by magnification: predictions from a look at a window of what closer looks at its parts find.
 
 - `rates` gives λ(x), the expected number of new objects of a class in each cell x, from maps of the hints around it.
-- `anywhere` gives the log odds that the picture holds a class, from the highest score and facts about the search.
+- `anywhere` gives the log odds that the picture holds a class, from the highest score and facts about the search, and
+  `presence` adds those of a photograph.
 """
 
 import math
@@ -128,6 +129,8 @@ class GlimpseEvidence(DecidingModule, Pretrained):
       corrected by further facts about the search, its case c (`semfov.zoom.decision`):
 
       .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
+
+      With evidence for photographs the odds are the mean of these and of those of a photograph (`presence`).
 
     Here λ and j are networks. Another network predicts how many objects of any class a look finds (`survey`). Two
     logistic regressions give the probabilities after a closer look at a place that seems to hold t (`verification`).

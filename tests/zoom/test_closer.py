@@ -769,18 +769,33 @@ def test_with_poses_of_a_still_camera_a_search_is_the_same_to_the_bit(detector, 
 
 
 def test_an_object_that_fills_a_large_picture_needs_no_closer_look():
-    """The look at the whole shows it as closely; in a stream a later frame shows other pixels."""
+    """The look at the whole shows it as closely; a later frame, and one that the camera has moved to, show others."""
     boxes = torch.tensor([[[10.0, 10, 1000, 750], [60.0, 60, 90, 90]]])
-    whole = Detections(boxes, torch.tensor([[[0, 0.9, 0], [0, 0.5, 0]]]), torch.ones(1, 2).bool())
-    for rate in (0.0, 2.5):
-        judge = Verifier(Alike(), CandidateBoxes(1, 0.6, LATTICE, Forgetting(rate)), Thresholds(0.5, 1e-4), most=9)
-        judge.see(TargetFacts(whole, 1, 0.8, 0.9, 0.3))
-        assert judge.shown is whole
-        if rate:
-            judge.wait()
-            assert judge.shown is None
-            continue
-        look = judge.examine(judge.shown)
-        assert (look.index, look.presence) == (0, 0.8)
-        judge.end()
-        assert judge.candidate is None or judge.shown is None  # a small place takes a pass
+    whole = Detections(boxes, torch.tensor([[[0, 0.9, 0], [0, 0.89, 0]]]), torch.ones(1, 2).bool())
+
+    def search(rate):
+        places = CandidateBoxes(1, 0.6, LATTICE, Forgetting(rate))
+        judge = Verifier(Alike(), places, Thresholds(0.999, 1e-4), most=9)
+        places.keep_whole(0, whole)
+        judge.see(TargetFacts(whole, 3, 0.8, 0.9, 0.3))
+        return judge, places
+
+    judge, places = search(0.0)
+    assert judge.shown is whole
+    look = judge.examine(judge.shown)
+    assert (look.index, look.presence) == (0, 0.8)
+    # A small place takes a pass.
+    assert judge.candidate.box.tolist() == boxes[0, 1].tolist()
+    assert judge.shown is None
+    assert not places.shows_nothing_new(judge.candidate)
+
+    judge, places = search(2.5)
+    assert judge.shown is whole
+    judge.wait()
+    assert judge.shown is None
+    assert not places.shows_nothing_new(judge.candidate)
+
+    judge, places = search(0.0)
+    judge.follow(CameraStep(Motion.similarity(shift=(5, 0))), LATTICE.size)
+    assert judge.shown is None
+    assert not places.shows_nothing_new(judge.candidate)
