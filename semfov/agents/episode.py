@@ -69,6 +69,7 @@ class EpisodeLimits:
             passes: number of passes of the detector so far.
             record: makes the record so far, for the caller's function.
         """
+        # First, so that it gets every look; False alone stops, as many functions return None.
         if self.on_look is not None and self.on_look(record()) is False:
             return "stopped"
         if self.passes is not None and passes >= self.passes:
@@ -262,6 +263,7 @@ class StreamEpisode(Episode[_Moment_co]):
     def _keep(self, moment: _Moment_co) -> None:  # type: ignore[misc]
         """Make a moment the present one; kept for longer, it holds the reduced frame alone."""
         self._moment = moment
+        # Weakly, so that moments which nobody keeps are freed.
         self._latest.append(ref(moment))
         # While a frame is looked at, a loop over frames still has the moment of the one before, and drops it then.
         if len(self._latest) > _UNREDUCED:

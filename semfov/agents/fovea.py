@@ -18,6 +18,7 @@ from semfov.paths import GazePrediction, Scanpath
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
 
 _MIN_GAIN = 0.1  # default for the least gain of a look, in cells that are classified correctly
+# It is 0.1 a frame at 25 frames a second, chosen on ten photographs of the fit.
 RATE = 2.5  # default rate at which the belief fades in a stream, per second
 _CONFIRM = 0.5  # default for the score of a detection that ends a search without thresholds
 
@@ -61,6 +62,7 @@ class FoveaAgent(GazeParts):
             start=settings.start,
             shifts=_shifts(settings.shifts, 30, limits),
             seed=settings.seed,
+            # By the protocol of the paper a search ends at a box of the target, without closer looks.
             decisions=settings if settings.boxes is None else replace(settings, closer=0),
             cells=cells,
         )

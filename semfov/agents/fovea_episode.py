@@ -323,6 +323,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
         step = self._gaze.step
         assert step is not None
         criterion = self._gaze.criterion
+        # Who stops an episode, or has no time left, does not wait for further looks.
         room = self.limits.room(self.passes) if limit in (None, "passes") else 0
         criterion.end_search()
         while criterion.candidate is not None and room > 0:

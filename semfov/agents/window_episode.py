@@ -50,6 +50,7 @@ from semfov.zoom.slices import ranked, usual_slices
 from semfov.zoom.window_sums import Cells
 
 PASSES = 24  # default for the largest number of passes of the detector
+# From 0.2 on half of a stream's list would be wrong where people are few (docs/measurements/stream.md).
 LIKELY = 0.5  # default for the least probability of the objects that a record counts
 NEW_OBJECTS = 0.01  # default for the least number of new objects that a look must be expected to find
 
@@ -147,6 +148,7 @@ class WindowSession:
         source = self.source
         evidence = task.evidence
         target = task.goal.target if task.goal.searches else None
+        # Sought once, so not in a stream, whose frames change.
         if isinstance(source, LiveWindowLooks) and self._stands_still and source.lattice.levels > 1:
             source.blank = cache(partial(blank_cells, source.view.picture, source.lattice))
         if target is not None and evidence is None:

@@ -93,6 +93,7 @@ def seen_by(look: KeptLook, lattice: Lattice, sought: Sequence[int]) -> Seen:
         The boxes, each with its best class.
     """
     detected = detected_boxes([look.original], sought, shares=False)
+    # No track can begin at a box that is not finite.
     detected = detected.of((detected.scores >= FAINTEST) & detected.boxes.isfinite().all(-1))
     window = look.original.window
     magnification = window.fixation[2]
@@ -128,6 +129,7 @@ def without_replaced(looks: Sequence[WindowLook], lattice: Lattice) -> list[Wind
     counts = [look.detections.boxes.shape[1] for look in looks]
     ends = np.cumsum(counts)
     boxes = torch.cat([look.detections.boxes[0] for look in looks])
+    # Only well inside: on a still picture people near the border of a later window were dropped.
     low, high = _surroundings(boxes, lattice.size)
     is_kept = torch.cat([look.detections.mask[0] for look in looks]).numpy()
     magnifications = np.array([look.window.fixation[2] for look in looks])

@@ -271,6 +271,7 @@ def _fuse_everywhere(beta: Tensor, scaled: Tensor, footprint: Tensor, update: _R
         if weight.is_floating_point():
             likelihood = likelihood.pow(weight.to(scaled))
         beta = torch.where(weight > 0, update(beta, likelihood), beta)
+    # Without detections it is the tensor that was given, which the caller may change.
     return beta.clone()
 
 

@@ -223,6 +223,7 @@ class Grid:
         if rule == "centre":
             inside = self._in_cells(sides.holds_middle(), torch.logical_and)
             covered = inside | (covered & ~inside.any(-1, keepdim=True))
+        # A box without area has a centre, too, which lies in a cell.
         has_area = self._in_cells(sides.upper > sides.lower, torch.logical_and)
         return covered & has_area
 
@@ -351,6 +352,7 @@ def _layout_of_size(
     device: torch.device,
 ) -> _Layout:
     """Lay out the cells over an image of one size, with numbers of the dtype `exact`, then converted to `dtype`."""
+    # Half precision cannot hold every number of pixels above 2048.
     extent = torch.tensor([width, height], dtype=torch.promote_types(exact, torch.float32))
     return _layout(columns, rows, extent).to(dtype, device)
 

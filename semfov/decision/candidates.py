@@ -142,6 +142,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         covered = torch.zeros(0).bool()
         if self.grid is not None:
             covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
+            # A small box may cover not even its own cell by that much.
             covered[candidate.cell] = True
         self._examined.append(ExaminedPlace(self._now, boxes, covered))
 
@@ -192,6 +193,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Let seconds pass, and forget looks and examined places of which less than half the evidence is left."""
         self._now += passed
         oldest = self._now - self.forgetting.span
+        # With rate 0 none is too old, and their number would grow without end.
         self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= oldest]
         self._examined = [place for place in self._examined if place.time >= oldest]
         self._places = [place for place in self._places if place.time >= oldest]

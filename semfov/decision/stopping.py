@@ -99,6 +99,7 @@ class _ByBelief(StoppingCriterion):
         self._now = 0.0  # seconds of the stream
         self._step: Step | None = None
         # The detections of the looks that count, each with its time.
+        # With rate 0 none is ever too old, so their number has a limit, too.
         self._recent: deque[tuple[float, Detections]] = deque(maxlen=_MOST_RECENT if forgetting else None)
 
     def see(self, step: Step) -> None:

@@ -99,6 +99,7 @@ class Verifier(Generic[LookType]):
         self._judged = None
         self.places.wait(passed)
         self.verdicts = self._aged(self.verdicts, passed)
+        # Time passes for a lost scene, too, so that old verdicts do not come back with it.
         if self._lost.things is not None:
             self._lost.things = self._aged(self._lost.things, passed)
 
@@ -167,6 +168,7 @@ class Verifier(Generic[LookType]):
         assert candidate is not None
         features, box = self.places.examine(candidate, detections)
         place, presence = self._verified(features)
+        # The look that told of the picture before would count twice.
         if self.places.shows_nothing_new(candidate):
             presence = self.places.presence
         look = self.places.record(box, place, presence)

@@ -197,5 +197,6 @@ def _correlations(
     covariance = count * ab - a * b
     spread = np.sqrt(variance_a) * np.sqrt(variance_b)
     correlation = np.divide(covariance, spread, out=np.zeros_like(spread), where=spread > 0)
+    # Both sides are n times a standard deviation.
     has_texture = np.sqrt(np.maximum(variance_a, variance_b)) >= _TEXTURE * count
     return has_texture, correlation

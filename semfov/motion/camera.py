@@ -186,6 +186,7 @@ class CameraMotion:
         if last is None or self._key is None:
             self._begin_at(present)
             return CameraStep(None)
+        # Kept now, as a doubted motion replaces the key frame.
         before = _LostFrame(self._key, self._key_to_last)
         motion = self._since_last(self._key, last, present)
         if motion is None and self._lost is None:
@@ -255,11 +256,13 @@ class CameraMotion:
             is_believed = is_believed and is_still and self._repeats_in_place(last, present, has_stood=has_stood)
         if not is_believed:
             self._begin_at(present)
+            # A doubted motion may be believed once it goes on, which is told by this one.
             if self._course is None:
                 self._course = since_last.similarity
             return None
         self._course = since_last.similarity
         if is_still:
+            # The motion to the last frame stays as it was: noise of a camera that stands would add up.
             self._key = key
             self._stands_still = True
             return Motion.still()

@@ -93,6 +93,7 @@ def rival_between(
     corners = second.corners_in(part)
     if len(corners) < _RIVALS:
         return None
+    # Backwards, since the part is one of the second frame.
     after, before = _followed(cv2, corners, second, first, _STILL, _PYRAMID)
     if len(after) < _RIVALS:
         return None

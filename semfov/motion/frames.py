@@ -76,10 +76,12 @@ class GreyFrame:
         """
         cv2 = self._cv2
         height, width = self.grey.shape
+        # The correlation is circular: zeros keep shifts of up to a quarter from meeting the other side.
         rows = cv2.getOptimalDFTSize(height + height // 4)
         columns = cv2.getOptimalDFTSize(width + width // 4)
         padded = np.zeros((rows, columns), np.float32)
         padded[:height, :width] = self.contrast
+        # With another mean than 0 a frame would be like itself after any shift.
         padded[:height, :width] -= padded[:height, :width].mean()
         # Spectra of real numbers are symmetric, so that half of them is enough.
         spectrum = cv2.dft(padded, nonzeroRows=height)

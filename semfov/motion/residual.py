@@ -135,6 +135,7 @@ class _Parts(NamedTuple):
             return None
         moved = cv2.warpAffine(first.grey, similarity, (width, height), flags=cv2.INTER_LINEAR)
         shown = cv2.warpAffine(np.full_like(first.grey, 255), similarity, (width, height), flags=cv2.INTER_NEAREST)
+        # A frame that was moved ends in black, and its border there would be a slope of its own.
         shown = cv2.erode(cv2.resize(shown, size, interpolation=cv2.INTER_AREA), np.ones((_BORDER, _BORDER))) == 255
         a, b = (_flattened(cv2, grey, size) for grey in (moved, second.grey))
         down, across = np.gradient((a + b) / 2)

@@ -27,6 +27,7 @@ def cheapest_pairs(costs: NDArray[np.float64]) -> NDArray[np.intp]:
     kept_columns = np.flatnonzero(are_better.any(0))
     if not len(kept_rows):
         return np.zeros((0, 2), np.intp)
+    # Being alone costs 0, so that no pair has to cost more; those at 0 are not made in the end.
     possible = np.minimum(costs[kept_rows[:, None], kept_columns], 0.0)
     cheapest = possible.argmin(1)
     if len(set(cheapest.tolist())) == len(cheapest):  # each row can have its best: no sum is lower

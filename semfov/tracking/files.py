@@ -26,6 +26,7 @@ _NUMBERS = {"track_ids": 1, "labels": 1, "passes": 0}  # whole numbers, and the 
 
 TRACK_FIELDS: dict[str, Field] = {
     **{
+        # A trail is NaN where its object was not known yet.
         _PREFIX + name: Field(("T", *shape), dtype=torch.float64, finite=name != "trail", optional=True)
         for name, shape in {**_KINEMATICS, **_COLUMNS}.items()
     },
@@ -45,6 +46,7 @@ def track_tensors(tracks: Tracks) -> dict[str, Tensor]:
     """
     arrays = {name: getattr(tracks.kinematics, name) for name in _KINEMATICS}
     arrays.update({name: getattr(tracks, name) for name in (*_COLUMNS, *_NUMBERS)})
+    # A clone keeps the order of memory otherwise, and a file has rows one after another.
     plain = torch.contiguous_format
     return {_PREFIX + name: torch.from_numpy(array).clone(memory_format=plain) for name, array in arrays.items()}
 

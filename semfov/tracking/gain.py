@@ -33,6 +33,7 @@ def value_of_windows(tracks: Tracks, model: TrackingModel, lattice: Lattice, lev
     first = np.ceil(tracks.corners[:, 2:] / pitch).astype(int) - span
     last = np.floor(tracks.corners[:, :2] / pitch).astype(int)
     for gain, (x1, y1), (x2, y2) in zip(gains, first.clip(0), last, strict=True):
+        # Beyond the first cell no window holds a box, and negative ends would count from the other side.
         if x2 >= 0 and y2 >= 0:
             values[y1 : y2 + 1, x1 : x2 + 1] += gain
     return values

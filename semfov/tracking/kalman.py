@@ -109,7 +109,7 @@ class Kinematics:
         scale = motion.scale_at(place).numpy()
         moved = motion.points(place).numpy()
         # A velocity is carried by the map's derivative at the place of the object.
-        weight = self.place @ motion.matrix[2, :2] + 1.0
+        weight = self.place @ motion.matrix[2, :2] + 1.0  # a motion has 1 in the corner of its matrix
         derivative = (motion.matrix[None, :2, :2] - moved[:, :, None] * motion.matrix[None, 2:, :2]) / weight[
             :, None, None
         ]

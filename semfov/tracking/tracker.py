@@ -152,6 +152,7 @@ class Tracker:
         """
         noise = self._noise(seen)
         pairs = cheapest_pairs(self._costs(seen, noise))
+        # A cut box shows that its object is there, but neither its place nor its size.
         is_whole = ~seen.cut[pairs[:, 1]]
         self._miss(seen, pairs[:, 0])
         self._hit(seen, noise, pairs[is_whole])
@@ -159,6 +160,7 @@ class Tracker:
         is_unpaired[pairs[:, 1]] = False
         self._begin(seen, noise, is_unpaired)
         self._merge_doubles()
+        # A frame may have several looks, and a trail has one place of each frame.
         self.tracks = self.tracks.marked(anew=self._is_marked)
         self._is_marked = True
 
@@ -170,6 +172,7 @@ class Tracker:
     def _least_size_variance(self, seen: Seen) -> Floats:
         """Least variance of the logarithm of an object's size after each detection, `(M,)`."""
         entering = np.zeros(len(seen.scores), bool) if seen.entering is None else seen.entering
+        # A box that was cut would hold the size back for many looks, so that the next one is to decide.
         return np.where(entering, self.model.entering**2, 0.0)
 
     def _costs(self, seen: Seen, noise: Floats) -> Floats:
@@ -251,6 +254,7 @@ class Tracker:
         boxes = tracks.corners.astype(np.float32)
         rows = remaining_rows(boxes, tracks.log_odds.astype(np.float32), tracks.labels, _ONE_OF_CLASS)
         if len(rows) < len(tracks):
+            # Back in the order of their numbers, as suppression lists them by their odds.
             self.tracks = tracks[np.sort(rows)]
 
 

@@ -260,6 +260,7 @@ class Tracks:
 
     def objects(self) -> Objects:
         """Convert to objects with probabilities as scores, the most probable first."""
+        # Stable, so that equals stay in the order of their numbers.
         chosen = self[(-self.existence * self.fits).argsort(kind="stable")]
         return Objects(
             chosen.boxes,

@@ -31,6 +31,7 @@ from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.survey import STEPS
 from semfov.zoom.window_sums import CellBox, Cells, CellSlices, WindowSums, extent
 
+# Fainter rates promise mostly where nothing is, so they are summed apart.
 _CLEAR = 0.1  # expected number of objects from which on a cell clearly promises one
 
 _EVERYWHERE: CellSlices = (slice(None), slice(None))
@@ -98,6 +99,7 @@ class ZoomBelief:
         self._rated_level = np.full(shape, -1, np.int8)  # level of the look that the rates of a cell are from
         self._gists_rated = 0
         self.closest_level = torch.full(shape, -1, dtype=torch.int8)
+        # Made anew when it is asked for: which cells are blank is known after the overview alone.
         self.__dict__.pop("unexplored", None)
         self.gists: list[Gist] = []
         self._sums: dict[tuple[_CellQuantity, int], WindowSums] = {}
@@ -136,6 +138,7 @@ class ZoomBelief:
             return
         self.gists.append(gist)
         x1, y1, x2, y2 = box = self._box(gist)
+        # The array shares the memory of the tensor, so that writing to it changes the attribute.
         closest_level = self.closest_level.numpy()[y1:y2, x1:x2]
         np.maximum(closest_level, gist.level, out=closest_level)
         self._mark_sums(box)
@@ -154,6 +157,7 @@ class ZoomBelief:
         if x1 >= x2 or y1 >= y2:
             return
         unexplored = self.unexplored.numpy()[y1:y2, x1:x2]
+        # Windows over cells that were explored before need not be summed again.
         if unexplored.any():
             unexplored[:] = 0
             self._mark_sums((x1, y1, x2, y2))
@@ -216,6 +220,7 @@ class ZoomBelief:
         Returns:
             Number of objects in cells that clearly promise one, and in all others.
         """
+        # The overview is always the first look, so no further one is of level 0.
         levels = range(1, self.lattice.levels)
         if not levels:
             return 0.0, 0.0
@@ -288,6 +293,7 @@ def _rates_before(rate: Cells, rated_level: NDArray[np.int8], gist: Gist) -> Ten
     """
     # Rates of looks that are coarser by more than three octaves are those for three.
     octaves = (gist.level - rated_level).clip(0, STEPS - 1)
+    # The sum is the level one octave closer than this look: what its own prediction is about.
     rate_before = np.choose(rated_level + 1 + octaves, rate)
     return before_of(rate_before, gist)[None]
 
@@ -324,5 +330,6 @@ def before_of(rate: Cells, gist: Gist) -> Tensor:
     scale = gist.scale
     if scale > 1:
         before = F.pad(before, (0, columns * scale - before.shape[1], 0, rows * scale - before.shape[0]))
+        # PyTorch pools means alone; times the number of cells they are sums.
         before = F.avg_pool2d(before[None], scale)[0] * scale**2
     return (before + 1e-6).log()

@@ -99,6 +99,7 @@ def _of_colour(
     width = right - left
     channels_last = pixels[:, top:bottom, left:right].transpose(1, 2, 0)
     values = channels_last.reshape(bottom - top, -1)  # three in a row for each pixel
+    # Bytes would wrap round at black and white.
     lowest = np.array([max(value, 1) - 1 for value in colour], np.uint8)
     highest = np.array([min(value, 254) + 1 for value in colour], np.uint8)
     # One comparison for both limits: bytes below the lowest wrap round to large ones.
@@ -184,5 +185,6 @@ def _least_linked(count: int, first: NDArray[np.int32], second: NDArray[np.int32
         first = first[differ]
         second = second[differ]
         np.minimum.at(least, ends.max(0)[differ], ends.min(0)[differ])
+        # Links of links halve the ways: a maze would take as many rounds as its way is long.
         while not np.array_equal(further := least[least], least):
             least = further

@@ -113,6 +113,7 @@ def _area(box: tuple[float, float, float, float]) -> float:
 def _window_at(window: Window, region: Sequence[float], scale: float, lattice: Lattice) -> Window:
     """Make the window of another frame that shows a region `x1 y1 x2 y2`, whose pixels are scaled."""
     x1, y1, x2, y2 = region
+    # Where a pixel of the look is several of this frame, each of these has fewer canvas pixels.
     fixation = (x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, window.fixation[2] / scale
     box = x1, y1, x2, y2
     return Window(fixation, window.level, nearest_cells(lattice, box), box)

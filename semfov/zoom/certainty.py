@@ -27,6 +27,7 @@ FACTS = (
 )
 """Facts about an object, from which its probability is predicted (`semfov.zoom.objects`)."""
 
+# The least tenth with which four fifths of 12 mosaics of the fit were within two errors.
 SPREAD = 0.3  # the spread of a certainty (`Certainty`) for which none was fitted
 
 DISPERSION = 2.0
@@ -82,6 +83,7 @@ class Certainty:
         Raises:
             InputError: there are too few or too many.
         """
+        # Evidence of earlier versions has probabilities by the score alone.
         if len(numbers) == 2:
             offset, weight_of_score = numbers
             weights_of_others = [0.0] * (len(FACTS) - 1)
@@ -123,6 +125,7 @@ class Certainty:
         clear, faint = expected
         number = clear + self.faint * faint
         if math.isinf(self.strength):
+            # A scale that is known exactly leaves a Poisson number, whose variance is its mean.
             return self.scale * number, self.scale * number
         rate = self.strength + self.promise * promised
         scale = (self.strength * self.scale + discoveries) / rate

@@ -21,6 +21,7 @@ from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
 
+# A smaller window shows the place equally well, but fewer other places.
 USUAL_WINDOW = 0.6, 2.0
 """Least side of that window in a photograph, in longer sides of the photograph, and its side in those of the box."""
 
@@ -47,6 +48,7 @@ def closer_window(lattice: Lattice, box: Tensor, window: tuple[float, float] = U
     least, context = window
     if lattice.levels > 1:
         context = CONTEXT
+        # At most one octave beyond the last level: such windows told right places from wrong ones best.
         least = min(lattice.canvas) / (2 * lattice.magnifications[-1]) / max(lattice.size)
     x1, y1, x2, y2 = window_around(box.double(), lattice.size, context=context, least=least).tolist()
     return Window.around(lattice, (x1, y1, x2, y2))
@@ -311,6 +313,7 @@ class PhotographPlaces(CandidateBoxes):
     It is :math:`v = p \, (1 - \max_i p_i)`, with the probability p of the place and those of the closer looks so far.
     """
 
+    # As faint as hints begin, where a head has no limit of its own (`semfov.detection.detector.FAINT`).
     least = 0.002
     exhaustive = True
 
@@ -322,6 +325,7 @@ class PhotographPlaces(CandidateBoxes):
         window: tuple[float, float] = USUAL_WINDOW,
         prior: Prior | None = None,
     ) -> None:
+        # Places are due by their chance of a hit, so that none has to be likely before.
         super().__init__(target, 0.0, lattice, forgetting, prior, window)
 
     def see(self, look: TargetFacts) -> None:
@@ -333,6 +337,7 @@ class PhotographPlaces(CandidateBoxes):
     def hit_chance(self) -> float:
         """Chance of a hit at the most evident place; below 0 if there is none."""
         place = self._most_evident
+        # Below a `stop_below` of 0, too, so that a search without places is over.
         return -1.0 if place is None else self._hit_chance_at(place)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:

@@ -69,6 +69,7 @@ class SearchFacts:
 
     def see(self, looks: Sequence[WindowLook]) -> None:
         """Take the looks that count now; those that were carried along are others, and show what is in view."""
+        # By identity, since looks hold tensors, which have no one truth.
         known = {id(facts.look): facts for facts in self.looks}
         self.looks = [known.get(id(look)) or self._facts_of(look) for look in looks]
         self._sum_up()
@@ -112,6 +113,7 @@ class SearchFacts:
         named = max(look.named for look in self.looks)
         overview = scores_of_looks[0]
         scores = torch.tensor([best, second, closest, overview, named, hit_chance], dtype=torch.float32)
+        # A picture may be blank all over.
         visible = self.belief.visible.sum().clamp(1)
         unexplored = float(self.belief.unexplored.sum() / visible)
         detected = sum(score >= DETECTION_SCORE for score in scores_of_looks)
@@ -263,6 +265,7 @@ class DecisionsByPresence(WindowDecisions):
         self._presence = None
         self.outcome = GO_ON
         if not self._goes_on():
+            # With one pass left no other look follows a closer one, so that less probable places are due, too.
             self._judge(step, number, last=step.next_value == 0 or room <= 1)
 
     def _goes_on(self) -> bool:
@@ -398,6 +401,7 @@ def decisions_of(
         most = MOST_IN_PHOTOGRAPH
     if settings.closer is not None:
         most = settings.closer
+    # Not `confirm` yet, which is about a place where closer looks decide, else about the picture.
     thresholds = (fitted or _DEFAULTS).changed(stop_below=settings.stop_below)
     if not most or verification is None or verification.thresholds is None:
         return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior)

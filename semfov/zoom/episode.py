@@ -161,6 +161,7 @@ class _Recent(Generic[_Belief]):
         self.kept.append(newest)
         if self.forgetting is not None:
             self._forget(self.forgetting.span)
+        # A belief cannot forget a single look, so it is made of those that are left.
         if len(self.kept) <= count:
             self._believe_anew()
         else:
@@ -190,6 +191,7 @@ class _Recent(Generic[_Belief]):
         """Forget looks that the newest one replaces, and those older than a span in seconds."""
         newest = self.kept[-1]
         if self._is_new_overview(newest):
+            # The overview stays the first of the looks that count.
             self.kept = [newest, *self.kept[1:-1]]
         overview = self.kept[0]
         # An old overview is kept until there is a new one, as all other looks are predicted from it.
@@ -200,6 +202,7 @@ class _Recent(Generic[_Belief]):
             if look in (overview, newest) or (is_recent and not is_replaced):
                 counting.append(look)
         self.kept = counting
+        # Judged for the next frame, in which the new overview would be made.
         at_next_frame = newest.time + self.source.passed
         is_old = at_next_frame - overview.time > span
         self.lacks_overview = is_old or share_shown(overview.current.window, self.source.lattice) < _LEAST_SHOWN
@@ -256,6 +259,7 @@ def _next_choices(recent: _Recent[_Belief], order: Order) -> Sequence[WindowChoi
         oldest = min(recent.kept, key=lambda look: look.time)
         return [(oldest.original.window, 0.0)]
     if recent.lacks_overview:
+        # With the value of the look that it displaces, which a search reads as its chance of a hit.
         return [(overview, choices[0][1])]
     return choices
 

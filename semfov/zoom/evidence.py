@@ -225,6 +225,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         Raises:
             InputError: a target is no class.
         """
+        # A compiled or exported graph cannot read the values of a tensor.
         if not torch.compiler.is_compiling():
             classes = targets.tolist()
             check(min(classes) >= 1, "targets", "classes from 1 on", classes)

@@ -161,6 +161,7 @@ class WindowEye(nn.Module):
         canvas, frames = self.resample(view, fixations, within) if resampled is None else resampled
         device = canvas.device
         threshold = self.detector.selection.threshold
+        # Hints begin below the threshold of detections.
         least = min(threshold, self.detector.faint) if hints else threshold
         candidates = self._propose(canvas, least, meanwhile)
         selected = select(candidates, None, self.detector.selection, self.detector.background)
@@ -246,6 +247,7 @@ class WindowEye(nn.Module):
     def _padding(self) -> Tensor:
         """Make the detector's padding from 0 to 255: a byte where it is a whole number, for canvases of bytes."""
         fill = 255 * float(self.detector.fill)
+        # A share of 255 that was a byte is a whole number up to rounding alone.
         is_byte = abs(fill - round(fill)) < 1e-6
         return torch.tensor(round(fill), dtype=torch.uint8) if is_byte else torch.tensor(fill)
 
@@ -282,6 +284,7 @@ class WindowEye(nn.Module):
         frame = x1, y1, x2, y2, u1, v1, u2, v2
         if (u1, v1, u2, v2) == (0, 0, width, height):
             return pixels, frame
+        # In the layout of `resized`, which windows that fill the canvas have.
         canvas = padding.expand(1, 3, height, width).contiguous(memory_format=torch.channels_last)
         canvas[..., v1:v2, u1:u2] = pixels
         return canvas, frame
@@ -327,6 +330,7 @@ class WindowEye(nn.Module):
             JSON values.
         """
         sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
+        # Not named where it is false, so that keys and metadata from before it stay valid.
         if self.stretch:
             sensor["stretch"] = True
         return {"sensor": sensor, "detector": self.detector.settings()}
@@ -351,6 +355,7 @@ def _hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy, fain
     index = (confidence >= faint).nonzero()[:, 0]
     selected = candidates.take(image, index)
     boxes = selected.boxes.detach()
+    # Some detectors check all numbers of a pass themselves, and once is enough.
     if not candidates.are_checked:
         check_numbers(image, -math.inf, math.inf, confidence=confidence, boxes=boxes)
         check_numbers(image, 0, 1, class_scores=selected.classes, objectness=selected.objectness)
@@ -379,6 +384,7 @@ def _window_pixels(
     window_end = step * round(last_edge / step)
     least = round(max(low, 0.0))
     most = round(min(high, length))
+    # A window beside the picture shows its nearest pixel.
     first = min(max(window_start, least), most - 1)
     end = min(max(window_end, first + 1), most)
     # What the window shows beyond the picture is padding on the canvas.

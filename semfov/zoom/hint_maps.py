@@ -136,5 +136,6 @@ def through(network: nn.Sequential, values: Tensor) -> Tensor:
 def _gelu(values: Tensor) -> Tensor:
     """Apply GELU to values that are not contiguous: torch gives those that are to oneDNN, whose call is slow."""
     if values.ndim == 1:
+        # A vector cannot be transposed, but rows that are one in memory are not contiguous either.
         return F.gelu(values.expand(2, -1))[0]
     return F.gelu(values.mT).mT

@@ -78,6 +78,7 @@ class Gist:
         strongest = scores.new_zeros(cells.total, kinds)
         strongest.scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
         top = confidence.new_zeros(cells.total).scatter_reduce_(0, place, confidence, "amax")
+        # By the scores, as in the fit: the confidence of the detector can rank otherwise.
         leads = np.flatnonzero(confidence.numpy() == top.numpy()[hint_cells])
         size = np.zeros(cells.total, np.float32)
         size[hint_cells[leads]] = _log_sides(hint_boxes[leads], lattice.magnifications[level])

@@ -71,6 +71,7 @@ class Lattice:
         # Magnifications one octave apart, from the one that shows the whole picture up to the finest one.
         width, height = size
         magnifications = [min(canvas[0] / width, canvas[1] / height)]
+        # Rounding must not cost a picture its level of native pixels.
         while magnifications[-1] * 2 <= finest * (1 + 1e-9):
             magnifications.append(magnifications[-1] * 2)
         lattice = cls(size, canvas, tuple(magnifications))
@@ -174,6 +175,7 @@ class Lattice:
         """
         levels = actions[..., 0]
         first_cells = actions[..., 1:]
+        # In double precision, so that each edge is rounded once, as in `_middle`.
         pitch = torch.tensor(self.pitch, dtype=torch.float64)
         sizes = torch.tensor([self.window(level) for level in range(self.levels)], dtype=torch.float64)
         lower = first_cells * pitch
@@ -210,6 +212,7 @@ class Lattice:
         width, height = self.window(level)
         centre_x = _middle(column * self.pitch[0], width)
         centre_y = _middle(row * self.pitch[1], height)
+        # Rounded as the tensors of `fixations` are, so that both name the same window.
         x, y, magnification = np.array([centre_x, centre_y, self.magnifications[level]], np.float32).tolist()
         return x, y, magnification
 

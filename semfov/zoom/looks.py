@@ -204,6 +204,7 @@ class LiveWindowLooks(WindowLooks):
             self.view,
             torch.tensor([window.fixation for window in windows], dtype=torch.float64),
             [window.within for window in windows],
+            # A look that points to closer ones has a gist, which is made of hints.
             hints=hints or any(window.points_closer(self.lattice) for window in windows),
             resampled=resampled,
             meanwhile=meanwhile,

@@ -283,12 +283,14 @@ def _should_show(
     Returns:
         `(M, N)`, and the logarithms (base 2) of the sides of the boxes, `(M,)`.
     """
+    # A box may have no area, and the logarithm of 0 is not finite.
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)
     log_side = np.log2(sides).mean(1)
     log_side_on_canvas = log_side[:, None] + np.log2(scale)
     is_large_enough = log_side_on_canvas >= math.log2(_SMALLEST)
     should_show = _are_inside(boxes, windows, scale, size) & is_large_enough
     if latest:
+        # From the first look on: what later ones should show is read before it is replaced.
         for number in range(len(scale) - 1):
             later = slice(number + 1, None)
             is_as_close = scale[later] >= scale[number]

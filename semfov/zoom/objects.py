@@ -93,6 +93,7 @@ def without_parts(
     better = overlaps.first
     worse = overlaps.second
     smaller = np.minimum(overlaps.area[better], overlaps.area[worse])
+    # Pairs stand in both orders, and the more confident object has the lower index.
     is_part = (overlaps.shared >= inside * smaller) & (better < worse) & ~stays[worse]
     is_part &= labels.numpy()[better] == labels.numpy()[worse]
     return objects[torch.from_numpy(survivors(len(objects), better[is_part], worse[is_part]))]
@@ -108,6 +109,7 @@ def _highest_scores(objects: Objects, detected: DetectedBoxes, iou: float) -> Te
     box = overlaps.second[pairs] - count
     overlaps_enough = overlaps.shared[pairs] >= iou * overlaps.union[pairs]
     same = overlaps_enough & (objects.labels.numpy()[object_] == detected.labels.numpy()[box])
+    # A copy, as the array shares the memory of the scores.
     highest = objects.scores.numpy().copy()
     np.maximum.at(highest, object_[same], detected.scores.numpy()[box[same]])
     return torch.from_numpy(highest)
@@ -169,6 +171,7 @@ def _fused(index: Tensor, detected: DetectedBoxes) -> Tensor:
     others = second[counts]
     weight = (detected.scores * detected.magnifications.square()).double().numpy()
     corners = detected.boxes.double().numpy()
+    # Indexing copies, so that what is added here leaves the weights of the boxes as they are.
     weights = weight[chosen]
     sums = corners[chosen] * weight[chosen, None]
     np.add.at(weights, objects, weight[others])
@@ -204,6 +207,7 @@ def probable_objects(
     if not any(remaining):
         return objects, (0.0, 0.0)
     before = _probable(*merge_with_facts(looks[:1], lattice, target), certainty)
+    # Further looks may lower the sum, and the number of discoveries cannot be negative.
     discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
     return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
 

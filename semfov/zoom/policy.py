@@ -59,6 +59,7 @@ def _better(
         values = values * _share_outside(beside, lattice.span(level), values.shape)
     flat = values.ravel()
     across = values.shape[1]
+    # At most all windows that were looked at are better than the best other one.
     for _ in range(len(done) + 1):
         place = int(flat.argmax())
         value = float(flat[place])
@@ -67,6 +68,7 @@ def _better(
         window = Window.on(lattice, (level, place % across, place // across))
         if window not in done:
             return window, value
+        # The values are the array of the belief, which keeps them for the next choice.
         flat = flat.copy()
         flat[place] = -np.inf
     return best

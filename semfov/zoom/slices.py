@@ -125,6 +125,7 @@ def raw(look: WindowLook, window: Window, targets: Sequence[int] = (), *, most: 
 def _hints_inside(hints: Hints, window: Window) -> Tensor:
     """Select the scores `(n, K)` of hints whose centre lies in a window."""
     boxes = hints.boxes
+    # Hints are kept in photographs alone, whose one window of the lattice shows all.
     region = boxes.new_tensor(window.within or (0.0, 0.0, 1e9, 1e9))
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
     is_inside = ((region[:2] <= centre) & (centre < region[2:])).all(-1)

@@ -70,6 +70,7 @@ class Survey(nn.Module):
         # torch takes twice as long for `any` of booleans, and for a matrix of few columns on the right.
         detections = look.found.to(best).amax(-1)
         mix = self.mix.weight
+        # Counted from the feature of a score of 0: cells without hints are nearly 0, as those beyond the map.
         kinds = torch.addmm(-LOWEST * mix.sum(1, keepdim=True), mix, hints.flatten(0, 1).mT).unflatten(1, best.shape)
         around = torch.cat([kinds, best[None], detections[None]])
         surroundings = [neighbourhood_mean(around, side) for side in _SURROUNDINGS]

@@ -78,6 +78,7 @@ class AnyOf(Observer):
         for weight in weights.values():
             check_number(weight, "weights", 0, 1)
         self.observer = observer
+        # A class that is never meant changes no probability, and would cost a belief.
         self.weights = {index: float(weight) for index, weight in weights.items() if weight > 0}
         self._targets: list[int | None] = list(self.weights) if observer.by_target else [None]
 
@@ -112,6 +113,7 @@ class AnyOf(Observer):
         any_belief = own(belief, _AnyBelief, "belief")
         any_evidence = own(look, _AnyEvidence, "look")
         inner = tuple(change(*pair) for pair in zip(any_belief.inner, any_evidence.inner, strict=True))
+        # All inner beliefs have had the same looks, so that the first one tells.
         return replace(any_belief, inner=inner, closest=inner[0].closest)
 
 
