@@ -110,6 +110,7 @@ def serve(options: AppOptions) -> int:
     except ImportError:
         raise DataError('app: expected Gradio for the page; pip install "semfov[app]"') from None
     try:
+        # Tried out now, as the detector takes seconds to load.
         socket.create_server((options.host, options.port or 0)).close()
     except OSError as error:
         address = f"{options.host}:{options.port or 'any'}"

@@ -113,6 +113,7 @@ class Doorkeeper:
     async def _welcome(self, send: Send) -> None:
         """Let the browser keep the token, and open the page under an address without it."""
         cookie = f"{_COOKIE}={self._token}; Path=/; HttpOnly; SameSite=Lax"
+        # A browser would name this address, which has the token, to the next page as its referrer.
         headers = [(b"location", b"/"), (b"set-cookie", cookie.encode()), (b"referrer-policy", b"no-referrer")]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})

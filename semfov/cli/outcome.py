@@ -264,6 +264,7 @@ def _figure(record: Record, options: PictureOptions) -> dict[str, bytes]:
         return {}
     from semfov.viz import save_figure
 
+    # Returned as bytes, since a worker of a cluster may not have the folder of the results.
     with tempfile.TemporaryDirectory() as folder:
         drawn = save_figure(record.plot(), Path(folder) / options.figure.name)
         return {str(options.figure): drawn.read_bytes()}

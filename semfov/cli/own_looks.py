@@ -116,6 +116,7 @@ def look_at_cells(agent: ActivePerception, image: Tensor, target: str, cells: Se
             if episode.ending is not None:
                 break
     record = episode.record()
+    # The agent does not fixate a cell twice, so none of these is its advice.
     values = record.values[-1].index_fill(0, record.cells, -torch.inf)
     of_agent = None if episode.ending is None else agent.search(image, target, how="fovea", start=cells[0], closer=0)
     return OwnLooks(record, int(values.argmax()), of_agent)

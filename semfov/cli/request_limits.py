@@ -70,6 +70,7 @@ class RequestLimits:
     async def _upload(self, scope: Message, receive: Receive, send: Send) -> None:
         """Pass an upload on, unless too much is kept or under way."""
         length = int(header(scope, "content-length") or 0)
+        # Counted before it is here: uploads at the same time might exceed the limit together.
         self._arriving += length
         try:
             kept = await asyncio.to_thread(self._kept_bytes)

@@ -141,6 +141,7 @@ def all_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float)
         clock = _Clock()
         source = LiveWindowLooks(eye, eye.open(picture))
         windows = [Window.overview(source.lattice), *_slices_of(source.lattice, side, overlap)]
+        # Slices are not chosen by hints, so that no time is spent on making them.
         looks = [source.see([window], hints=False)[0] for window in windows]
         return [clock.finding(looks, labels)]
 

@@ -215,6 +215,7 @@ class _Builder:
 
     def _convolution(self, section: Section) -> nn.Module:
         channels, step = self._here
+        # Cfgs leave out keys for which Darknet has a value, such as this 1: here and in other layers it is the same.
         filters = section.integer("filters", 1)
         groups = section.integer("groups", 1)
         counts = f"{excerpt(channels)} input channels and {excerpt(filters)} filters"
@@ -456,9 +457,11 @@ class Darknet(nn.Module):
         Returns:
             The outputs, by layer, that later layers read, or that the network returns.
         """
+        # A copy: the first layer would write its output into the caller's mapping.
         outputs = dict(outputs)
         for index in range(start, stop):
             outputs[index] = self.layers[index](*(outputs[source] for source in self.sources[index]))
+            # Maps go after their last reader, so that memory never has to hold all of them.
             outputs = {source: output for source, output in outputs.items() if self._last_reader[source] > index}
         return outputs
 
@@ -496,6 +499,7 @@ def _folded(numbers: Tensor, layer: Convolution, name: str) -> tuple[Tensor, Ten
         The weight `(O, I / groups, k, k)` and the bias `(O,)`, in float64.
     """
     vectors, kernel = numbers.split([layer.out_channels * layer.stored_vectors, layer.weight.numel()])
+    # In float64, so that a weight is rounded only once, when it is copied into the layer.
     weight = kernel.view(layer.weight.shape).double()
     bias, *batch_norm = vectors.view(-1, layer.out_channels).double()
     if not batch_norm:

@@ -72,6 +72,7 @@ def _parse_cfg(text: str, source: str = "cfg") -> list[Section]:
     sections: list[Section] = []
     options: dict[str, str] = {}
     for number, raw in enumerate(text.splitlines(), start=1):
+        # Darknet, too, ignores all white space, also within a line.
         line = "".join(raw.split())
         where = f"{source}:{number}"
         if not line or line.startswith(("#", ";")):

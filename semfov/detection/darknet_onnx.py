@@ -169,6 +169,7 @@ class _NetworkGraph(Graph):
             source,
             "",
             self.constant([1.0, 1.0, scale, scale]),
+            # As PyTorch's `nearest`, which rounds places down; ONNX by itself counts from the centres of pixels.
             mode="nearest",
             nearest_mode="floor",
             coordinate_transformation_mode="asymmetric",
@@ -315,6 +316,7 @@ class OnnxTwin:
         self._opened: dict[tuple[int, ...], _OpenSession] = {}
 
     def __reduce__(self) -> tuple[Callable[[str], OnnxTwin], tuple[str]]:
+        # Without the versions, which hold addresses in the memory of this process.
         return OnnxTwin, (self.digest,)
 
     def obstacle(self, network: Darknet) -> str | None:
@@ -392,6 +394,7 @@ class OnnxTwin:
         return opened.session
 
     def _new_session(self, network: Darknet, layers: tuple[int, ...]) -> OnnxSession:
+        # Not open-ended: the graph is made here, so that its work is known.
         try:
             return OnnxSession(_exported(network, self.digest, cache_folder() / "exported", layers), open_ended=False)
         except DataError:  # the cache cannot be written to

@@ -215,6 +215,7 @@ class Detections:
         image = self._mapped(lambda tensor: tensor.reshape(*tensor.shape[len(lead) :]))
         image = image.take(image.mask)
         image = image.take(image.confidence.argsort(descending=True, stable=True))
+        # Without classes there is no best one that could be found.
         labels = image.labels if image.scores.shape[-1] > 1 else image.mask.long()
         return image.boxes, image.scores, labels, image.confidence
 

@@ -83,6 +83,7 @@ def main() -> None:
             classes=arguments.classes,
             input_size=arguments.input_size,
             stride=None if arguments.static else 32,
+            # With `auto` onnxruntime would compute it, too, and the export be compared with its own graph.
             runtime="torch",
         )
         export_onnx(detector, arguments.output, static=arguments.static)

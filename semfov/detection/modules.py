@@ -42,6 +42,7 @@ class ModuleDetector(Detector):
         self.model = model
         self._places = places
         self._count = len(classes)
+        # In training, outputs would depend on the other images (batch norm) and on chance (dropout).
         self.eval()
 
     def feature_modules(self) -> dict[str, nn.Module]:

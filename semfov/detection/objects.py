@@ -326,6 +326,7 @@ def unlike(
     """
     order = _best_first(scores, cut, sharpness)
     corners = boxes[order].numpy()
+    # In float64: beside the shifts of the classes, float32 would round the edges of the boxes away.
     classes = labels.double()[order].numpy()
     look = looks[order].numpy()
     is_cut = cut[order].numpy()
@@ -340,7 +341,7 @@ def unlike(
     empty = np.flatnonzero(union <= 0)
     is_same[empty] = (corners[better[empty]] == corners[worse[empty]]).all(-1)
     # The part of an object at the border of a window lies inside the box of the whole object, which another look shows.
-    share_of_worse = shared / np.maximum(area, 1e-6)[worse]
+    share_of_worse = shared / np.maximum(area, 1e-6)[worse]  # a box may have no area to divide by
     is_part = (share_of_worse >= np.float32(inside)) & is_cut[worse]
     is_same |= is_part & (look[better] != look[worse])
 
@@ -389,6 +390,7 @@ def _overlapping_pairs(
     if around is not None:
         first = first % count
         second = second % count
+        # A box as wide as the panorama meets its own copy, and the two are no pair.
         distinct = first != second
         first = first[distinct]
         second = second[distinct]
@@ -462,6 +464,7 @@ def survivors(count: int, better: _Index, worse: _Index) -> _Index:
     removed = np.zeros(count, np.bool_)
     removed[worse[~doubtful[better]]] = True
     undecided = ~(removed[better] | removed[worse])
+    # Sorted by the better box, so that it is settled whether that one stays before it removes others.
     pairs = np.sort(better[undecided] * count + worse[undecided])
     # Entries of a bytearray are read faster than those of an array.
     flags = bytearray(removed)

@@ -78,6 +78,7 @@ class ModelApart:
 
     def _start(self) -> Description:
         """Start the process, and open the model in it."""
+        # Isolated (-I): until the paths are set, modules would be imported from the present folder, too.
         call = [os.fsdecode(get_executable()), "-I", "-c", _START, onnx_program.__file__, *sys.path]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(call, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL)

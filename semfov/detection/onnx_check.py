@@ -64,6 +64,7 @@ def _check_model(model: ModelProto, path: Path, canvas: tuple[int, int], name: s
     _check_count(name, len(stored), _MOST_TENSORS, "stored tensors")
     ports = len(model.graph.input) + len(model.graph.output)
     _check_count(name, ports, _MOST_PORTS + len(stored), "inputs and outputs")
+    # A set, as many tensors may lie in one file, whose bytes count once.
     files = {path, *_files_of_weights(path.parent, stored)}
     for tensor in stored:
         check_elements(f"{name}: tensor {excerpt(tensor.name)}", tensor.dims)

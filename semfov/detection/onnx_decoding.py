@@ -165,6 +165,7 @@ def rows_of_images(flat: Tensor, images: int) -> Tensor:
     check(
         are_known, "rows", f"the number of an image, from 0 to {images - 1}, in the first column", number[:3].tolist()
     )
+    # Selected rows of other networks have the score before the class.
     rows = flat[:, [1, 2, 3, 4, 6, 5]]
     return pad_sequence([rows[of_image] for of_image in is_of_image], batch_first=True)
 

@@ -308,6 +308,7 @@ def with_input_size(path: Path, canvas: Canvas) -> Path:
 
     check_canvas("input_size", canvas)
     check(all(side % _COARSEST == 0 for side in canvas), "input_size", f"multiples of {_COARSEST} pixels", canvas)
+    # Before all of its weights are read, which may be more than the memory holds.
     check_file(path)
     model = onnx.load(path)
     rows, columns = model.graph.input[0].type.tensor_type.shape.dim[2:4]  # of (B, 3, H, W)

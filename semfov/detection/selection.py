@@ -226,6 +226,7 @@ def remaining_rows(
     # A box without area overlaps none, so nothing would suppress it.
     x1, y1, x2, y2 = boxes.T
     with_area = ((x2 > x1) & (y2 > y1)).nonzero()[0]
+    # Stable, so that of equal confidences the first stays, as it does with tensors.
     order = with_area[(-confidence[with_area]).argsort(kind="stable")]
     return order[_remaining_ranks(boxes[order], labels[order], selection)]
 

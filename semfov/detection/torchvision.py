@@ -188,6 +188,7 @@ class TorchvisionDetector(ModuleDetector):
         elif classes is None:
             raise InputError("classes: expected the names of the model's classes without background, got None")
         else:
+            # By itself torchvision would download weights of a backbone, which those of the file replace.
             model |= {"num_classes": len(classes) + first, "weights_backbone": None}
             digest = "" if weights is None else sha256(weights, f"weights {fspath(weights)!r}")
         try:

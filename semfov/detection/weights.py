@@ -100,6 +100,7 @@ class _SourceDistribution(NamedTuple):
         (setuptools / "__init__.py").touch()
         backend = _BACKEND.format(project=self.project, version=self.version)
         (setuptools / "build_meta.py").write_text(backend, encoding="utf-8")
+        # What pip leaves in its temporary folder is removed with this one.
         temporary = folder / "temporary"
         temporary.mkdir()
         path = os.pathsep.join(filter(None, [str(setuptools.parent), os.environ.get("PYTHONPATH")]))

@@ -92,6 +92,7 @@ def _fit_map(
         group = groups[number]
         # Whole channels are left out, other ones for each readout.
         is_read = torch.rand(readouts, 1, model.read.shape[1], generator=generator) >= fit.dropout
+        # Raised, so that in the mean as much is read as later, when no channel is left out.
         mask = (is_read / (1 - fit.dropout)).expand(-1, units, -1).flatten(0, 1) / scale
         maps = blurred(model.readouts(group.some(batch), group.size, model.read * mask), model.blur.exp())
         values = maps + model.centre_bias(group.size)
@@ -144,7 +145,7 @@ def _standardise(model: FixationDensity, groups: Sequence[Viewed], pictures: _Pi
                 values.append(maps.transpose(0, 1).flatten(1))
         by_channel = torch.cat(values, 1)
         means.append(by_channel.mean(1))
-        deviations.append(by_channel.std(1).clamp(min=1e-3))
+        deviations.append(by_channel.std(1).clamp(min=1e-3))  # a channel may be 0 everywhere
     scale = torch.cat(deviations)
     with torch.no_grad():
         model.shift.sub_((model.read / scale) @ torch.cat(means))
@@ -318,6 +319,7 @@ def _scores(density: Tensor, cell: Tensor) -> Tensor:
     at_fixation = density.gather(1, cell[:, None])[:, 0]
     z = (at_fixation - density.mean(1)) / density.std(1, unbiased=False).clamp(min=1e-12)
     lower = (density < at_fixation[:, None]).float().mean(1)
+    # Ties count half, so that a density that is the same everywhere has an AUC of one half.
     equal = (density == at_fixation[:, None]).float().mean(1)
     bits = (at_fixation * density.shape[1]).log2()
     return torch.stack([z.mean(), (lower + equal / 2).mean(), bits.mean()])

@@ -80,7 +80,7 @@ class Adaptation(nn.Module):
         model.blur.add_(self.spread)
         centre = self.kept * model.centre_weight * _resized(model.centre, learned.shape) + self.learned * learned
         model.centre = centre - centre.logsumexp((0, 1))
-        model.centre_weight.fill_(1.0)
+        model.centre_weight.fill_(1.0)  # which the centre now has in it
         return model
 
 
@@ -150,6 +150,7 @@ def _centres_of_others(
 ) -> Tensor:
     """Compute the log density of the fixations in all pictures but one, for each of a group, `(P, rows, columns)`."""
     centres = []
+    # By its own fixations a picture would be predicted better than any new one.
     for left_out in numbers:
         others = []
         for other_group, of_group in zip(groups, pictures, strict=True):

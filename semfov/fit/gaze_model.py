@@ -60,14 +60,16 @@ def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
     for group in groups:
         for scanpath in _timed(group):
             durations = torch.from_numpy(scanpath.durations).float()
+            # A duration of 0 ms has no logarithm.
             for number, log in enumerate(durations[:LONGEST].clamp(min=1).log()):
                 logs[min(number, _DURATIONS - 1)].append(log)
             # The time that no fixation takes, for each of them.
             pauses.append((1000 * group.seconds - durations.sum()) / len(durations))
     if pauses:
         by_number = [torch.stack(of_number) for of_number in logs if of_number]
+        # Without Bessel's correction, by which a single duration has a spread of NaN.
         model.duration = torch.stack([torch.stack([log.mean(), log.std(correction=0)]) for log in by_number])
-        model.pause = torch.stack(pauses).mean().clamp(min=0)
+        model.pause = torch.stack(pauses).mean().clamp(min=0)  # durations may exceed the stated time
 
 
 def _describe_starts(model: FixationDensity, groups: Sequence[Viewed]) -> None:

@@ -91,6 +91,7 @@ def count_misses(
         The counts by class and level.
     """
     misses = MissCounts(samples.scores.shape[-1], len(edges) + 1)
+    # The last looks may have no detections, and miss objects all the same.
     detections = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
     for look, boxes in enumerate(samples.boxes.split(detections)):
         index = int(samples.scenes[look])
@@ -141,6 +142,7 @@ class ObservationFit(PartFit):
         judged = self._annotated(samples, self.inputs.held_out)
         for model in models.values():
             fit_cells(model, photographs, seed=self.settings["seed"])
+        # Of few photographs those that are held out may show no object.
         return {name: mean_map_loss(model, judged or photographs) for name, model in models.items()}
 
     def _annotated(self, samples: Samples, photographs: Iterable[int]) -> list[AnnotatedLooks]:

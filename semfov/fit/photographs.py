@@ -222,6 +222,7 @@ def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
     there, missing = numbers_drawn(pictures, _PRESENT, _AREA)
     present = torch.cat([torch.ones(len(there)), torch.zeros(len(missing))])
     offset, slope = logistic_regression(usual.repeat(2)[:, None], present, times=torch.cat([there, missing]))
+    # Their log odds are read, which a share that is rounded to 0 or 1 does not have.
     return (slope * usual.double() + offset).sigmoid().clamp(1e-4, 1 - 1e-4).float()
 
 

@@ -181,5 +181,6 @@ def annotated_looks(
         is_search = answers.any(0) & ~answers.all(0)
         legal = legal_targets(annotation, max_target_area)
         targets = torch.tensor([target for target in legal if is_search[target]], dtype=torch.long)
+        # Last: the background is no target, and with it no photograph would be without an answer.
         answers[:, 0] = ~answers.any(-1)
         yield AnnotatedLooks(index, detections, fixations, grid, answers, targets)

@@ -319,7 +319,7 @@ def fit_places(model: FovealObservationModel, run: Looking, config: FitSearchCon
                 log_odds.append(log_odds_of_cells(step.belief.probability(targets).double()).flatten())
                 holds.append(goal.flatten())
     if not log_odds:
-        return torch.tensor([0.0, 1.0])
+        return torch.tensor([0.0, 1.0])  # which leave log odds as they are
     return torch.tensor(logistic_regression(torch.cat(log_odds)[:, None], torch.cat(holds), ridge=_RIDGE))
 
 

@@ -170,6 +170,7 @@ class _PhotographSearch(TargetSearch[Step]):
         photograph = self.photograph
         grid = photograph.grid
         source = CellLooks(photograph.looks, grid, grid.centres, self.target)
+        # The same ties each time: a fit makes its searches twice (`fit_in_folds`).
         choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), source.like))
         policy = TargetPosterior(self.target)
         return list(rollout(source, self.observer, policy, self.search.start, choice, most=self.most_looks))

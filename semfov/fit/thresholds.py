@@ -53,6 +53,7 @@ class _Searches:
 
     def found(self, thresholds: Thresholds) -> Tensor:
         """Tell which searches find their target, `(E,)` boolean: their first look that ends them says so."""
+        # A place of 0 is none, and with a threshold of 0 would pass for one.
         known = (self.place > 0) & (self.place >= thresholds.place)
         outcomes = settle(self.presence, known, self.hit_chance, thresholds)
         first = (outcomes > 0).int().argmax(0)

@@ -353,6 +353,7 @@ def fit_to_closer_looks(
     model = Verification()
     for row, answers in enumerate((closer_looks.right, closer_looks.present)):
         centre = torch.zeros(CLOSER_FEATURES + 1, dtype=torch.float64)
+        # The regression sums over cases, so that λ counts N times, and takes half of a precision.
         precision = torch.full_like(centre, 2 * _RIDGE * len(features))
         precision[0] = 0.0
         if prior is not None:

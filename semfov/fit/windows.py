@@ -217,6 +217,7 @@ class MosaicFit:
                 digest = self.pictures[kind].digest(index)
                 if looks and self.store.read(digest) is None:
                     self.store.write(digest, unpack_tensors(looks))
+        # After work in other processes this one still has all its threads, on which results depend.
         prepare_worker()
         return {kind: self._examples(kind) for kind in kinds}
 

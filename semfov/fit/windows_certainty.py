@@ -204,6 +204,7 @@ def _growth_of(exploration: Exploration, certainty: Certainty) -> list[_Growth]:
         clear, faint = exploration.remaining[number - 1]
         now = exploration.sum_after(certainty, number)
         discovered = max(now - first, 0.0)
+        # Further looks may lower the sum, too, while an expected number never is below it.
         growth.append(_Growth(clear, faint, exploration.promised[number - 1], discovered, now, max(last, now)))
     return growth
 

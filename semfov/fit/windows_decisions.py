@@ -247,11 +247,12 @@ def fit_closer_looks(
     limits = Thresholds(1.0, model.thresholds.stop_below, config.place)
     searches = track([*searched, *judged], "looking closely", "search")
     try:
+        # Both take from one iterator, so that one bar shows them: the second goes on where the first ends.
         training = examine(islice(searches, len(searched)))
         held_out = examine(searches)
     except OneKindError:
         return NO_PLACES
-    fitted = fit_to_closer_looks(training, training.fold == 0, prior)
+    fitted = fit_to_closer_looks(training, training.fold == 0, prior)  # all of them, in one fold
     in_folds = with_thresholds(fitted, [fitted], held_out, judged, limits, config.false_alarms, config.surest)
     model.verification = fitted
     report = verification_report(

@@ -146,6 +146,7 @@ class LookCounts(NamedTuple):
             expected = _expected_in_windows(rates[:, steps - 1], model.taper(span), counts.rows, counts.columns)
             new = counts.new[:, targets].mT
             terms.append((expected - new * expected.clamp(min=_LEAST_RATE).log()).flatten())
+        # Also without windows inside it a look has a loss from which a step of training can go back.
         return torch.cat(terms).mean() if terms else log_rates.sum() * 0
 
 

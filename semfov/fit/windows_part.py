@@ -170,6 +170,7 @@ def _photograph_recalls(
         photographs = [tile.scene for tile in mosaics.tiles(index)]
         counts = [len(mosaics.scenes.annotation(photograph).boxes) for photograph in photographs]
         photograph_of_object = np.repeat(photographs, counts)
+        # `+=` would count one object for each photograph, however many it has.
         np.add.at(objects, photograph_of_object, 1)
         history: list[WindowLook] = []
         steps = _steps(source, model)

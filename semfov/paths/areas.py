@@ -84,6 +84,7 @@ def boxes_of(areas: AreasLike) -> Boxes | Mapping[str, Boxes]:
         return _parsed(areas)
     if isinstance(areas, str | PathLike):
         path = Path(areas)
+        # Of two areas of one name, the last one would replace the first without a word.
         content = read_json(path, unique=True)
         check(isinstance(content, dict), f"areas ({path})", 'boxes by name, {"logo": [10, 20, 200, 80]}', content)
         return dict(content)
@@ -197,6 +198,7 @@ def border_of(density: Tensor, share: float) -> float:
     """
     ordered = density.flatten().double().sort(descending=True).values
     last = int(torch.searchsorted(ordered.cumsum(0), share))
+    # Rounding can leave the sum of all cells below a share of 1.
     return float(ordered[min(last, len(ordered) - 1)])
 
 

@@ -91,6 +91,7 @@ class FoveaLooks:
             The look.
         """
         x1, y1, x2, y2 = region
+        # Points have the centres of pixels at integers, and regions the edges: half a pixel lies between the two.
         middle = (x1 + x2 - 1) / 2, (y1 + y2 - 1) / 2
         return self._add(middle, (x1, y1, x2, y2), detections, stages, value, cell, is_closer=True)
 

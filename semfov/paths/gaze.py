@@ -215,7 +215,7 @@ class GazePrediction(OtherWords):
             InputError: `count` is out of range.
         """
         check_whole(count, "count", 1, 100)
-        return [{**place} for place in self._places[:count]]
+        return [{**place} for place in self._places[:count]]  # copies, which a caller may change
 
     @cached_property
     def _places(self) -> list[Place]:

@@ -48,6 +48,7 @@ def merge_fixations(
     if not rows:
         return Objects.none()
     merged = [_single(torch.cat(column)) for column in zip(*rows, strict=True)]
+    # Closer looks of any probability take part: one that refutes an object removes the boxes of fixations there.
     return merge_looks(*merged, score=0.0, around=around).above(FAINTEST)
 
 

@@ -144,6 +144,7 @@ class Outcome(ABC):
     @property
     def passes(self) -> int:
         """Number of passes of the detector, closer looks included."""
+        # A closer look that is no look of the record had a pass of its own.
         return len(self) + sum(look.index is None for look in self.closer)
 
     @property

@@ -59,6 +59,7 @@ _FORMAT = Format(
     {
         "cells": Field(("f",), dtype=torch.int64, low=0),
         "fixations": Field(("f", 2), mixed=True, low=-FARTHEST, high=FARTHEST),
+        # Rounding may bring probabilities above 1, in half precision by a thousandth.
         "probabilities": Field(("f", "cells", "C"), mixed=True, low=0, high=1 + 1e-3),
         "values": Field(("f", "cells"), mixed=True, finite=False),
         "posterior": Field(("f", "cells"), mixed=True, low=0, high=1 + 1e-3, optional=True),

@@ -91,6 +91,7 @@ class Stimulus:
             for point in placement.points_to_canvas(fixations.to(canvas)):
                 picture = sensor.picture(state, point[None])[0]
                 view = picture[:, top : top + height, left : left + width]
+                # A copy, as a view would keep the whole canvas in memory.
                 views.append(view.float().cpu().clone())
         return views
 

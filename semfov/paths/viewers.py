@@ -90,6 +90,7 @@ def drawn_starts(model: FixationDensity, size: tuple[int, int], people: int, gen
     drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
     mean, spread = model.start.cpu().float()  # (2,) both, shares of the sides
     start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
+    # The right and the lower edge of a picture belong to none of its pixels.
     return torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
 
 

@@ -215,6 +215,7 @@ class Words(ABC):
         at_half = record.probability_at(0.5)
         if abs(at_half - decision.probability) < _MATTERS:
             return ""
+        # Never 100 %, to which three digits would round: an assumed share is below 1.
         share = f"{min(100 * record.assumed, 99.9):.3g} % of your {self._pictures} hold it"
         return f"This assumes that {share}; if half of them did, it would be {at_half:.2f} after these looks."
 

@@ -110,6 +110,7 @@ def _rounded_points(scanpath: Fixations) -> list[list[float]]:
 
 def _bytes_of_map(density: Tensor) -> str:
     """Encode the share of the fixations in the smallest area that reaches each cell as bytes, in base 64."""
+    # Rounding may bring a sum above 1, and a byte above 255 begins at 0 again.
     shares = (shares_around(density).clamp(max=1) * 255).round().byte()  # (rows, columns)
     return base64.b64encode(shares.numpy().tobytes()).decode()
 

@@ -115,7 +115,7 @@ def scanpath_html(scanpath: Scanpath) -> str:
     """
     # Maps of classes fit beside those of background and entropy, and the acquisition values.
     cells = len(scanpath) * len(scanpath.grid)
-    bytes_of_map = 4 * cells / 3
+    bytes_of_map = 4 * cells / 3  # in base 64, four letters for three bytes
     classes = min(len(scanpath.classes) - 1, int((_MAPS - 8 * cells) / bytes_of_map - 2))
     if classes >= 1:
         views = None if scanpath.stimulus is None else scanpath.views()

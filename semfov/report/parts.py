@@ -133,7 +133,7 @@ class Part(ABC):
         """Make the row of an object in the list."""
         cells = [escape(found["label"]), f"{found['score']:.2f}"]
         if self.data["turns"]:
-            cells.append(f"{found['pan']:z.0f}°, {found['tilt']:z.0f}°")
+            cells.append(f"{found['pan']:z.0f}°, {found['tilt']:z.0f}°")  # z: never -0°
         cells.append(str(found["look"]))
         if self.data["confirmable"]:
             cells.append("yes" if found["confirmed"] else "no")

@@ -165,6 +165,7 @@ def run_command(
         with _signals(advice):
             settings = _parsed(config, make_parser(config, description, positional, program), arguments, words)
             code = main(settings)
+            # Here, so that a reader that is gone is noticed below, and not at the end of the process.
             sys.stdout.flush()
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -179,7 +180,7 @@ def run_command(
     except BrokenPipeError:
         # The reader of the output, such as `head`, has closed its end: discard what is still in the buffer.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return 141  # 128 + 13, as of a program that SIGPIPE has ended; Windows has no such signal
     except KeyboardInterrupt:
         # If the interrupt came while `exec` ran a string, as some packages do when they are imported, CPython remembers
         # it and would end by the signal although it was caught here. A string that runs to its end resets this.
@@ -255,6 +256,7 @@ def _signals(advice: str) -> Iterator[None]:
             _leave(number, frame)
         raise KeyboardInterrupt if number == signal.SIGINT else _Terminated(number)
 
+    # Under nohup SIGHUP is ignored, and the command is to outlive its terminal.
     signals = [number for number in _ENDINGS if signal.getsignal(number) != signal.SIG_IGN]
     before = {number: signal.signal(number, end) for number in signals}
     try:

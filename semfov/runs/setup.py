@@ -115,6 +115,7 @@ def detector_options(detector: DetectorConfig) -> dict[str, Any]:
             value = getattr(detector, name)
             check(not value, f"detector.{name}", expected, repr(value))
     default = DetectorConfig()
+    # A loader refuses options that it lacks, even with the value that they have by default.
     changed = [name for name in _OPTIONAL if getattr(detector, name) != getattr(default, name)]
     options = {name: getattr(detector, name) for name in ("threshold", "iou", "limit", *changed)}
     if detector.colour is not None:

@@ -58,6 +58,7 @@ def _open_cluster(address: str, *, again: bool = False) -> Iterator[tuple[Execut
         workers = client.scheduler_info()["workers"].values()
         if not workers:
             _log.warning("the scheduler at %s has no worker yet; start some with `dask worker %s`", address, address)
+        # If tasks were pure, Dask could answer one by the result of an equal one.
         executor = client.get_executor(pure=False)
         try:
             yield executor, max(1, sum(worker["nthreads"] for worker in workers))
@@ -82,7 +83,7 @@ def prepare_worker() -> None:
     # of the environment, which also takes away glibc's own rule.
     with suppress(OSError, AttributeError):  # other systems have no such setting
         setting = ctypes.CDLL(None).mallopt
-        setting(_MMAP_THRESHOLD, 31 << 20)
+        setting(_MMAP_THRESHOLD, 31 << 20)  # glibc refuses more than 32 MiB
         setting(_TRIM_THRESHOLD, 1 << 30)
     if multiprocessing.parent_process() is not None:
         logging.getLogger("semfov").setLevel(logging.ERROR)
@@ -263,6 +264,7 @@ def _in_processes(
         with ExitStack() as stack:
             pools, executors = shared or (stack, {})
             if processes not in executors:
+                # Processes that are kept may have more tasks in a later call.
                 number = processes if shared else min(processes, len(tasks))
                 executors[processes] = pools.enter_context(_started(number))
             yield from _results(executors[processes], job, tasks, tell, _deaf_children())
@@ -277,6 +279,7 @@ def _in_processes(
 def _started(processes: int) -> Iterator[Executor]:
     """Start processes of this machine, which end with the block, and at once if it fails."""
     before = multiprocessing.active_children()
+    # Not forked: a session of onnxruntime that is open here would have none of its threads there.
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _prepare) as pool:
         try:
             yield pool
