@@ -26,7 +26,7 @@ from eval.zoom.objects import (
     suppressed,
 )
 from eval.zoom.orders import in_order, quad_tree, shuffled
-from eval.zoom.report import recall_and_precision, recall_cells
+from eval.zoom.report import _recall_cells, recall_and_precision
 from eval.zoom.run import ZoomConfig, ZoomRun
 from semfov import FovealObservationModel
 from semfov.data.scene import Annotation, Scene
@@ -403,7 +403,7 @@ def test_recall_and_precision_are_shares_of_all_objects_and_boxes():
         assert got[0].tolist() == pytest.approx(expected)
         assert got[1, :2].tolist() == [0, 0]
         assert got[1, 2].isnan()
-    assert recall_cells(got[1], got[0], "+") == (["+0.000 ± 0.125", "+0.000 ± 0.625"], "-")
+    assert _recall_cells(got[1], got[0], "+") == (["+0.000 ± 0.125", "+0.000 ± 0.625"], "-")
 
 
 def test_orders_look_at_every_slice_once(zooming):
