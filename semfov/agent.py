@@ -27,7 +27,7 @@ from semfov.errors import InputError, check, check_options, checked_keywords
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
-from semfov.io.compatibility import check_grid, check_same_detector, check_sensor
+from semfov.io.compatibility import check_fitted
 from semfov.io.state import MovableModule
 from semfov.kinds import KindName, Quality
 from semfov.live import LivePerception
@@ -104,13 +104,9 @@ class ActivePerception(MovableModule):
         self.exploring = Strategy(*explore)
         check_cells(grid)
         self.columns, self.rows = grid
-        settings = eye.settings()
         for model in self.modules():
             if isinstance(model, FovealObservationModel | Verification):
-                fitted = model.metadata
-                check_same_detector(fitted.get("detector", {}), settings["detector"], model.title)
-                check_sensor(fitted.get("sensor", {}), settings["sensor"], model.title, strict=True)
-                check_grid(fitted.get("training", {}), grid, model.title)
+                check_fitted(model.metadata, eye.settings(), grid, model.title)
 
     @classmethod
     def recommended(
@@ -252,7 +248,12 @@ class ActivePerception(MovableModule):
             raise missing("an agent", name, AGENT, dir(type(self))) from None
 
     def forward(self, *arguments: object, **options: object) -> Any:
-        """Refuse a call of the agent itself with the names of its methods."""
+        """Refuse a call of the agent itself with the names of its methods.
+
+        Args:
+            *arguments: any.
+            **options: any.
+        """
         raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
 
     def __repr__(self) -> str:

@@ -91,6 +91,23 @@ def check_background(fitted: Settings, background: str | None, what: str) -> Non
     check(policy == background, "background", expected, f"{background!r}; {remedy}")
 
 
+def check_fitted(metadata: Settings, settings: Settings, grid: tuple[int, int], what: str) -> None:
+    """Check that a model was fitted for an eye and for the cells of a belief.
+
+    Args:
+        metadata: what the model says of its fit.
+        settings: those of the eye.
+        grid: `(columns, rows)` of the belief.
+        what: what the model is, for the message.
+
+    Raises:
+        InputError: it was fitted for another detector, sensor or grid.
+    """
+    check_same_detector(metadata.get("detector", {}), settings["detector"], what)
+    check_sensor(metadata.get("sensor", {}), settings["sensor"], what, strict=True)
+    check_grid(metadata.get("training", {}), grid, what)
+
+
 def check_same_detector(fitted: Settings, detector: Settings, what: str) -> None:
     """Check that a model is used with the detector that it was fitted for; warn where another setting differs.
 
