@@ -1,7 +1,6 @@
 """The agent: it looks at any picture, searches it for a class, finds all objects in it or explores it."""
 
 from collections.abc import Callable, Sequence
-from inspect import signature
 from os import PathLike, fspath
 from typing import Any, Self
 
@@ -21,7 +20,7 @@ from semfov.data.classes import class_numbers
 from semfov.data.inputs import Color
 from semfov.data.tone import White
 from semfov.data.windowed import ChosenBands
-from semfov.detection.load import DetectorLike, loader_options
+from semfov.detection.load import DetectorLike
 from semfov.detection.scores import HALVES
 from semfov.errors import InputError, check, check_options, checked_keywords
 from semfov.eye import Eye
@@ -35,7 +34,13 @@ from semfov.model_folder import is_model_file, open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.paths import GazePrediction, Record
 from semfov.paths.viewed import ScanpathLike
-from semfov.presets import model_file_arguments, published_arguments, raw_arguments, recommended_arguments
+from semfov.presets import (
+    model_file_arguments,
+    option_names,
+    published_arguments,
+    raw_arguments,
+    recommended_arguments,
+)
 from semfov.settings import (
     ExploreSettings,
     FindSettings,
@@ -57,11 +62,10 @@ _Targets = str | int | Sequence[str | int] | None  # a class by name or index, s
 class ActivePerception(MovableModule):
     """An agent that looks at any picture, to find a target, to find all objects, or to learn what is where.
 
-    The picture decides how the agent looks (`how="auto"`). At a flat picture of any size it looks at windows, the first
-    of them the whole picture, and chooses their places and magnifications (`windows`). In a scene, such as a
-    `semfov.Panorama`, it moves eye and head (`head`). `how="fovea"` moves the gaze of a fovea over the cells of a
-    photograph, as in the paper; without evidence for photographs, `auto` does so where the picture is less than four
-    times as long as the detector's input. `record.how` says which it was.
+    The picture decides how the agent looks (`how="auto"`): at windows of a flat picture, the first of them the whole
+    (`windows`), or with eye and head in a scene such as a `semfov.Panorama` (`head`). `how="fovea"` moves the gaze of a
+    fovea over the cells of a photograph, as in the paper; without evidence for photographs, `auto` does so where the
+    picture is less than four times as long as the detector's input. `record.how` says which it was.
 
     Args:
         eye: sensor and detector.
@@ -216,14 +220,7 @@ class ActivePerception(MovableModule):
     @classmethod
     def _of(cls, make: Callable[..., dict[str, Any]], /, *arguments: object, **options: Any) -> Self:
         """Make an agent of the parts that a function gives from the options of a constructor, ready for use."""
-        passed_on = [
-            parameter.name
-            for parameter in signature(make).parameters.values()
-            if parameter.kind not in (parameter.POSITIONAL_ONLY, parameter.VAR_KEYWORD)
-        ]
-        # The constructors have a `name` of their own.
-        names = [*passed_on, *(name for name in loader_options() if name not in ("name", "options"))]
-        check_options(options, names, "the agent or of semfov.load_detector")
+        check_options(options, option_names(make), "the agent or of semfov.load_detector")
         return cls(**make(*arguments, **options)).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -247,12 +244,15 @@ class ActivePerception(MovableModule):
         except AttributeError:
             raise missing("an agent", name, AGENT, dir(type(self))) from None
 
-    def forward(self, *arguments: object, **options: object) -> Any:
+    def forward(self, *arguments: object, **options: object) -> None:
         """Refuse a call of the agent itself with the names of its methods.
 
         Args:
             *arguments: any.
             **options: any.
+
+        Raises:
+            InputError: always.
         """
         raise InputError("an agent is not called itself: it has search, find_all, explore, gaze and live")
 
@@ -260,8 +260,8 @@ class ActivePerception(MovableModule):
         """Write the detector, the sensor and the parts that were fitted in one line."""
         fitted = [name for name in ("windows", "verification") if getattr(self, name) is not None]
         detector = f"{self.eye.detector.settings()['name']}, {len(self.classes) - 1} classes"
-        sensor = type(self.eye.sensor).__name__
-        return f"{type(self).__name__}({detector}, {sensor}, cells={(self.columns, self.rows)}, fitted={fitted})"
+        parts = f"{detector}, {type(self.eye.sensor).__name__}, cells={(self.columns, self.rows)}, fitted={fitted}"
+        return f"{type(self).__name__}({parts})"
 
     @property
     def classes(self) -> tuple[str, ...]:

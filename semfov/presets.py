@@ -4,13 +4,15 @@ Each function returns the arguments of `semfov.ActivePerception`. The class meth
 and `raw` document the parameters.
 """
 
+from collections.abc import Callable
+from inspect import signature
 from os import PathLike, fspath
 from typing import Any
 
 from semfov.belief.grid import check_cells
 from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.belief.verification import Verification
-from semfov.detection.load import DetectorLike, load_detector
+from semfov.detection.load import DetectorLike, load_detector, loader_options
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy
@@ -23,6 +25,17 @@ from semfov.zoom import GlimpseEvidence
 
 PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.published)
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
+
+
+def option_names(make: Callable[..., dict[str, Any]]) -> list[str]:
+    """List the options of a constructor: those of a function of this module, and those of `load_detector`."""
+    passed_on = [
+        parameter.name
+        for parameter in signature(make).parameters.values()
+        if parameter.kind not in (parameter.POSITIONAL_ONLY, parameter.VAR_KEYWORD)
+    ]
+    # The constructors have a `name` of their own.
+    return [*passed_on, *(name for name in loader_options() if name not in ("name", "options"))]
 
 
 def recommended_arguments(name: DetectorLike, /, grid: tuple[int, int], **options: Any) -> dict[str, Any]:
