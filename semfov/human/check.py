@@ -187,6 +187,8 @@ class _Reading(NamedTuple):
 
     def report(self, path: Path) -> FixationReport:
         """Read one file of fixations, and say what is suspicious."""
+        if self.sizes is not None:
+            self.sizes.damage.clear()  # what is said of a file is of its own pictures
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what the lines below say
             warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say

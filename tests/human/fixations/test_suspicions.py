@@ -161,6 +161,21 @@ def test_damaged_pictures_are_named_and_the_others_are_compared(tmp_path, capsys
     assert "; or leave out the lines of this picture, or give --size\n" in capsys.readouterr().err
 
 
+def test_damage_of_a_picture_is_said_of_the_files_that_name_it(tmp_path, capsys):
+    folder = tmp_path / "viewed"
+    folder.mkdir()
+    (folder / "0.jpg").write_bytes(b"no picture")
+    Image.new("L", SIZE).save(folder / "1.jpg")
+    first, second, frameless = (tmp_path / f"{name}.csv" for name in ("first", "second", "frameless"))
+    write_table(first, people(1))
+    write_table(second, people(2)[1:])
+    frameless.write_text("picture,subject,x,y\n1.jpg,1,900,40\n")  # outside its frame, which is a whole picture
+    assert main(["check", *map(str, (first, second, frameless)), "--picture", str(folder)]) == 1
+    of_first, of_others = capsys.readouterr().out.split(f"{second}: ")
+    assert f"suspicious: image {folder / '0.jpg'}: " in of_first
+    assert "0.jpg" not in of_others
+
+
 def test_fixations_in_the_pixels_of_smaller_pictures_are_told():
     smaller = {f"{number}.jpg": (640, 480) for number in range(40)}
     within = [replace(each, size=SIZE) for each in people(size=(640, 480))]
