@@ -250,8 +250,9 @@ class _Reading(NamedTuple):
             try:
                 return read_by(reader, path, {**arguments, "size": self.sizes})
             except InputError:
-                # Whose frames are the pictures cannot be read without them.
-                for damage in self.sizes.damage.values():
+                if self.sizes.damage:
+                    # A file whose frames are its pictures cannot be read without their sizes.
+                    damage = next(iter(self.sizes.damage.values()))
                     raise DataError(f"{damage}; or leave out the lines of this picture, or give --size") from None
                 raise
 
