@@ -14,7 +14,7 @@ from semfov.data.fixations import Fixations
 from semfov.data.large import picture_size
 from semfov.data.sources import PHOTOGRAPHS, picture_files
 from semfov.errors import DataError, InputError, SemfovError, check, printable
-from semfov.human.density_check import suspicions_by_content
+from semfov.human.density_check import damage_lines, suspicions_by_content
 from semfov.human.fixations.reading import DATA_SETS, frame_of, read_by, reader_of
 from semfov.human.fixations.suspicions import other_frame_of, suspicions
 from semfov.human.fixations.table import FrameError, PictureError, read_table
@@ -22,7 +22,6 @@ from semfov.human.fixations.table import FrameError, PictureError, read_table
 _Reader = Callable[..., list[Fixations]]
 
 _FRAMES_NAMED = 3  # largest number of sizes of frames that are named
-_DAMAGED_NAMED = 3  # largest number of damaged pictures that are named
 _WITHOUT_FRAMES = ("OSIE", "COCO-Search18")  # data sets whose files need not have the size of their frames
 
 
@@ -205,9 +204,7 @@ class _Reading(NamedTuple):
         """Say why pictures cannot be opened, the first of them."""
         if self.sizes is None:
             return []
-        errors = [*self.sizes.damage.values()]
-        more = len(errors) - _DAMAGED_NAMED
-        return [*map(str, errors[:_DAMAGED_NAMED]), *([f"{more} more pictures cannot be opened"] if more > 0 else [])]
+        return damage_lines([*self.sizes.damage.values()])
 
     def _suspicions_by_content(self, records: Sequence[Fixations]) -> list[str]:
         """Compare fixations with where people look in their pictures, if there are pictures."""

@@ -9,12 +9,15 @@ from torch import Tensor
 
 from semfov.agents.picture import OpenedPicture
 from semfov.cli.options import DEFAULT_DETECTOR
+from semfov.data.classes import amount
 from semfov.data.fixations import Fixations
 from semfov.detection.load import load_detector
 from semfov.errors import SemfovError
 from semfov.human.content import CONTENT_PICTURES, FEWEST_PICTURES, content_suspicions
 from semfov.paths.gaze import GazePrediction
 from semfov.runs.progress import task_bar
+
+_DAMAGED_NAMED = 3  # largest number of damaged pictures that are named
 
 
 def suspicions_by_content(
@@ -42,14 +45,22 @@ def suspicions_by_content(
     detector = load_detector(DEFAULT_DETECTOR)
     densities: dict[str, Tensor] = {}
     picture_sizes: dict[str, tuple[int, int]] = {}
-    damage: list[str] = []
+    errors: list[SemfovError] = []
     with task_bar(len(names), "where people look", "picture", hidden=quiet) as bar:
         for name in names:
             try:
                 image, size = OpenedPicture.of(path_of(name)).viewed(torch.zeros(1))
+            except SemfovError as error:  # its head tells a size, but the rest cannot be decoded
+                errors.append(error)
+            else:
                 densities[name] = GazePrediction.of(detector, image, size=size).cells
                 picture_sizes[name] = sizes[name]
-            except SemfovError as error:  # its head tells a size, but the rest cannot be decoded
-                damage.append(str(error))
             bar.update()
-    return damage + content_suspicions(records, densities, picture_sizes)
+    return damage_lines(errors) + content_suspicions(records, densities, picture_sizes)
+
+
+def damage_lines(errors: Sequence[SemfovError]) -> list[str]:
+    """Say why pictures cannot be opened, the first of them."""
+    more = len(errors) - _DAMAGED_NAMED
+    rest = [f"{amount(more, 'more picture')} cannot be opened"] if more > 0 else []
+    return [*map(str, errors[:_DAMAGED_NAMED]), *rest]

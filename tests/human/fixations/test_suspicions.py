@@ -176,6 +176,23 @@ def test_damage_of_a_picture_is_said_of_the_files_that_name_it(tmp_path, capsys)
     assert "0.jpg" not in of_others
 
 
+def test_of_many_damaged_pictures_the_first_are_named(tmp_path, capsys):
+    heads, bodies = tmp_path / "heads", tmp_path / "bodies"
+    for folder, kept in ((heads, 4), (bodies, 5000)):
+        folder.mkdir()
+        for number in range(7):
+            Image.effect_noise(SIZE, 50).save(folder / f"{number}.jpg")
+        for number in range(2, 6):
+            damaged = folder / f"{number}.jpg"
+            damaged.write_bytes(damaged.read_bytes()[:kept])
+    write_table(tmp_path / "t.csv", people(7))
+    for folder in (heads, bodies):
+        assert main(["check", str(tmp_path / "t.csv"), "--picture", str(folder)]) == 1
+        shown = capsys.readouterr().out
+        assert shown.count("suspicious: image ") == 3
+        assert "suspicious: 1 more picture cannot be opened\n" in shown
+
+
 def test_fixations_in_the_pixels_of_smaller_pictures_are_told():
     smaller = {f"{number}.jpg": (640, 480) for number in range(40)}
     within = [replace(each, size=SIZE) for each in people(size=(640, 480))]
