@@ -303,10 +303,10 @@ def former_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Re
 
 
 def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """Decorate a method so that unknown or missing arguments raise `InputError` with a suggestion."""
+    """Decorate a function or a method so that wrong arguments raise `InputError` with a suggestion."""
     form = signature(function)
     name = function.__qualname__.removesuffix(".__init__").rpartition(".")[-1]
-    known = [*form.parameters][1:]  # without `self`
+    known = [parameter for parameter in form.parameters if parameter != "self"]
 
     @wraps(function)
     def call(*arguments: _Given.args, **options: _Given.kwargs) -> _Result:
@@ -323,18 +323,18 @@ def checked_keywords(function: Callable[_Given, _Result]) -> Callable[_Given, _R
 
 
 def _right_form(name: str, form: Signature, number: int) -> str:
-    """Say how a method is called, or what else takes what it was given.
+    """Say how a function or a method is called, or what else takes what it was given.
 
     Args:
-        name: name of the method.
+        name: its name.
         form: its signature.
-        number: number of arguments, with `self`, that were given without a name.
+        number: number of arguments, of a method with `self`, that were given without a name.
     """
-    _, *parameters = form.parameters.values()  # without `self`
+    parameters = [p for p in form.parameters.values() if p.name != "self"]
     words = [p.name if p.default is p.empty else f"{p.name}=" for p in parameters]
     remedy = f"expected {', '.join(words)}"
-    unnamed = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    if number > 1 + len(unnamed):
+    unnamed = [p for p in form.parameters.values() if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if number > len(unnamed):
         # What is given without a name, beside the picture, is what others look for.
         remedy = other_method(name, "target", [p.name for p in parameters]) or remedy
     return f"{remedy}; {MAKERS[name]} makes one" if name in MAKERS else remedy

@@ -32,7 +32,10 @@ from semfov.gaze.saliency import VOCUS2, IttiKoch
 from semfov.live import LivePerception
 from semfov.paths import GazePrediction, Scanpath, WindowMoment
 from semfov.paths.outcome import NumberByClass
+from semfov.report.episode import episode_data
+from semfov.report.zoom import zoom_data
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
+from semfov.viz import plot_scanpath
 from semfov.zoom import GlimpseEvidence
 from tests import small
 
@@ -462,6 +465,17 @@ def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
 def test_what_others_call_it_and_other_forms_of_a_call_are_refused_with_ours(call, said, agent):
     with pytest.raises((SemfovError, AttributeError, TypeError), match=f"^{said}"):
         call(agent)
+
+
+def test_functions_take_their_first_argument_by_name_too(agent):
+    fovea, windows = agent.explore(PIXELS, shifts=1), agent.find_all(PIXELS, "cup")
+    assert plot_scanpath(scanpath=fovea, image=PIXELS).axes
+    assert episode_data(scanpath=fovea, image=None, views=None, name="a")["name"] == "a"
+    assert zoom_data(path=windows, picture=None, name="a")["name"] == "a"
+    with pytest.raises(SemfovError, match=r"^plot_scanpath: too many .*; expected scanpath, image=, boxes="):
+        plot_scanpath(fovea, PIXELS, None)
+    with pytest.raises(SemfovError, match=r"^scanpth: .* of plot_scanpath, .* did you mean scanpath="):
+        plot_scanpath(scanpth=fovea)
 
 
 def test_numbers_by_class_are_asked_for_in_every_way_of_a_dict_by_the_same_names():
