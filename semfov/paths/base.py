@@ -22,7 +22,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.windowed import LargePicture
 from semfov.decision import CloseUp
 from semfov.detection.detections import Detections
-from semfov.errors import DataError, InputError, check, reason_of
+from semfov.errors import DataError, InputError, check, check_options, reason_of
 from semfov.paths.conversion import Conversion, Values
 from semfov.paths.files import PLAIN, Format, SharedFields
 from semfov.paths.look import Box, LookView, RecordedLook, read_region, whole_pixels
@@ -73,6 +73,7 @@ class Record(Conversion):
     """
 
     _format: ClassVar[Format]
+    _page_options: ClassVar[tuple[str, ...]] = ("picture", "name", "boxes", "width", "quality")
 
     def __str__(self) -> str:
         """Return the summary, the looks, and the most confident objects."""
@@ -242,16 +243,19 @@ class Record(Conversion):
             title: heading of the page; None takes what was looked for.
             options: `picture`, the picture in full size, in which narrow windows are sharp; None takes the one that the
                 record keeps. `name`, the name of the picture on the page. `boxes`, `(M, 4)`, true boxes of the target.
+                `width`, that of the page's pictures in pixels, and `quality`, that of their JPEGs.
 
         Returns:
             The path.
 
         Raises:
-            InputError: the picture was not kept, and none is given.
+            InputError: the picture was not kept, and none is given; or an option is unknown.
             DataError: the file cannot be written.
         """
         from semfov.report.page import write_page
 
+        # What makes the data of the page knows neither the title nor whose option it is.
+        check_options(options, ["title", *self._page_options], "report")
         return write_page(Path(path), title or f"semfov: {self.words.task}", [self.page_data(**options)])
 
     def page_data(self, picture: Any = None, *, name: str | None = None, **options: Any) -> Values:

@@ -239,6 +239,7 @@ class Scanpath(_CellRecord):
 
     _words = ScanpathWords
     _format = _FORMAT
+    _page_options = (*Record._page_options, "settings", "classes")
     _tensors = "cells", "fixations", "probabilities", "values", "posterior", "presence"
 
     def __getstate__(self) -> dict[str, object]:

@@ -554,6 +554,17 @@ def test_every_record_draws_itself_on_its_picture(make, tmp_path):
 
 
 @pytest.mark.parametrize("make", RECORDS)
+def test_unknown_options_of_a_page_are_refused_with_those_of_the_page(make, tmp_path):
+    record = with_picture(make)
+    page = tmp_path / "page.html"
+    refused("titel: expected an option of report, .*; did you mean title=", record.report, page, titel="Cups")
+    refused("image: expected an option of report, .*; did you mean picture=", record.report, page, image=None)
+    assert not page.exists()
+    options = {"classes": 1, "settings": None} if make is scanpath else {}
+    record.report(page, picture=None, name="a", boxes=None, width=40, quality=60, **options)
+
+
+@pytest.mark.parametrize("make", RECORDS)
 def test_a_file_keeps_the_picture(make, tmp_path):
     record = replace(with_picture(make), targets=(1, 2), score_threshold=0.4, source="a.jpg")
     file = tmp_path / "a.safetensors"
