@@ -13,9 +13,9 @@ function stepper({ last, show, word, pause, first = 1 }) {
     document.querySelector(".controls").hidden = last() === 0;
     find("fixation").max = last();
     find("fixation").value = steps.at;
-    // Before the first step all are shown together.
+    // Before the first step all are shown.
     const place = steps.at + first;
-    const number = place > 0 ? `${place} of ${last() + first}` : `1 to ${last()}`;
+    const number = place > 0 ? `${place} of ${last() + first}` : "all";
     find("fixation").setAttribute("aria-valuetext", `${word()} ${number}`);
     find("number").textContent = number;
     find("back").disabled = steps.at === 0;
