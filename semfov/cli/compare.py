@@ -23,6 +23,7 @@ from semfov.viz.compare import plot_comparison
 from semfov.viz.style import save_figure
 from semfov.zoom.eye import WindowEye
 
+_FILES = (".html", ".htm", ".csv", ".png", ".json")  # ends of the names of files that others would write
 _COLUMNS = ("way", "passes", "seconds", "ap50", "listed", "right", "reference")
 _HEADINGS = ("way", "passes", "seconds", "AP50", "listed", "right", "of")
 
@@ -69,7 +70,7 @@ def compare(options: CompareOptions) -> int:
 
 def _check_options(options: CompareOptions) -> None:
     """Raise an error for options that cannot be followed, before anything is loaded."""
-    is_folder = not options.out.suffix or options.out.is_dir()
+    is_folder = options.out.suffix.lower() not in _FILES or options.out.is_dir()
     check(is_folder, "out", "a folder, for compare.html, compare.csv and compare.png", options.out)
     check_writable(options.out, folder=True)
     check(bool(options.with_), "with", "sahi, ranked, or both", "none")

@@ -28,10 +28,10 @@ def compare(run, agent, evidence, monkeypatch, tmp_path):
             picture.paste((230, 20, 20), (x, y, x + 40, y + 40))
         picture.save(pictures / f"{name}.png")
 
-    def run_compare(*options):
-        code, printed = run("compare", pictures, "--target", "red", "--out", tmp_path / "out", *options)
+    def run_compare(*options, out="out"):
+        code, printed = run("compare", pictures, "--target", "red", "--out", tmp_path / out, *options)
         points: dict[str, list[dict[str, str]]] = {}
-        table = tmp_path / "out" / "compare.csv"
+        table = tmp_path / out / "compare.csv"
         if table.exists():
             for row in csv.DictReader(table.read_text("utf-8").splitlines()):
                 points.setdefault(row["way"], []).append(row)
@@ -125,6 +125,14 @@ def test_what_cannot_be_compared_is_refused(compare, truth, tmp_path):
     assert code == 1
     assert "skipped" in printed.err
     assert points["all slices"][0]["reference"] == "3"
+
+
+def test_the_name_of_the_folder_may_have_a_point(compare, tmp_path):
+    code, _, points = compare("--passes", 1, "--slice", 640, out="run-1.5")
+    assert (code, sorted(points)) == (0, ["all slices", "semfov"])
+    code, printed, _ = compare("--passes", 1, out="page.HTML")
+    assert code != 0
+    assert "out: expected a folder, for compare.html, compare.csv and compare.png" in printed.err
 
 
 def test_where_every_picture_is_skipped_nothing_is_written(compare, truth, tmp_path):
