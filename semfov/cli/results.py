@@ -134,7 +134,8 @@ def held_outputs(options: object) -> AbstractContextManager[None]:
         path = getattr(options, name, None)  # not all commands have all of them
         if path in (None, STDOUT):
             continue
-        is_folder = path.is_dir() or not path.suffix
+        # A folder that is not there yet may have a point in its name.
+        is_folder = name in ("crops", "labels") or path.is_dir() or not path.suffix
         (folders if is_folder else files).append(path)
     return written_alone(files, folders)
 

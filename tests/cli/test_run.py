@@ -20,6 +20,7 @@ from semfov import DataError, InputError, read_image, viz
 from semfov.cli import outcome, written
 from semfov.cli.jobs import FindJob
 from semfov.cli.options import FindOptions, SearchOptions
+from semfov.cli.results import held_outputs
 from semfov.cli.search import _assumed_in_all
 from semfov.cli.totals import expected_in_all, found_in_all
 from semfov.gaze.policies import Policy
@@ -248,6 +249,14 @@ def test_calls_of_several_threads_look_at_their_own_pictures(agent, flight, monk
     calls[0].join()
     assert [row["width"] for row in own] == [96, 96]
     assert [row["width"] for row in rows] == [160, 160]
+
+
+def test_two_commands_cannot_make_a_folder_with_a_point_in_its_name(tmp_path):
+    options = SimpleNamespace(labels=tmp_path / "labels-1.5")
+    with held_outputs(options):
+        options.labels.mkdir(exist_ok=True)
+        with pytest.raises(DataError, match="another command is writing it"), held_outputs(options):
+            pass
 
 
 def test_crops_and_labels_keep_the_places_of_their_pictures(agent, flight, tmp_path):
