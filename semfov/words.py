@@ -137,7 +137,7 @@ ADVICE = {**_ADVICE, **_ADVICE_FOR_OBJECTS, **_ADVICE_FOR_GAZE}
 ADVICE_OF = {
     **{command: {**_ADVICE, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")},
     "gaze": {**_ADVICE, **_ADVICE_FOR_GAZE},
-    "compare": _by_word({"--out FOLDER has compare.html, compare.csv and compare.png": "html page plot report"}),
+    "compare": _by_word({"--out FOLDER has compare.html, compare.csv and compare.png": "html page report"}),
 }
 """The same for the options of each command."""
 
