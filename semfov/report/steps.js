@@ -1,7 +1,7 @@
 "use strict";
 // The controls of a page of steps: a slider, buttons, keys, and playing. `last` gives the place of the last step, from
 // 0, `show` draws the step that `steps.at` tells, `word` names one, and `first` is the number that a reader sees of the
-// first one.
+// first one, where 0 is the step that shows all.
 const find = (id) => document.getElementById(id);
 document.documentElement.classList.add("scripted");
 
