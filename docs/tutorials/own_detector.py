@@ -130,6 +130,6 @@ viz.plot_episode(scanpath)
 
 # %% [markdown]
 # For practical use, fit on thousands of photographs: `semfov fit` fits everything that the
-# recommended agent needs ([your detector in three commands](../detectors.md#your-detector-in-three-commands)).
+# recommended agent needs ([your detector](../detectors.md#your-detector)).
 #
 # Next: [your policy](own_policy.py).
