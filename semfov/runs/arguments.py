@@ -29,7 +29,7 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         options: the options of the parser, with underscores, such as `--stop_below`.
 
     Returns:
-        The words for the parser, those that belong to no option first. What it does not know stays as it is.
+        The words for the parser, those that belong to no option first. Options that it does not know stay as they are.
 
     Raises:
         InputError: an option that takes one value is given twice, or one that takes a file is given no name.
@@ -52,6 +52,10 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
                 usual.append(words.popleft())
         elif word.startswith("-") and word != "-":
             usual.append(word)  # left to the parser, with its messages
+            # An item of a dictionary, as `--sensor.settings.fovea`, is no option of its own, but has a value.
+            is_item = option.rpartition(".")[0] in options and "=" not in word
+            if is_item and words and not words[0].startswith("--"):
+                usual.append(words.popleft())
         else:
             free.append(word)
     return [*free, *usual]

@@ -15,6 +15,7 @@ from semfov.cli.main import _completion, _in_command_words, _options_of, main
 from semfov.cli.outcome import table_lines
 from semfov.cli.results import kind_of
 from semfov.errors import InputError
+from semfov.fit.settings import FitDetectorConfig
 from semfov.runs.arguments import usual_form
 from semfov.runs.command import make_parser
 from tests import small
@@ -332,6 +333,15 @@ def test_pictures_may_stand_before_between_and_after_options(given):
     parsed = parser.parse_args(usual_form(given.split(), options.GazeOptions, parser._option_string_actions))
     assert [str(picture) for picture in parsed.pictures] == ["a.jpg", "b.jpg"]
     assert (parsed.areas, parsed.people) == ("logo:1,2,3,4 price:5,6,7,8", 3)
+
+
+@pytest.mark.parametrize("item", ["--sensor.settings.fovea 80", "--sensor.settings.fovea=80"])
+def test_an_item_of_a_dictionary_keeps_its_value_beside_words(item):
+    parser = make_parser(FitDetectorConfig, None, ("model", "a detector"))
+    given = f"my.onnx --columns 3 {item} --rows 2".split()
+    parsed = parser.parse_args(usual_form(given, FitDetectorConfig, parser._option_string_actions))
+    assert str(parsed.model) == "my.onnx"
+    assert (parsed.columns, parsed.rows, parsed.sensor.settings) == (3, 2, {"fovea": 80})
 
 
 def test_a_shell_completes_commands_and_options():
