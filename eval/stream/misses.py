@@ -74,24 +74,25 @@ class Misses:
             counts: whether the frame counts, or is only remembered.
         """
         overlaps = box_iou(boxes.float(), within(tracks.boxes, frame))
+        inside = inside_frame(tracks.boxes, frame)
         numbers = identities.tolist()
         for region in regions:
             is_shown = (boxes[:, :2] >= boxes.new_tensor(region[:2])) & (boxes[:, 2:] <= boxes.new_tensor(region[2:]))
             self._looked_at.update(identities[is_shown.all(-1)].tolist())
         if counts:
-            fates = [self._fate(number, row, tracks) for number, row in zip(numbers, overlaps, strict=True)]
+            fits = (overlaps >= _SAME) & inside
+            fates = [self._fate(number, row, tracks) for number, row in zip(numbers, fits, strict=True)]
             self.counts.objects.update(fates)
             if moving is not None:
                 self.counts.moving.update(fate for fate, moves in zip(fates, moving.tolist(), strict=True) if moves)
-            is_listed = (tracks.probability >= LIKELY) & inside_frame(tracks.boxes, frame)
+            is_listed = (tracks.probability >= LIKELY) & inside
             self.counts.errors.update(_errors(overlaps[:, is_listed]))
         for number, row in zip(numbers, overlaps, strict=True):
             if (row >= _SAME).any():
                 self._track_of[number] = int(tracks.track_ids[int(row.argmax())])
 
-    def _fate(self, number: int, overlaps: Tensor, tracks: Tracks) -> str:
-        """Tell what became of an object, by its overlaps with the tracks `(T,)`."""
-        fits = overlaps >= _SAME
+    def _fate(self, number: int, fits: Tensor, tracks: Tracks) -> str:
+        """Tell what became of an object, by the tracks in the frame that fit it `(T,)`."""
         if (tracks.probability[fits] >= LIKELY).any():
             return LISTED
         if fits.any():
@@ -119,11 +120,10 @@ def _errors(overlaps: Tensor) -> list[str]:
 
 def miss_rows(counts: MissCounts) -> list[list[str]]:
     """Make the rows of a table: the share of all boxes, and of those that move, by what became of them."""
-    totals = [max(counts.objects.total(), 1), max(counts.moving.total(), 1)]
-    rows = []
-    for fate in (LISTED, *CAUSES):
-        shares = [
-            number / total for number, total in zip((counts.objects[fate], counts.moving[fate]), totals, strict=True)
-        ]
-        rows.append([fate, *(f"{share:.3f}" for share in shares)])
-    return rows
+    groups = counts.objects, counts.moving
+    return [[fate, *(_share(group, fate) for group in groups)] for fate in (LISTED, *CAUSES)]
+
+
+def _share(group: Counter[str], fate: str) -> str:
+    """Write the share of boxes that a fate has; `-` where there are none."""
+    return f"{group[fate] / group.total():.3f}" if group else "-"

@@ -101,8 +101,8 @@ def course_tables(course: str, outcomes: Sequence[StreamOutcome], config: Stream
         *table(listed),
         "",
         *reliability_table(by, config.after),
-        *identity_table(outcomes),
-        *miss_tables(outcomes),
+        *identity_table(outcomes, config.after),
+        *miss_tables(outcomes, config.after),
     ]
 
 
@@ -130,7 +130,7 @@ def reliability_cells(records: Sequence[ResultRecord]) -> list[str]:
     return cells
 
 
-def identity_table(outcomes: Sequence[StreamOutcome]) -> list[str]:
+def identity_table(outcomes: Sequence[StreamOutcome], after: int) -> list[str]:
     """Table of how well numbers stay with their objects, of the ways that tell numbers; empty without any."""
     rows = [["", "IDF1", "found, of all boxes", "found, of objects that move"]]
     for way in outcomes[0].identities:
@@ -140,14 +140,15 @@ def identity_table(outcomes: Sequence[StreamOutcome]) -> list[str]:
     if len(rows) == 1:
         return []
     return [
-        "IDF1 of the objects that are listed, and the share of boxes that are found, in all frames.",
+        "IDF1 of the objects that are listed, and the share of boxes that are found, in all frames after the first "
+        f"{after}.",
         "",
         *table(rows),
         "",
     ]
 
 
-def miss_tables(outcomes: Sequence[StreamOutcome]) -> list[str]:
+def miss_tables(outcomes: Sequence[StreamOutcome], after: int) -> list[str]:
     """Tables of what becomes of objects in the lists of the agent; empty where their numbers are not known."""
     lines: list[str] = []
     for way in outcomes[0].misses:
@@ -156,8 +157,8 @@ def miss_tables(outcomes: Sequence[StreamOutcome]) -> list[str]:
             continue
         errors = ", ".join(f"{counts.errors[kind]} {kind}" for kind in ERRORS)
         lines += [
-            f"Why boxes of objects are not listed ({way}), as shares in all frames. Listed boxes that are wrong: "
-            f"{errors}.",
+            f"Why boxes of objects are not listed ({way}), as shares in all frames after the first {after}. Listed "
+            f"boxes that are wrong: {errors}.",
             "",
             *table([["", "of all boxes", "of objects that move"], *miss_rows(counts)]),
             "",

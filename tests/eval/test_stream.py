@@ -316,6 +316,16 @@ def test_why_an_object_is_missed_after_it_was_found(tracks, fate, errors):
     assert [*rows] == [LISTED, *CAUSES]
 
 
+def test_a_track_that_leaves_the_frame_lists_no_object():
+    """Its box, cut to the frame, fits the object, but it is not listed."""
+    misses, box = Misses(), torch.tensor([[600.0, 100, 640, 140]])
+    misses.step(torch.tensor([7]), box, tracks_at((610, 100, 690, 140)), [], (640, 480))
+    assert misses.counts.objects == {"not looked at": 1}
+    assert not +misses.counts.errors
+    # No object moves on its own, so that there is nothing to have a share of.
+    assert [row[1:] for row in miss_rows(misses.counts) if row[0] == "not looked at"] == [["1.000", "-"]]
+
+
 def test_an_object_is_not_detected_once_a_look_has_shown_all_of_it():
     misses, number, box = Misses(), torch.tensor([7]), torch.tensor([[100.0, 100, 140, 140]])
     misses.step(number, box, tracks_at(), [(0.0, 0.0, 120.0, 480.0)], FRAME)
