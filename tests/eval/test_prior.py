@@ -105,4 +105,5 @@ def test_enlarged_photographs_show_the_same_objects():
     # The middle of each block of 3 x 3 pixels is the pixel itself.
     assert torch.allclose(scene.image[:, 1::3, 1::3], before.image, atol=1e-5)
     assert enlarged.digest(1) not in {scenes.digest(1), enlarged.digest(0)}
+    assert enlarged.fingerprint != scenes.fingerprint
     assert (enlarged.ids, enlarged.classes) == (scenes.ids, scenes.classes)
