@@ -258,8 +258,7 @@ def _search_scene(config: _SembaConfig, run: Looking, index: int) -> list[Tensor
     for step, rule in product(_STEPS, _RULES):
         looks_of_code = code_looks[step.picture]
         looks: Looks = looks_of_code if step.scores else looks_here
-        inhibited = _Inhibited(noise, looks_of_code, escape=step.escape)
-        choice = inhibited if step.inhibition else Greedy(drawn_from(noise))
+        choice = _Inhibited(noise, looks_of_code, escape=step.escape) if step.inhibition else Greedy(drawn_from(noise))
         # Scores of the code have no component for background: classes are components from 0 on.
         first = 0 if step.scores else 1
         observer = Semantic(len(run.scenes.classes) + first, prior=config.belief.prior, fusion=rule)
