@@ -144,7 +144,7 @@ def measure(config: ContentConfig) -> list[str]:
         The lines of the table.
     """
     by_picture: dict[str, list[Fixations]] = {}
-    frame = {} if config.frame is None else {"size": frame_of(config.frame)}
+    frame = {} if config.frame is None else {"size": frame_of(config.frame, "frame")}
     for record in read_fixations(config.fixations, **frame):
         if record.subject not in config.without and len(record):
             by_picture.setdefault(record.picture, []).append(record)

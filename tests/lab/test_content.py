@@ -7,6 +7,7 @@ import torch
 from eval import content
 from eval.content import ContentConfig, measure
 from semfov.data.fixations import Fixations, write_osie, write_table
+from semfov.errors import InputError
 
 
 @pytest.fixture
@@ -48,6 +49,11 @@ def test_the_table_says_how_often_an_offset_is_right(recorded, tmp_path):
     assert rows["one person shifted by (70, -50)"][within] == "1.00"
     assert rows["y upwards"][1:3] == ["1.00", ""]
     assert rows["none"][1] == "0.00"
+
+
+def test_a_frame_without_a_height_is_named_by_its_option(tmp_path):
+    with pytest.raises(InputError, match="frame: expected a width and a height, as 1920,1080, got '640'"):
+        measure(ContentConfig(fixations=tmp_path / "people.json", frame="640"))
 
 
 def test_a_file_without_a_frame_is_given_one_and_a_page_its_table(recorded, tmp_path):

@@ -135,10 +135,10 @@ def _is_eyelink(source: str | PathLike[str]) -> bool:
     return read_text(source, WINDOWS).lstrip().startswith(("** CONVERTED FROM", "MSG\t"))
 
 
-def frame_of(text: str) -> tuple[int, int]:
-    """Read the width and the height of a frame that a command line gives, such as `1920,1080` or `800x600`."""
+def frame_of(text: str, name: str = "size") -> tuple[int, int]:
+    """Read the width and the height of a frame that the option `name` gives, such as `1920,1080` or `800x600`."""
     try:
         width, height = (int(side) for side in text.lower().replace("x", ",").split(","))
     except ValueError:
-        raise InputError(f"size: expected a width and a height, as 1920,1080, got {text!r}") from None
+        raise InputError(f"{name}: expected a width and a height, as 1920,1080, got {text!r}") from None
     return width, height
