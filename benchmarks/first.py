@@ -5,6 +5,7 @@ onnxruntime and OpenCV (`benchmarks/bare.py`). Each program is a process of its 
 those of the processor, of all threads.
 """
 
+import argparse
 import os
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from pathlib import Path
 from shutil import copytree, ignore_patterns
 
 from benchmarks.machine import describe
-from benchmarks.tables import command, number, page, spread, table, write
+from benchmarks.tables import RESULTS, number, page, spread, table, write
 from benchmarks.timing import Spread
 from semfov.detection.weights import fetch
 from semfov.errors import check
@@ -75,13 +76,15 @@ def seconds(words: Sequence[str], environment: Mapping[str, str], folder: Path) 
     with subprocess.Popen(words, env=environment, cwd=folder, stdout=subprocess.DEVNULL) as process:
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
-    check(process.returncode == 0, "program", "the exit code 0", process.returncode)
+    check(process.returncode == 0, f"program {words[:4]}", "the exit code 0", process.returncode)
     return usage.ru_utime + usage.ru_stime
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and write the table."""
-    parser = command("benchmarks.first", __doc__, seconds=0.0)
+    lines = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("python -m benchmarks.first", description=__doc__, formatter_class=lines)
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     parser.add_argument("--picture", type=Path, required=True, help="photograph (JPEG)")
     parser.add_argument("--weights", type=Path, help="ONNX file of YOLOX-nano")
     options = parser.parse_args(arguments)
@@ -109,6 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 print(" | ".join(rows[-1]), flush=True)
     head = ["environment", "program", "s", "bare script, s", "program by script", "at most"]
     about = describe() | {"times": "of the processor"}
+    del about["threads"]  # each program has as many as it takes
     write(options.out, "first", page("First answer", TEXT, about, table(head, rows)), {"machine": about, "s": figures})
 
 
