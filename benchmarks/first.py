@@ -71,12 +71,12 @@ def environments(folder: Path) -> dict[str, dict[str, str]]:
     }
 
 
-def seconds(words: Sequence[str], environment: Mapping[str, str], folder: Path) -> float:
+def seconds(name: str, words: Sequence[str], environment: Mapping[str, str], folder: Path) -> float:
     """Run a program to its end; returns its seconds of the processor."""
     with subprocess.Popen(words, env=environment, cwd=folder, stdout=subprocess.DEVNULL) as process:
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
-    check(process.returncode == 0, f"program {words[:4]}", "the exit code 0", process.returncode)
+    check(process.returncode == 0, f"program {name!r}", "the exit code 0", process.returncode)
     return usage.ru_utime + usage.ru_stime
 
 
@@ -94,12 +94,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder = Path(name)
         for label, environment in environments(folder).items():
             run = partial(seconds, environment=environment, folder=folder)
-            for words in runs.values():
-                run(words)  # the first time reads files, and writes bytecode
+            for program, words in runs.items():
+                run(program, words)  # the first time reads files, and writes bytecode
             durations: dict[str, list[float]] = {program: [] for program in runs}
             for _ in range(REPETITIONS):
                 for program, words in runs.items():
-                    durations[program].append(run(words))
+                    durations[program].append(run(program, words))
             bare, *others = durations
             for program in others:
                 pairs = zip(durations[program], durations[bare], strict=True)
