@@ -248,8 +248,8 @@ class _Tiles:
         separate: whether each channel has a grid of tiles of its own.
 
     Private attributes: `_decoded` keeps strips that are the whole picture, by page and number, as each window would
-    decode them again. `_inflatable` has page and number of the packed tiles that inflate to their size: each is asked
-    once, as that takes as long as decoding it. `_lock` is held while the place in the file is moved.
+    decode them again. `_inflatable` has page and number of the large packed tiles that inflate to their size: each is
+    asked once, as that takes as long as decoding it. `_lock` is held while the place in the file is moved.
 
     Invariant: tiles of a grid cover the picture without overlaps, `columns` by `rows` of them; those of the last column
     and the last row may reach beyond it. `_decoded` is empty for pictures of several tiles.
@@ -347,23 +347,22 @@ class _Tiles:
             a_pixel = 2 * samples * self._page.dtype.itemsize + 3
             check_decoding(self._size, a_pixel, stored, f"image {self._path}")
         data = self.read_bytes(layer.dataoffsets[number], stored)
-        if key not in self._inflatable:
-            self._check_inflation(data, size)
-            self._inflatable.add(key)
+        self._check_inflation(key, data, size)
         tile: Values = self._page.decode(data, number, jpegtables=self._page.jpegtables)[0][0]
         if self._is_one_strip:
             self._decoded[key] = tile
         return tile
 
-    def _check_inflation(self, data: bytes, size: int) -> None:
+    def _check_inflation(self, key: tuple[int, int], data: bytes, size: int) -> None:
         """Raise `DataError` for a packed tile that inflates to far more than its `size` in bytes."""
         make_inflater = _INFLATERS.get(int(self._page.compression))
-        if make_inflater is None or len(data) <= _INFLATED:
+        if make_inflater is None or len(data) <= _INFLATED or key in self._inflatable:
             return
         most = 2 * size + 2**16
         inflated = make_inflater().decompress(data, most)
         got = "one that inflates to more; replace it"
         check_data(len(inflated) < most, f"image {self._path}", f"tiles of {size:,} bytes", got)
+        self._inflatable.add(key)
 
     def _plain_rows(self, layer: _Layer, plane: int, part: int) -> Values:
         """Read rows of a picture that is one strip as it is, `(h, w, samples)`; `part` counts such parts of a plane."""

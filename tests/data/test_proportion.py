@@ -127,6 +127,14 @@ def test_a_tile_is_asked_once_how_far_it_inflates(tmp_path, monkeypatch):
     assert len(asked) == 2  # tiles
 
 
+def test_small_tiles_are_not_remembered(tmp_path):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, pixels(64, 128), tile=(64, 64), compression="zlib", photometric="rgb")
+    picture = open_large(path)
+    picture.read((0, 0, 64, 64))
+    assert picture._tiles._inflatable == set()
+
+
 def test_a_tile_that_claims_more_than_is_stored(tmp_path):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, np.zeros((64, 64), np.uint8), tile=(64, 64), compression="zlib")
