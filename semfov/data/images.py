@@ -219,8 +219,8 @@ def _fault(error: Exception, source: Path | str, action: str) -> str:
     is_unidentified = error_name == "UnidentifiedImageError"
     kind, is_read = kind_of(source)
     # Bytes that tell no kind, such as those of a PPM, are still a picture where Pillow has identified it.
-    is_other_kind = kind != "" or is_unidentified
-    if is_other_kind and not is_read:
+    is_known_by_bytes = kind != ""
+    if (is_known_by_bytes or is_unidentified) and not is_read:
         return _of_another_kind(kind)
     if is_unidentified:
         reason = f"as {kind}"  # Pillow's own words name the open file alone
