@@ -173,16 +173,12 @@ class _NodeCounter:
         """Count what nodes become in functions that call each other; raises `DataError` for one that calls itself."""
         total = 0
         for node in nodes:
-            total += self._count_of_call((node.domain, node.op_type), callers)
+            function = node.domain, node.op_type
+            got = f"{excerpt(node.op_type)}, which calls itself"
+            check_data(function not in callers, self._name, "functions that end", got)
+            # One call of Python for each function in another: its depth is limited.
+            if function in self._bodies and function not in self._counts:
+                self._counts[function] = self.count(self._bodies[function], (*callers, function))
+            total += self._counts.get(function, 1)  # an operation of ONNX itself stays one node
             total += sum(self.count(graph.node, callers) for graph in graphs(node))
         return total
-
-    def _count_of_call(self, function: _Function, callers: tuple[_Function, ...]) -> int:
-        """Count what the call of a function becomes; an operation of ONNX itself stays one node."""
-        _, name = function
-        check_data(function not in callers, self._name, "functions that end", f"{excerpt(name)}, which calls itself")
-        if function not in self._bodies:
-            return 1
-        if function not in self._counts:
-            self._counts[function] = self.count(self._bodies[function], (*callers, function))
-        return self._counts[function]
