@@ -225,12 +225,12 @@ def _ending_late(message: Message, nowhere: int) -> Iterator[None]:
 
 def _answer_with_description(message: Message, arrays: Sequence[Numbers], sink: IO[bytes]) -> InferenceSession | None:
     """Open the model of the first message, and send its description; None for one that cannot be opened."""
-    model = arrays[0].tobytes() if arrays else None
     try:
+        model = arrays[0].tobytes() if arrays else None
         session = open_session(cast(Opening, message["opening"]), model)
         send(sink, {"description": describe(session)})
     except Exception as error:  # onnxruntime's own exceptions share no base class
-        send(sink, {"error": str(error)})
+        send(sink, {"error": _reason(error)})
         return None
     return session
 
@@ -243,9 +243,14 @@ def _answer_with_outputs(
     try:
         outputs = session.run(cast(list[str], message["outputs"]), dict(zip(names, arrays, strict=True)))
     except Exception as error:
-        send(sink, {"error": str(error)})
+        send(sink, {"error": _reason(error)})
     else:
         send(sink, {}, [np.asarray(output) for output in outputs])
+
+
+def _reason(error: Exception) -> str:
+    """Write the message of an error, or its name where it has none, as a `MemoryError`."""
+    return str(error) or type(error).__name__
 
 
 def _limit_process(most: int | None) -> None:

@@ -1,5 +1,6 @@
 """Small ONNX files that ask for much are refused before, or stopped while; what is counted is what a pass takes."""
 
+import io
 import json
 import os
 import pickle
@@ -21,8 +22,8 @@ from semfov import load_detector
 from semfov.detection import onnx_session
 from semfov.detection.onnx import load_onnx
 from semfov.detection.onnx_budget import _SURE_NUMBERS, _SURE_PRODUCTS, Budget
-from semfov.detection.onnx_check import check_file
-from semfov.detection.onnx_program import open_session
+from semfov.detection.onnx_check import _NodeCounter, check_file
+from semfov.detection.onnx_program import _answer_with_description, open_session
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.weights import fetch
 from semfov.errors import DataError
@@ -104,6 +105,28 @@ def test_own_functions_are_counted_as_what_they_call_and_must_end(tmp_path):
     model.functions[0].node[0].op_type, model.functions[0].node[0].domain = "F2", "own"
     onnx.save(model, str(path))
     unusable("functions that end, got 'F[012]', which calls itself", check_file, path)
+
+
+def test_functions_that_call_each_other_far_down_are_counted(tmp_path):
+    """Releases of ONNX that put more than a hundred in each other leave the depth to Python's own."""
+    model = onnx.load(write(tmp_path / "model.onnx", "functions that end"))
+    model.graph.node[0].op_type = "F599"
+    del model.functions[1:]
+    for i in range(1, 600):
+        body = [node(f"F{i - 1}", "x", "y", domain="own")]
+        model.functions.append(onnx.helper.make_function("own", f"F{i}", ["x"], ["y"], body, model.opset_import))
+    nodes = len(model.graph.node) - 1 + len(model.functions[0].node)
+    assert _NodeCounter(model, "model").count(model.graph.node) == nodes
+
+
+def test_a_model_that_memory_does_not_hold_is_told():
+    class Model(np.ndarray):
+        def tobytes(self):
+            raise MemoryError
+
+    sink = io.BytesIO()
+    assert _answer_with_description({"opening": {}}, [np.zeros(1).view(Model)], sink) is None
+    assert json.loads(sink.getvalue())["error"] == "MemoryError"
 
 
 @pytest.mark.parametrize("place", ["../other/weights.bin", "/etc/hostname", "missing.bin", "*/_ORT_MEM_ADDR_/*"])
