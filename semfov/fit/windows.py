@@ -157,12 +157,13 @@ class MosaicFit:
         Raises:
             DataError: mosaics are so small that one look shows all of them.
         """
-        examples = self.look(self.looked(parts, model is None))
-        if not examples.get("judged", True):
+        kinds = self.looked(parts, model is None)
+        if "judged" in kinds and not any(looks.lattice.levels > 1 for looks in self.opened("judged")):
             raise DataError(
                 "data: expected photographs whose mosaics are larger than the detector's input, got a width of "
-                f"{self.config.tile} px for each; give larger ones"
+                f"{self.config.tile} px for each; give larger ones, or raise tile"
             )
+        examples = self.look(kinds)
         lines: list[str] = []
         if model is None:
             model = self.fit_prediction(examples)

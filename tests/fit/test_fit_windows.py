@@ -53,10 +53,11 @@ from train.zoom_pictures import PICTURE_KINDS, FitZoomConfig, _compose_pictures
 
 
 def test_mosaics_that_one_look_shows_are_refused(monkeypatch):
-    monkeypatch.setattr(MosaicFit, "look", lambda fit, kinds: {kind: [] for kind in kinds})
+    """They are before any is looked at, for which this fit has nothing."""
+    monkeypatch.setattr(MosaicFit, "opened", lambda fit, kind: [])
     fit = MosaicFit.__new__(MosaicFit)
     fit.config = FitMosaicsConfig(tile=32)
-    with pytest.raises(DataError, match="mosaics are larger than the detector's input, got a width of 32 px for each"):
+    with pytest.raises(DataError, match="got a width of 32 px for each; give larger ones, or raise tile"):
         fit.fit()
 
 
