@@ -20,7 +20,14 @@ _Returned = TypeVar("_Returned")
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one thread: the last bits of a parallel sum depend on the number, and small tensors need no others."""
+    """Compute on one thread: the last bits of a parallel sum depend on the number, and small tensors need no others.
+
+    PyTorch's number of threads is also that of every thread of Python that starts meanwhile, and that one keeps it. So
+    this does nothing outside the main thread, in a server for example, whose threads would get it from each other.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -32,7 +39,8 @@ def one_thread() -> Iterator[None]:
 def one_thread_if_small(function: Callable[_Arguments, _Returned]) -> Callable[_Arguments, _Returned]:
     """Decorate a function of tensors, so that one thread of the CPU works on small ones.
 
-    PyTorch waits for the last of its threads at each of the many operations, however busy the cores are.
+    PyTorch waits for the last of its threads at each of the many operations, however busy the cores are. Nothing
+    changes outside the main thread of Python, as with `one_thread`.
     """
 
     @wraps(function)

@@ -36,7 +36,7 @@ from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
 from semfov.sensor import laplacian_pyramid
 from semfov.sensor import pyramid as pyramids
-from semfov.threads import _MANY_ELEMENTS, beside, one_thread_if_small
+from semfov.threads import _MANY_ELEMENTS, beside, one_thread, one_thread_if_small
 from tests import small
 from tests.pretended import a_gpu, waits
 from tests.small import draw, model
@@ -288,6 +288,28 @@ def test_only_small_tensors_are_worked_on_by_one_thread(threads):
     bands = pyramids.Bands((large,), small, "kornia")
     assert [used(), used(small), used((small,), 1.0)] == [1, 1, 1]
     assert [used(large), used(small, large), used((small, (large,))), used(bands)] == [threads] * 4
+    assert torch.get_num_threads() == threads
+
+
+def test_a_thread_beside_the_main_one_leaves_the_number_for_others(threads):
+    """A third thread, which starts meanwhile, would keep the number of one."""
+
+    def meanwhile(work):
+        (thread := threading.Thread(target=work)).start()
+        thread.join()
+
+    counts = []
+
+    def count():
+        counts.append(torch.get_num_threads())
+
+    def spare():
+        with one_thread():
+            count()
+            meanwhile(count)
+
+    meanwhile(spare)
+    assert counts == [threads] * 2
     assert torch.get_num_threads() == threads
 
 
