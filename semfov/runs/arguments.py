@@ -29,7 +29,8 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         options: the options of the parser, with underscores, such as `--stop_below`.
 
     Returns:
-        The words for the parser, those that belong to no option first. Options that it does not know stay as they are.
+        The words for the parser. Those that belong to no option stand together, where the first of them was: a file of
+        settings before them gives way to them, and one after them does not.
 
     Raises:
         InputError: an option that takes one value is given twice, or one that takes a file is given no name.
@@ -37,6 +38,7 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
     types = setting_types(config)
     usual: list[str] = []
     free: list[str] = []  # of which the parser takes only those that stand together
+    place = 0  # of the first of these among the others
     words = deque(arguments)
     while words:
         word = words.popleft()
@@ -57,8 +59,9 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
             if is_item and words and not words[0].startswith("--"):
                 usual.append(words.popleft())
         else:
+            place = place if free else len(usual)
             free.append(word)
-    return [*free, *usual]
+    return [*usual[:place], *free, *usual[place:]]
 
 
 _NO_SETTING = SettingType(None)
