@@ -166,6 +166,9 @@ class CocoScenes(Scenes):
 
         Returns:
             The objects, in pixels of the upright photograph.
+
+        Raises:
+            DataError: the size of a photograph on its side cannot be read.
         """
         annotation = self._packed.annotation(self._rows[index])
         orientation = self._annotated_orientation(index)
@@ -180,9 +183,9 @@ class CocoScenes(Scenes):
         if index not in self._orientations:
             path = self._files[index]
             width, height = self._packed.sizes[self._rows[index]]
-            orientation = file_orientation(path)
             # A square has one size in both frames.
-            is_stored = orientation >= SWAPPED and width != height and picture_size(path) == (height, width)
+            orientation = 1 if width == height else file_orientation(path)
+            is_stored = orientation >= SWAPPED and picture_size(path) == (height, width)
             self._orientations[index] = orientation if is_stored else 1
         return self._orientations[index]
 

@@ -21,6 +21,7 @@ from semfov.data.camera_raw import check_no_raw
 from semfov.data.decoded import Decoded
 from semfov.data.deep import DeepValues, cut, is_deep, jpeg2000_bits, rows_of
 from semfov.data.jpeg_scans import MOST_SCANS, has_many_scans
+from semfov.data.png_chunks import has_late_orientation
 from semfov.data.signatures import kind_of
 from semfov.data.tiff_tags import HEIGHT, WHITE_IS_ZERO, WIDTH, TiffTags
 from semfov.data.tone import White
@@ -29,7 +30,7 @@ from semfov.errors import DataError, SemfovError, check_data, check_pixels, reas
 from semfov.io.files import check_regular
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
+    from PIL.Image import Exif, Image
     from PIL.ImageFile import ImageFile
 
 MAX_PIXELS = 89_478_485
@@ -393,10 +394,23 @@ def from_pillow(image: "Image", name: str, white: White | None = None) -> Tensor
 def _orientation(image: "Image") -> int:
     """Read the EXIF orientation, 1 to 8; 1 (as stored) where the metadata are damaged or hold another value."""
     try:
-        orientation = image.getexif().get(_ORIENTATION, _UPRIGHT)
+        orientation = _exif(image).get(_ORIENTATION, _UPRIGHT)
     except Exception:  # of the kind that the damage has
         return _UPRIGHT
     return int(orientation) if orientation in _ORIENTATIONS else _UPRIGHT
+
+
+def _exif(image: "Image") -> "Exif":
+    """Read the EXIF data; for those behind the pixels of a PNG, Pillow decodes it, which others are spared."""
+    from PIL.Image import Image
+
+    if image.format != "PNG" or "exif" in image.info:
+        return image.getexif()
+    file: BinaryIO | None = getattr(image, "fp", None)
+    # A picture that is decoded has all its data, and perhaps no file.
+    if file is None or getattr(file, "closed", False) or has_late_orientation(file):
+        return image.getexif()
+    return Image.getexif(image)
 
 
 def _loaded(image: "Image", *, upright: bool) -> "Image":

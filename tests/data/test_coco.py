@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageOps
+from PIL.PngImagePlugin import PngImageFile
 
 from semfov import CocoScenes, DataError, read_image
 from semfov.data.annotations import read_annotations, warn_of_form
@@ -308,6 +309,16 @@ def test_the_size_of_a_square_does_not_tell_its_frame(tmp_path, make_coco, coco_
     data = coco_dict([(10, "cat", (2, 1, 7, 9))])
     data["images"] = [{"id": 10, "file_name": "10.png", "width": 40, "height": 40}]
     assert CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL)[0].boxes.tolist() == [[2, 1, 9, 10]]
+
+
+def test_annotations_of_a_png_are_read_without_its_pixels(tmp_path, make_coco, coco_dict, monkeypatch):
+    decoded = []
+    monkeypatch.setattr(PngImageFile, "load", lambda image: decoded.append(image))
+    Image.new("RGB", (40, 30)).save(tmp_path / "10.png")
+    data = coco_dict([(10, "cat", (2, 1, 7, 9))])
+    data["images"] = [{"id": 10, "file_name": "10.png", "width": 40, "height": 30}]
+    annotation = CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL).annotation(0)
+    assert (annotation.boxes.tolist(), annotation.size, decoded) == ([[2, 1, 9, 10]], (40, 30), [])
 
 
 def test_annotations_of_another_detector_or_image_size_are_refused(photographs, make_coco, coco_dict):

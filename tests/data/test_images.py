@@ -10,9 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from semfov import DataError, read_image
 from semfov.data.images import MAX_PIXELS, file_orientation, stored_boxes
+from semfov.data.large import picture_size
 from tests.refusals import unusable
 
 # Four colours, one per quadrant, so that every rotation or mirroring is visible.
@@ -49,6 +51,44 @@ def test_photographs_are_rotated_by_exif_orientation(tmp_path, orientation, kind
     assert abs(shown - expected).max() <= 12
     if kind != "tif":  # Pillow rotates TIFF files itself
         assert abs(bits(read_image(path, oriented=False)).astype(int) - PICTURE).max() <= 12
+
+
+def write_late(path, content):
+    """Write a PNG with a chunk behind its pixels, of a kind and its content."""
+    Image.fromarray(PICTURE).save(path)
+    chunk = struct.pack(">I", len(content) - 4) + content + struct.pack(">I", zlib.crc32(content))
+    png = path.read_bytes()
+    end = png.rindex(b"IEND") - 4
+    path.write_bytes(png[:end] + chunk + png[end:])
+
+
+@pytest.mark.parametrize("name", ["chunk.png", "text.png"])
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_exif_data_behind_the_pixels_of_a_png_turn_it_for_every_reader(tmp_path, orientation, name):
+    """The data are a chunk, or a text as ImageMagick writes it."""
+    path = tmp_path / name
+    exif = oriented(orientation).tobytes()
+    text = b"tEXtRaw profile type exif\0\nexif\n%d\n%s\n" % (len(exif), exif.hex().encode())
+    write_late(path, text if name == "text.png" else b"eXIf" + exif)
+    expected = SHOWN[orientation](PICTURE)
+    assert (bits(read_image(path)) == expected).all()
+    assert (bits(read_image(path, oriented=False)) == PICTURE).all()
+    assert file_orientation(path) == orientation
+    assert picture_size(path) == (expected.shape[1], expected.shape[0])
+    with Image.open(path) as image:
+        image.load()
+        assert picture_size(image) == (expected.shape[1], expected.shape[0])
+
+
+def test_the_orientation_and_the_size_of_a_png_are_read_without_its_pixels(tmp_path, monkeypatch):
+    write_late(tmp_path / "plain.png", b"tEXtComment\0by hand")
+    Image.fromarray(PICTURE).save(tmp_path / "turned.png", exif=oriented(6))
+    decoded = []
+    monkeypatch.setattr(PngImageFile, "load", lambda image: decoded.append(image))
+    paths = tmp_path / "plain.png", tmp_path / "turned.png"
+    assert [file_orientation(path) for path in paths] == [1, 6]
+    assert [picture_size(path) for path in paths] == [(24, 16), (16, 24)]
+    assert decoded == []
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
