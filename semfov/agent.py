@@ -108,9 +108,8 @@ class ActivePerception(MovableModule):
         self.exploring = Strategy(*explore)
         check_cells(grid)
         self.columns, self.rows = grid
-        for model in self.modules():
-            if isinstance(model, FovealObservationModel | Verification):
-                check_fitted(model.metadata, eye.settings(), grid, model.title)
+        models = [model for model in self.modules() if isinstance(model, FovealObservationModel | Verification)]
+        check_fitted(models, eye.settings(), grid)
 
     @classmethod
     def recommended(

@@ -2,8 +2,8 @@
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, Protocol
 
 from semfov.errors import InputError, check
 
@@ -91,21 +91,29 @@ def check_background(fitted: Settings, background: str | None, what: str) -> Non
     check(policy == background, "background", expected, f"{background!r}; {remedy}")
 
 
-def check_fitted(metadata: Settings, settings: Settings, grid: tuple[int, int], what: str) -> None:
-    """Check that a model was fitted for an eye and for the cells of a belief.
+class _Fitted(Protocol):
+    """A fitted model: what it is, in words, and what it says of its fit."""
+
+    title: ClassVar[str]
+    metadata: dict[str, Any]
+
+
+def check_fitted(models: Iterable[_Fitted], settings: Settings, grid: tuple[int, int]) -> None:
+    """Check that models were fitted for an eye and for the cells of a belief.
 
     Args:
-        metadata: what the model says of its fit.
+        models: the models.
         settings: those of the eye.
         grid: `(columns, rows)` of the belief.
-        what: what the model is, for the message.
 
     Raises:
-        InputError: it was fitted for another detector, sensor or grid.
+        InputError: one was fitted for another detector, sensor or grid.
     """
-    check_same_detector(metadata.get("detector", {}), settings["detector"], what)
-    check_sensor(metadata.get("sensor", {}), settings["sensor"], what, strict=True)
-    check_grid(metadata.get("training", {}), grid, what)
+    for model in models:
+        fitted = model.metadata
+        check_same_detector(fitted.get("detector", {}), settings["detector"], model.title)
+        check_sensor(fitted.get("sensor", {}), settings["sensor"], model.title, strict=True)
+        check_grid(fitted.get("training", {}), grid, model.title)
 
 
 def check_same_detector(fitted: Settings, detector: Settings, what: str) -> None:
