@@ -83,7 +83,9 @@ class _WholeSearch(TargetSearch[TargetFacts]):
         return TargetFacts(self.whole.candidates, number, float(presence), self.best, 0.0)
 
     def candidates(self) -> PhotographPlaces:
-        return PhotographPlaces(self.target, self.source.lattice, window=self.evidence.window)
+        places = PhotographPlaces(self.target, self.source.lattice, window=self.evidence.window)
+        places.keep_whole(0, self.whole.candidates)
+        return places
 
     def close_up(self, box: Tensor) -> Detections:
         return look_closely(self.source, box, self.evidence.window).candidates

@@ -328,11 +328,6 @@ class PhotographPlaces(CandidateBoxes):
         # Places are due by their chance of a hit, so that none has to be likely before.
         super().__init__(target, 0.0, lattice, forgetting, prior, window)
 
-    def see(self, look: TargetFacts) -> None:
-        """Take in a look at the whole photograph."""
-        super().see(look)
-        self.keep_whole(look.next_index - 1, look.detections)
-
     @property
     def hit_chance(self) -> float:
         """Chance of a hit at the most evident place; below 0 if there is none."""

@@ -406,6 +406,7 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     scores = torch.tensor([[[0, 0.5, 0.2], [0, 0.3, 0]]])
     places = PhotographPlaces(1, OVER)
     whole = Detections(boxes, scores, torch.ones(1, 2).bool())
+    places.keep_whole(0, whole)
     places.see(TargetFacts(whole, 1, 0.8, 0.5, 0.0))
     large = places.due(Thresholds(1.0, 0.1), last=True)
     assert places.shown_at(large) is whole
@@ -425,7 +426,9 @@ def test_a_place_that_fills_the_photograph_leaves_the_picture_its_probability(sh
     boxes = torch.tensor([[[10.0, 10, 180, 140], [60.0, 60, 80, 80]]])
     whole = Detections(boxes, torch.tensor([[[0, 0.9, 0], [0, 0.3, 0]]]), torch.ones(1, 2).bool())
     prior = Prior(share, fitted=0.4)
-    judge = Verifier(Alike(), PhotographPlaces(1, OVER, prior=prior), Thresholds(0.5, 1e-4), most=9)
+    places = PhotographPlaces(1, OVER, prior=prior)
+    places.keep_whole(0, whole)
+    judge = Verifier(Alike(), places, Thresholds(0.5, 1e-4), most=9)
     judge.see(TargetFacts(whole, 1, 0.8, 0.9, 0.0))
 
     def verified(candidate, detections):
