@@ -219,7 +219,7 @@ class ActivePerception(MovableModule):
     @classmethod
     def _of(cls, make: Callable[..., dict[str, Any]], /, *arguments: object, **options: Any) -> Self:
         """Make an agent of the parts that a function gives from the options of a constructor, ready for use."""
-        check_options(options, option_names(make), "the agent or of semfov.load_detector")
+        check_options(options, ["name", *option_names(make)], "the agent or of semfov.load_detector")
         return cls(**make(*arguments, **options)).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:

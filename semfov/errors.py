@@ -14,7 +14,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from semfov.words import FORMER, MAKERS, meant_options, note_of_former, other_method
+from semfov.words import FORMER, MAKERS, OPTIONS, meant_options, note_of_former, other_method, parts_of
 
 __all__ = ["DataError", "InputError", "SemfovError"]
 
@@ -260,16 +260,26 @@ def check_options(options: Iterable[str], known: Iterable[str], what: str) -> No
     names = list(dict.fromkeys(known))
     for name in options:
         if name not in names:
-            hint = other_method(what, name, names) or _nearest_options(name, names)
+            hint = _hint(what, name, names) or f"known: {', '.join(names) or 'none'}"
             raise InputError(f"{name}: expected an option of {what}, got an unknown one; {hint}")
 
 
-def _nearest_options(name: str, known: list[str]) -> str:
-    """Suggest the options that others call by this name, or those with a similar name, or list all."""
-    options = meant_options(name, known) or get_close_matches(name, known, cutoff=0.7)
-    if not options:
-        return f"known: {', '.join(known) or 'none'}"
-    return f"did you mean {' or '.join(f'{option}=' for option in options)}?"
+def _hint(what: str, name: str, known: list[str]) -> str:
+    """Say what has an option that others call by a name, or which one has a similar name; empty if none is known."""
+    hint = _remedy(what, name, known) or _question(get_close_matches(name, known, cutoff=0.7))
+    for part in [] if name in OPTIONS else parts_of(name):
+        hint = hint or _remedy(what, part, known)
+    return hint
+
+
+def _remedy(what: str, word: str, known: list[str]) -> str:
+    """Say what has the option that others call by a word; empty if the word is not listed."""
+    return other_method(what, word, known) or _question(meant_options(word, known))
+
+
+def _question(options: list[str]) -> str:
+    """Ask whether one of some options is meant; empty if there are none."""
+    return f"did you mean {' or '.join(f'{option}=' for option in options)}?" if options else ""
 
 
 def rename_former(options: dict[str, object], known: Collection[str]) -> None:

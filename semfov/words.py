@@ -15,17 +15,40 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
     return {word: ours for ours, others in rows.items() for word in others.split()}
 
 
+_VERBS = ("draw", "export", "hide", "plot", "print", "save", "show", "to", "write")
+"""Verbs with which others' words begin."""
+
+
+def parts_of(word: str) -> list[str]:
+    """List the parts of a word of several that may tell what it means, the likeliest first.
+
+    A noun ends with what it is, and a verb stands first: `confidence_threshold` is a threshold, `save_path` saves. Each
+    part is also given in the plural and in the singular.
+
+    Args:
+        word: the word, with underscores between its parts.
+
+    Returns:
+        The parts of three letters or more; none of a word of one part.
+    """
+    words = word.split("_")
+    ends = ["_".join(words[first:]) for first in range(1, len(words))]
+    beginnings = ["_".join(words[:count]) for count in range(len(words) - 1, 0, -1)]
+    parts = beginnings + ends if words[0] in _VERBS else ends + beginnings
+    return [form for part in parts if len(part) > 2 for form in (part, f"{part}s", part.removesuffix("s"))]
+
+
 OPTIONS = _by_word(
     {
-        "score_threshold confirm threshold": (
-            "conf conf_thres conf_threshold confidence min_conf min_score score threshold"
-        ),
-        "iou per_class": "iou iou_thres iou_threshold nms nms_iou nms_threshold",
+        "score_threshold confirm threshold": ("conf confidence score threshold"),
+        "iou per_class": "iou iou_thres iou_threshold match_threshold nms nms_iou nms_threshold",
         "limit": "max_det max_detections max_objects topk",
         "input_size": "image_size img_size imgsz resolution",
         "min_gain": "expected_gain gain min_improvement tol tolerance",
-        "stop_below": "stop stop_threshold stopping_threshold",
-        "target": "class class_name classes cls filter find label labels name only query targets",
+        "stop_below": "early_stopping stop stop_threshold stopping_threshold",
+        "target": (
+            "class class_name classes cls filter find label labels name object objects only prompt query targets text"
+        ),
         "picture": "file image img path photo source",
         "grid": "cells columns rows",
         "detector name": "model yolo",
@@ -35,20 +58,24 @@ OPTIONS = _by_word(
         "device": "gpu cuda",
         "half": "amp fp16 float16",
         "out": (
-            "csv excel export figure format geojson heatmap json output output_dir overlay pdf plot png project save "
-            "save_img show svg visualise visualize"
+            "csv excel export figure format geojson heatmap json output overlay pdf plot png project save show svg "
+            "visualise visualize"
         ),
         "report": "html page",
         "crops": "crop save_crop save_crops",
         "labels": "label_dir save_txt txt yolo_labels",
-        "passes": "budget iterations looks max_passes max_steps n_looks steps",
+        "passes": "attempts budget iter iterations looks steps tries",
+        "prior": "base_rate frequency prevalence",
+        "start": "first_fixation init_fixation initial_fixation start_fixation x0",
+        "seed": "generator random_state rng",
+        "annotations": "ground_truth gt truth",
         "areas": "aoi aois box boxes region regions roi rois",
         "compare": "ab ab_test before_after diff difference",
         "camera": "webcam",
         "rate": "fps",
-        "people": "n n_scanpaths num_observers observers subjects viewers",
-        "shifts passes": "fixations max_fixations max_shifts n_fixations saccades",
-        "seconds": "duration max_seconds time time_budget time_limit timeout",
+        "people": "n observers participants samples scanpaths subjects viewers",
+        "shifts passes": "fixations saccades",
+        "seconds": "duration time time_budget time_limit timeout",
         "workers": "jobs num_workers parallel processes threads",
         "on_look": "callback on_step",
         "looks quiet": "log_level verbose",
@@ -100,6 +127,9 @@ _ADVICE = _by_word(
         "--print-config prints the settings, and --config FILE reads them": "configure dry_run settings",
         "the page of detectors in the documentation has the call, under Export": "export onnx",
         "save the page as a picture first": "screenshot url webpage",
+        "figures have one style; --out FILE.json has what is to be drawn otherwise": (
+            "font hide_boxes hide_conf hide_labels line show_boxes show_conf show_labels thickness"
+        ),
         "give all pictures to one command": "combine concat merge",
         "nothing is logged elsewhere; a tracker takes the file that --out writes": (
             "clearml comet mlflow tensorboard wandb"
@@ -109,12 +139,14 @@ _ADVICE = _by_word(
 
 _ADVICE_FOR_OBJECTS = _by_word(
     {
-        "semfov chooses the windows; `semfov compare` sets all slices beside it": (
-            "overlap overlap_ratio slice slice_size sliding tile tile_size tiles"
-        ),
+        "semfov chooses the windows; `semfov compare` sets all slices beside it": ("overlap slice sliding tile"),
         "--out FILE.geojson has the coordinates of a GeoTIFF": "coordinates crs epsg gps latlon",
         "--out FILE.csv has all boxes, to choose by their size": "max_area max_size min_area min_size",
         "--out FILE.csv has all objects, to sort by their scores": "best k max_det max_objects sort top top_k topk",
+        "--out FILE.jsonl has each picture as soon as it is done": "stream",
+        "boxes of several looks become one object by themselves": "match_metric merge nmm postprocess",
+        "semfov looks again where that pays": "augment tta",
+        "in Python an agent is made with it: semfov.ActivePerception.recommended(grid=…)": "cells columns grid rows",
         "the agent has one; in a checkout `python -m eval.search --help` compares several": (
             "acquisition policies policy strategy"
         ),
@@ -128,6 +160,10 @@ _ADVICE_FOR_GAZE = _by_word(
             "age audience gender persona"
         ),
         "the places are printed by their shares, the largest first": "k peaks sort top top_k topk",
+        "--seconds says how long a viewer looks": "fixations saccades shifts",
+        "the fitted model has its own centre bias and blur": (
+            "blur center_bias centerbias centre_bias dva pixel_per_degree pixels_per_degree ppd sigma temperature"
+        ),
     }
 )
 
@@ -137,7 +173,21 @@ ADVICE = {**_ADVICE, **_ADVICE_FOR_OBJECTS, **_ADVICE_FOR_GAZE}
 ADVICE_OF = {
     **{command: {**_ADVICE, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")},
     "gaze": {**_ADVICE, **_ADVICE_FOR_GAZE},
-    "compare": _by_word({"--out FOLDER has compare.html, compare.csv and compare.png": "html page report"}),
+    "live": {
+        **_ADVICE,
+        **_by_word(
+            {
+                "each frame is looked at; live.step in Python takes the frames that you choose": "skip stride",
+                "objects keep their numbers by themselves; --tracks FILE writes them": "persist track tracker tracking",
+            }
+        ),
+    },
+    "compare": _by_word(
+        {
+            "--out FOLDER has compare.html, compare.csv and compare.png": "html page report",
+            "AP50 is compared over passes and seconds": "map map50 metric metrics",
+        }
+    ),
 }
 """The same for the options of each command."""
 
@@ -145,31 +195,38 @@ _LOOKING = ("search", "find_all", "explore")
 
 _OF_TARGETS = "find_all(picture, target) lists what is there of a class, search(picture, target) decides"
 _OF_VIEWERS = "gaze.scanpaths(people, seconds=…) draws viewers from a prediction"
+_OF_FRAMES = "live.step(frame) takes the frames"
 _OTHER_METHODS = {
     ("explore", "target"): _OF_TARGETS,
     ("gaze", "target"): _OF_TARGETS,
     ("gaze", "people"): _OF_VIEWERS,
     ("gaze", "seconds"): _OF_VIEWERS,
     ("gaze", "areas"): "gaze.share(areas) and gaze.visits(areas) are of a prediction",
+    ("scanpaths", "shifts"): "seconds= says how long a viewer looks",
+    ("live", "picture"): _OF_FRAMES,
+    ("live", "stream"): _OF_FRAMES,
+    ("semfov find", "stream"): "out='FILE.jsonl' has each picture as soon as it is done",
     ("search", "policy"): "explore takes one, and semfov.rollout one of yours",
     **dict.fromkeys(
         [("search", "temperature"), ("explore", "temperature")], "semfov.gaze.Softmax is for semfov.rollout"
     ),
+    **dict.fromkeys(
+        [("gaze", "center_bias"), ("gaze", "centerbias"), ("gaze", "centre_bias")],
+        "the fitted model has its own; gaze.parts tells what it adds",
+    ),
 }
 """What to call in place of a method of an agent, by its name and the option that it has not."""
 
-_OF_DETECTORS = ("iou", "limit", "input_size", "device", "weights", "per_class", "classes")
+_OF_DETECTORS = ("iou", "limit", "input_size", "device", "weights", "per_class", "classes", "grid")
 """Options that an agent is made with, and not a look."""
 
 _OTHER_PLACES = _by_word(
     {
         "semfov chooses the windows, so none are cut; `semfov compare` sets all slices beside it": (
-            "auto_slice_resolution overlap overlap_height_ratio overlap_ratio overlap_width_ratio "
-            "perform_standard_pred slice slice_height slice_size slice_width slice_wh tile tile_size"
+            "auto_slice_resolution overlap perform_standard_pred slice tile"
         ),
         "the record has what is to be written and shown: record.report(path), record.plot(), record.to_csv(path)": (
-            "csv export format html json out output plot project report save save_crop save_txt show tensorboard "
-            "visualize wandb"
+            "csv export format html json out output plot project report save show tensorboard visualize wandb"
         ),
         "record.objects has all, to sort by their scores": "best k sort top top_k topk",
         "agent.live(target).step(frame) takes the frames of a stream": "stream video vid_stride",
@@ -192,9 +249,9 @@ def meant_options(word: str, known: Collection[str]) -> list[str]:
         known: names of the options that there are.
 
     Returns:
-        Those of our names that are known; none where the word is not listed.
+        Those of our names that are known, among them the word itself; none where the word is not listed.
     """
-    meant = FORMER.get(word) or OPTIONS.get(word, "")
+    meant = FORMER.get(word) or OPTIONS.get(word, word)
     return [option for option in meant.split() if option in known]
 
 
@@ -236,7 +293,7 @@ PACKAGE = _by_word(
         "semfov.envs, whose environments gymnasium.make knows": "Env env environment environments make",
         "semfov.read_image": "imread open",
         "semfov.load_detector(name or file), or semfov.ActivePerception.recommended(name)": (
-            "AutoDetectionModel AutoModel Detector YOLO from_pretrained get_model pipeline"
+            "AutoDetectionModel AutoModel Detector YOLO from_pretrained get_model load_model pipeline"
         ),
         "semfov.ActivePerception.recommended().find_all(picture, target), which chooses its windows": (
             "InferenceSlicer count get_prediction get_sliced_prediction slice_image"
@@ -254,8 +311,7 @@ PACKAGE = _by_word(
 AGENT = _by_word(
     {
         "search, find_all, explore, gaze and live, or semfov.run for many pictures": (
-            "analyse analyze batch detect detect_all find find_everything find_objects infer locate look predict run "
-            "track"
+            "analyse analyze batch detect detect_all find find_everything find_objects infer locate look predict run"
         ),
         "len(agent.find_all(picture, target).objects), and record.expected with what was not seen": (
             "count count_all count_objects"
@@ -272,7 +328,7 @@ AGENT = _by_word(
         "semfov.run(folder, target)": "find_folder find_in_folder run_folder search_folder",
         "record.belief_map(-1), of looks by a fovea or a head": "belief beliefs posterior",
         "agent.explore(picture, policy=…), or semfov.rollout with one of yours": "act policy select_action",
-        "agent.live(target), whose step takes frames": "step stream update video watch webcam",
+        "agent.live(target), whose step takes frames": "step stream track update video watch webcam",
         "agent.classes[1:]": "class_names labels names",
         "agent.eye.detector": "detector model",
         "next(agent.parameters()).device": "device",
@@ -321,6 +377,7 @@ OBJECTS = _by_word(
         "record.to_frame('objects')": "dataframe df to_dataframe to_df to_frame to_pandas",
         "record.object_rows()": "to_dict to_json tolist",
         "the method of the record": "to_coco to_geojson to_supervision to_yolo",
+        "record.to_yolo(), in shares of the picture": "xywhn xyxyn",
         "record.plot()": "draw plot show",
         "objects.boxes": "bbox box xyxy",
         "objects.scores": "conf confidence probability score",
@@ -353,7 +410,6 @@ RECORD = _by_word(
         "record.decision.box": "bbox",
         "record.found, or record.decision.outcome": "is_present present success",
         "record.objects.labels": "class_id cls label",
-        "record.to_coco()": "to_coco_annotations to_coco_predictions",
         "record.to_yolo(path)": "save_labels save_txt",
         "record.plot().savefig(path)": "export_visuals save_plot savefig",
         "record.object_rows()": "objects_table to_json_list tolist",
@@ -361,10 +417,38 @@ RECORD = _by_word(
         "semfov.run(picture, target, crops=FOLDER)": "crop save_crop save_crops",
         "record.rows(), which has the seconds of each look": "duration elapsed speed time times timing",
         "record.objects.track_ids, of a stream": "id ids track_id tracker_id",
-        "[look.fixation for look in record]": "actions fixations gaze path saccades scanpath sequence",
+        "[look.fixation for look in record]": "actions fixations gaze path saccades scanpath sequence trajectory",
         "record.belief_map(-1), of looks by a fovea or a head": (
             "belief beliefs entropy heat_map heatmap logits map posterior probabilities"
         ),
+    }
+)
+
+LOOK = _by_word(
+    {
+        "look.detections; record.objects has those of all looks together": (
+            "boxes conf detections labels masks object_prediction_list objects obb predictions probs scores xyxy"
+        ),
+        "look.fixation": "action gaze location place point position x xy y",
+        "look.region": "bbox box crop roi window",
+        "look.value": "gain reward score",
+        "look.seconds": "duration speed time",
+        "look.number": "id step",
+        "record.plot(), or record.report(path)": "draw plot save save_txt show",
+    }
+)
+
+METRICS = _by_word(
+    {
+        "semfov.metrics.scanpath": (
+            "AUC CC IG KL NSS SIM auc auc_judd cc edit_distance ig information_gain kl kl_div kldiv multimatch nss "
+            "scanmatch sequence_score sim similarity"
+        ),
+        "semfov.metrics.calibration": "Calibration ECE calibration_error ece reliability",
+        "semfov.metrics.average_precision": (
+            "AP AveragePrecision MeanAveragePrecision ap ap50 average_precision mAP map map50"
+        ),
+        "semfov.metrics.episodes": "area_under_roc cumulative_performance roc_auc standard_error",
     }
 )
 
@@ -403,9 +487,16 @@ def missing(
     Returns:
         The error, to raise.
     """
-    ours = words.get(name, of_class)
-    remedy = f"; use {ours}" if ours else _near(name, known)
+    remedy = _use(words.get(name, of_class)) or _near(name, known)
+    attributes = set(known)
+    for part in [] if name.startswith("_") else parts_of(name):
+        remedy = remedy or _use(words.get(part, part if part in attributes else ""))
     return AttributeError(f"{owner} has no attribute {name!r}{remedy}")
+
+
+def _use(ours: str) -> str:
+    """Say what to use; empty where there is nothing."""
+    return f"; use {ours}" if ours else ""
 
 
 def _near(name: str, known: Iterable[str]) -> str:

@@ -10,13 +10,24 @@ from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
 from io import TextIOWrapper
+from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
 from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
-from semfov.words import ADVICE, ADVICE_OF, COMMANDS, FORMER, OPTIONS, dashed, meant_options, note_of_former
+from semfov.words import (
+    ADVICE,
+    ADVICE_OF,
+    COMMANDS,
+    FORMER,
+    OPTIONS,
+    dashed,
+    meant_options,
+    note_of_former,
+    parts_of,
+)
 
 if TYPE_CHECKING:
     from semfov.runs.settings import Settings
@@ -233,7 +244,22 @@ def _of_others(command: str, words: Sequence[str]) -> str | None:
     """Say what is wrong with an option that other subcommands or other programs have; None if there is none."""
     options = [word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")]
     refusals = (_refusal(command, option) for option in options)
-    return next(filter(None, refusals), None)
+    return next(filter(None, refusals), None) or _without_dashes(command, words)
+
+
+def _without_dashes(command: str, words: Sequence[str]) -> str | None:
+    """Say how an option is written that stands as NAME=VALUE, as in other programs; None if there is none."""
+    for before, word in pairwise(["", *words]):
+        option, equals, value = word.partition("=")
+        known = _option_names(command)
+        # The value of an option may have this form, too, and so may the name of a file.
+        if before.startswith("-") or not equals or Path(word).exists():
+            continue
+        if option in known:
+            return f"expected --{dashed(option)} {value}, got {word}"
+        if option in OPTIONS or option == SUBCOMMANDS[command].positional:
+            return _refusal(command, option) or f"expected options with two dashes, --NAME VALUE, got {word}"
+    return None
 
 
 def _refusal(command: str, option: str) -> str | None:
@@ -269,14 +295,22 @@ def _means_positional(option: str, positional: str) -> bool:
 def _meant_instead(command: str, option: str) -> str | None:
     """Say which option is meant by an unknown one, or which subcommands have it; None where neither is known."""
     unknown = f"unknown option --{dashed(option)}"
-    meant = meant_options(option, _option_names(command))
-    if meant:
-        return f"{unknown}; did you mean --{dashed(meant[0])}?"
-    advice = ADVICE_OF.get(command, {}).get(option)
-    if advice:
-        return f"{unknown}; {advice}"
+    remedy = _remedy(command, option)
+    if remedy:
+        return f"{unknown}; {remedy}"
     having = [f"`semfov {name}`" for name in _LOOKING if option in _option_names(name)]
-    return f"{unknown}; it is one of {' and '.join(having)}" if having else None
+    if having:
+        return f"{unknown}; it is one of {' and '.join(having)}"
+    if option in OPTIONS or get_close_matches(option, _option_names(command), cutoff=0.7):
+        return None  # the parser names the similar one, if there is one
+    remedies = filter(None, (_remedy(command, part) for part in parts_of(option)))
+    return next((f"{unknown}; {remedy}" for remedy in remedies), None)
+
+
+def _remedy(command: str, word: str) -> str | None:
+    """Say which option of a subcommand others call by a word, or what to do instead; None if it is not listed."""
+    meant = meant_options(word, _option_names(command))
+    return f"did you mean --{dashed(meant[0])}?" if meant else ADVICE_OF.get(command, {}).get(word)
 
 
 _RENAME = "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too)"

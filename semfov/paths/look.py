@@ -14,6 +14,7 @@ from semfov.data.classes import amount
 from semfov.data.windowed import LargePicture, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.objects import box_text
+from semfov.words import LOOK, OtherWords
 
 Box = tuple[float, float, float, float]  # `(x1, y1, x2, y2)`
 _Steps = TypeVar("_Steps", Tensor, NDArray[np.float64])
@@ -21,7 +22,7 @@ CONFIDENT = 0.1  # score from which on the detections of a look are counted, nam
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class RecordedLook:
+class RecordedLook(OtherWords):
     """One look of a record, in pixels of the picture.
 
     Attributes:
@@ -46,6 +47,8 @@ class RecordedLook:
     seconds: float | None = None
     value: float | None = None
     more: Mapping[str, Any] = field(default_factory=dict)
+
+    _other_words = LOOK
 
     @property
     def number(self) -> int:

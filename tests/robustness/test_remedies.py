@@ -1,6 +1,7 @@
 """Every remedy of the tables of words names what is there: attributes, calls with their options, commands."""
 
 import ast
+import importlib
 import re
 from collections.abc import Iterator
 from dataclasses import fields
@@ -14,26 +15,38 @@ from matplotlib.figure import Figure
 import semfov
 from semfov import ActivePerception, words
 from semfov.cli.commands import SUBCOMMANDS
+from semfov.cli.main import _option_names
 from semfov.cli.options import FindOptions
 from semfov.detection.load import loader_options
 from semfov.errors import InputError
 from semfov.gaze.saliency import FixationDensity
 from semfov.paths import GazePrediction
+from semfov.words import dashed
 from tests import small
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (30, 44, 3), dtype=np.uint8)
 
 ATTRIBUTES = (
     words.PACKAGE, words.AGENT, words.DECISION, words.LIVE, words.OBJECTS, words.RECORD, words.GAZE_PREDICTION,
+    words.LOOK, words.METRICS,
 )  # fmt: skip
 REMEDIES = {
     *(remedy for table in (*ATTRIBUTES, words._OTHER_PLACES) for remedy in table.values()),
+    *(remedy for table in words.ADVICE_OF.values() for remedy in table.values()),
     *words.ADVICE.values(),
     *words._OTHER_METHODS.values(),
     *(f"semfov.{call}" for call in words.MAKERS.values()),
     *(words.other_method("search", option, ()) for option in words._OF_DETECTORS),
     *(f"agent.{call}" for call in re.findall(r"\w+\(.*?\)", words._OF_TARGETS)),
 }
+
+OPTIONS = {
+    "help",
+    "print-config",
+    "config",
+    *(dashed(name) for command in SUBCOMMANDS for name in _option_names(command)),
+}
+"""Options of the commands."""
 
 PASSED_ON = {
     "recommended": {*signature(ActivePerception.recommended).parameters, *loader_options()},
@@ -96,6 +109,7 @@ def test_what_a_remedy_names_is_there(remedy, things):
     for code in expressions(remedy, things):
         value_of(code, things)
     assert {*re.findall(r"`semfov (\w+)", remedy)} <= {*SUBCOMMANDS}
+    assert {*re.findall(r"--([a-z-]+)", remedy)} <= OPTIONS
 
 
 @pytest.mark.parametrize(
@@ -111,6 +125,10 @@ def test_what_a_remedy_names_is_there(remedy, things):
         ("record", "masks", "the detector has no masks"),
         ("objects", "sort", "objects[objects.scores.argsort(descending=True)]"),
         ("gaze", "diff", "semfov.paths.Drafts(gaze, other)"),
+        ("look", "boxes", "look.detections; record.objects has those of all looks together"),
+        ("record", "save_video", "use save"),
+        ("record", "to_coco_annotations", "use to_coco"),
+        ("objects", "get_scores", "use objects.scores"),
     ],
 )
 def test_words_of_others_are_answered_with_ours(thing, word, remedy, things):
@@ -126,6 +144,10 @@ def test_words_of_others_are_answered_with_ours(thing, word, remedy, things):
         ("search", "policy", "explore takes one"),
         ("find_all", "mask", "what is transparent in a picture is left out"),
         ("find_all", "resume", "semfov.run(pictures, target, out=FILE)"),
+        ("find_all", "slice_height", "semfov chooses the windows"),
+        ("search", "max_fixations", "did you mean shifts= or passes=?"),
+        ("search", "prior_odds", "did you mean prior=?"),
+        ("live", "stream", "live.step(frame) takes the frames"),
     ],
 )
 def test_options_of_others_are_answered_with_ours(method, option, remedy, things):
@@ -133,10 +155,31 @@ def test_options_of_others_are_answered_with_ours(method, option, remedy, things
         getattr(things["agent"], method)(PIXELS, **{option: 1})
 
 
+@pytest.mark.parametrize(
+    ("word", "parts"),
+    [
+        ("conf", []),
+        ("confidence_threshold", ["threshold", "confidence"]),
+        ("save_paths", ["save", "paths"]),
+        ("n_max_fixations", ["max_fixations", "fixations", "n_max"]),
+    ],
+)
+def test_the_head_of_a_word_of_several_parts_comes_first(word, parts):
+    assert words.parts_of(word) == [form for part in parts for form in (part, f"{part}s", part.removesuffix("s"))]
+
+
+def test_measures_are_in_the_modules_that_are_named():
+    for name in ("nss", "multimatch", "calibration_error", "area_under_roc"):
+        with pytest.raises(AttributeError, match=words.METRICS[name]):
+            getattr(semfov.metrics, name)
+        assert hasattr(importlib.import_module(words.METRICS[name]), name)
+
+
 def test_remedies_are_read():
     """So that the test above cannot pass because nothing is found in them."""
     roots = ("semfov", "agent", "record", "objects", "decision", "look", "live", "gaze")
-    silent = [remedy for remedy in REMEDIES if "`" not in remedy and not [*expressions(remedy, roots)]]
+    named = re.compile(r"`|--[a-z]")
+    silent = [remedy for remedy in REMEDIES if not named.search(remedy) and not [*expressions(remedy, roots)]]
     assert len(silent) < 24 < len(REMEDIES) - 50
 
 
