@@ -302,7 +302,7 @@ def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], are
     places = []
     for number, peak in enumerate(prediction.peaks(), 1):
         places.append(f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %")
-    lines.append(f"  most of all fixations: {'; '.join(places)}")
+    lines.append(f"  most fixations: {'; '.join(places)}")
     mean = sum(map(len, paths)) / len(paths)
     lines.append(f"  {len(paths)} viewers drawn, {mean:.1f} fixations each")
     if prediction.caution is not None:

@@ -230,7 +230,7 @@ def _facts(prediction: GazePrediction, areas: Mapping[str, ViewedArea]) -> str:
     places = _place_rows(prediction.peaks())
     tables = [_area_table(areas)] if areas else []
     tables.append(_table("Where people look first", ("Fixation", "x, y in pixels", "Viewers"), first))
-    tables.append(_table("Where most of all fixations are", ("Place", "x, y in pixels", "Fixations"), places))
+    tables.append(_table("Where most fixations are", ("Place", "x, y in pixels", "Fixations"), places))
     return f'<div class="parts">{"".join(tables)}</div>{_details(prediction)}'
 
 
@@ -268,7 +268,7 @@ def _table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> 
 def _details(prediction: GazePrediction) -> str:
     """Tell the numbers that researchers ask for, with what they mean."""
     uniform = math.log2(prediction.cells.numel())
-    spread = f"{prediction.entropy:.2f} of {uniform:.2f} bits, where people would look everywhere alike"
+    spread = f"{prediction.entropy:.2f} bits; {uniform:.2f} if people looked everywhere alike"
     rows = [("Spread of the map (entropy)", spread)]
     rows += [(f"What the {name} adds to the map", f"{bits:.2f} bits") for name, bits in prediction.parts.items()]
     if prediction.unlikeness is not None:
