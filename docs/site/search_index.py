@@ -6,10 +6,11 @@ from pathlib import Path
 
 
 def put_pages_first(index: Path) -> None:
-    """Make members part of the entry of their class, and leave out source files.
+    """Make members part of the entry of their class, and leave out source files and what is not public.
 
     A member such as `thresholds`, or a file such as `examples/ros_node.py`, has a word for a title, which no page about
-    thresholds or ROS outranks. The words of a member lead to its class, and those of a file to the pages that link it.
+    thresholds or ROS outranks. The words of a member lead to its class, and those of a file, or of a name on the page
+    of internals, to the pages that link it.
 
     Args:
         index: the file of the index, whose entries follow the order of the pages; it is written anew.
@@ -19,7 +20,7 @@ def put_pages_first(index: Path) -> None:
     for item in found["items"]:
         name = re.sub(r"\s*<.*", "", str(item["title"]))
         is_member = str(item["location"]).startswith("api/") and "#" in str(item["location"]) and "." not in name
-        if str(item["location"]).endswith(".py.html"):
+        if str(item["location"]).partition("#")[0].endswith((".py.html", "api/internals.html")):
             continue
         if is_member:
             items[-1]["text"] = f"{items[-1]['text']}<p>{name}</p>{item['text']}"

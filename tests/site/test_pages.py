@@ -262,7 +262,7 @@ def test_docstrings_of_classes_are_complete(thing):
         check_function(function, inspect.getdoc(function))
 
 
-def test_members_are_found_in_the_entry_of_their_class_and_source_files_by_their_pages(tmp_path):
+def test_members_are_found_in_the_entry_of_their_class_and_files_and_internals_by_their_pages(tmp_path):
     entries = [
         ("tasks/find.html#threshold", "Threshold", "when"),
         ("api/semfov.paths.html", "semfov.paths", ""),
@@ -274,6 +274,8 @@ def test_members_are_found_in_the_entry_of_their_class_and_source_files_by_their
         ),
         ("api/semfov.paths.html#semfov.paths.open", "semfov.paths.open", "opens"),
         ("repository/examples/ros_node.py.html", "examples/ros_node.py", "import rclpy"),
+        ("api/internals.html", "Internals", "what the pages name"),
+        ("api/internals.html#semfov.belief.prior.Prior", "semfov.belief.prior.Prior", "prior"),
     ]
     index = tmp_path / "search.json"
     items = [{"location": place, "title": title, "text": text} for place, title, text in entries]

@@ -178,6 +178,18 @@ ASKED = {
     "calibration": "guides/evaluation",
     "license": "LICENSE",
     "batch": "tasks/running",
+    "uncertainty": "tasks/count",
+    "pomdp": "guides/environments",
+    "tracking": "tasks/video",
+    "mot": "tasks/video",
+    "coco": "tasks/count",
+    "dota": "tasks/count",
+    "attention": "tasks/poster",
+    "prior": "zoom",
+    "stop": "tasks/find",
+    "cite": "index",
+    "tobii": "tasks/eye-tracker",
+    "gym": "guides/environments",
 }
 """Words that a reader may ask for, and a page that is among the first three answers."""
 ANSWERS = """() => {
