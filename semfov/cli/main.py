@@ -249,9 +249,9 @@ def _of_others(command: str, words: Sequence[str]) -> str | None:
 
 def _without_dashes(command: str, words: Sequence[str]) -> str | None:
     """Say how an option is written that stands as NAME=VALUE, as in other programs; None if there is none."""
+    known = _option_names(command) if any("=" in word for word in words) else []
     for before, word in pairwise(["", *words]):
         option, equals, value = word.partition("=")
-        known = _option_names(command)
         # The value of an option may have this form, too, and so may the name of a file.
         if before.startswith("-") or not equals or Path(word).exists():
             continue
