@@ -278,15 +278,15 @@ def landing(observer, searches, looks=3):
 def test_training_through_three_looks_makes_searches_better():
     """α, misses and exponents learn from the belief after each of three looks; other scenes judge."""
     generator = torch.Generator().manual_seed(11)
-    searches = [draw_search(generator) for _ in range(40)]
-    train, others = searches[:20], searches[20:]
+    searches = [draw_search(generator) for _ in range(20)]
+    train, others = searches[:10], searches[10:]
     start = FovealObservationModel.identity(CLASSES, EDGES, miss_odds=torch.full((4, 3), 0.3))
     observer = SemanticSearch(start)
     before = float(landing(observer, others).detach())
     chosen = [start.log_alpha, start.log_miss, start.log_exponents]
-    optimiser = torch.optim.Adam(chosen, lr=0.05)
+    optimiser = torch.optim.Adam(chosen, lr=0.1)
     kept = [each.detach().clone() for each in chosen]
-    for _ in range(25):
+    for _ in range(10):
         optimiser.zero_grad()
         landing(observer, train).backward()
         optimiser.step()
@@ -322,7 +322,7 @@ def test_the_fit_through_the_belief_lands_sooner_and_keeps_the_model_it_starts_f
     searches = [draw_search(generator) for _ in range(40)]
     start = FovealObservationModel.identity(CLASSES, EDGES)
     state = {name: value.clone() for name, value in start.state_dict().items()}
-    fitted = fit_through_belief(start, searches[:20], looks=4, steps=40, batch=4)
+    fitted = fit_through_belief(start, searches[:20], looks=4, steps=20, batch=4)
     untrained = fit_through_belief(start, searches[:20], looks=4, steps=1, batch=1, rate=1e-9)
     losses = [float(landing(SemanticSearch(each), searches[20:]).detach()) for each in (untrained, fitted)]
     torch.testing.assert_close(untrained.miss_odds(torch.zeros(1)).detach(), torch.tensor([[1.0, *[1e-4] * 3]]))
