@@ -21,10 +21,19 @@ PACKAGE = ROOT / "semfov"
 DATA = {".safetensors", ".onnx", ".jpg", ".css", ".html", ".js", ".json", ".typed", ".cfg", ".txt", ".md"}
 
 CODE = """
+import socket
 import sys
 from pathlib import Path
+from types import ModuleType
+
+def refuse(*_, **__):
+    raise AssertionError("a socket was opened")
+
+socket.socket.connect = socket.create_connection = socket.getaddrinfo = refuse
+
 import torch
 import semfov
+from semfov.cli.app import _Calls
 from semfov.cli.main import main
 from semfov.report.page import page_html
 
@@ -38,6 +47,16 @@ assert "<script" in page_html("a page", [])
 view = semfov.foveate(torch.rand(1, 3, 8, 8), (4.0, 4.0), sigma=2.0)
 print(semfov.__version__, view.shape[-1])
 assert main(["detectors"]) == 0
+for words in (["search", "--target", "boat"], ["find", "--target", "person", "--passes", "4"], ["gaze"],
+              ["search", "example:market", "--target", "truck", "--out", "seen"]):
+    assert main(words) == 0, words
+sys.modules["gradio"] = ModuleType("gradio")  # the page's calls need it only for their errors
+calls = _Calls(semfov.ActivePerception.recommended())
+for number, _ in enumerate(calls.examples):
+    picture, name, *_ = calls.take(number, "search")
+    picture.save("example.png")
+    words, page = calls.look("example.png", name, "search", 2)
+    print(name, words)
 main(["search", "--help-all"])
 """
 
@@ -93,51 +112,11 @@ def test_wheel_and_sdist_contain_what_they_must(built):
     assert not [name for name in names if name.startswith((".venv/", "build/", "runs/", ".git/"))]
 
 
-ALONE = """
-import socket
-import sys
-from types import ModuleType
+def test_the_wheel_works_in_a_separate_environment_without_a_network_and_with_an_empty_cache(built, tmp_path):
+    """A path file adds the dependencies of this environment, but not its editable install of the checkout.
 
-def refuse(*_, **__):
-    raise AssertionError("a socket was opened")
-
-socket.socket.connect = socket.create_connection = socket.getaddrinfo = refuse
-
-import semfov
-from semfov.cli.app import _Calls
-from semfov.cli.main import main
-
-assert semfov.__file__.startswith(sys.argv[1]), semfov.__file__
-for words in (["search", "--target", "boat"], ["find", "--target", "person", "--passes", "4"], ["gaze"],
-              ["search", "example:market", "--target", "truck", "--out", "seen"]):
-    assert main(words) == 0, words
-sys.modules["gradio"] = ModuleType("gradio")  # the page's calls need it only for their errors
-calls = _Calls(semfov.ActivePerception.recommended())
-for number, _ in enumerate(calls.examples):
-    picture, name, *_ = calls.take(number, "search")
-    picture.save("example.png")
-    words, page = calls.look("example.png", name, "search", 2)
-    print(name, words)
-"""
-
-
-def test_the_wheel_alone_looks_at_its_photographs_without_a_network_and_with_an_empty_cache(built, tmp_path):
-    """Its files are unpacked into a folder that comes first; whatever opens a connection ends the process."""
-    (wheel,) = built.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(tmp_path / "unpacked")
-    where = {"PYTHONPATH": str(tmp_path / "unpacked"), "SEMFOV_CACHE": str(tmp_path / "cache"), "MPLBACKEND": "agg"}
-    printed = run(sys.executable, "-c", ALONE, tmp_path / "unpacked", cwd=tmp_path, **where)
-    assert "looking at example:beach, which comes with semfov" in printed
-    assert "found boat" in printed
-    assert "looking at example:sheet" in printed
-    assert "found truck" in printed
-    assert (tmp_path / "seen").is_dir()
-    assert not (tmp_path / "cache").exists()
-
-
-def test_the_wheel_works_in_a_separate_environment(built, tmp_path):
-    """A path file adds the dependencies of this environment, but not its editable install of the checkout."""
+    Whatever opens a connection ends the process.
+    """
     home = tmp_path / "environment"
     venv.create(home, with_pip=False, symlinks=os.name != "nt")
     python = home / "bin" / "python"
@@ -147,9 +126,16 @@ def test_the_wheel_works_in_a_separate_environment(built, tmp_path):
     run(sys.executable, "-m", "pip", *install, cwd=tmp_path)
     libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
     (site / "dependencies.pth").write_text("\n".join(sorted(libraries)) + "\n", encoding="utf-8")
-    printed = run(python, "-W", "error", "-c", CODE, cwd=tmp_path)
+    where = {"SEMFOV_CACHE": str(tmp_path / "cache"), "MPLBACKEND": "agg"}
+    printed = run(python, "-W", "error", "-c", CODE, cwd=tmp_path, **where)
     assert printed.split()[:2] == [semfov.__version__, "8"]
     assert "yolox-nano" in printed
+    assert "looking at example:beach, which comes with semfov" in printed
+    assert "found boat" in printed
+    assert "looking at example:sheet" in printed
+    assert "found truck" in printed
     assert "--stop_below" in printed
+    assert (tmp_path / "seen").is_dir()
+    assert not (tmp_path / "cache").exists()
     command = home / "bin" / "semfov"
     assert run(command, "--version", cwd=tmp_path) == f"semfov {semfov.__version__}\n"

@@ -36,7 +36,7 @@ def test_finetuning_raises_the_chance_of_a_hit(run):
 
 
 def test_the_whole_chain_learns_together(run):
-    output = run("learned_chain")
+    output = run("learned_chain", "--scenes", 3, "--steps", 40)
     losses = [float(value) for value in re.findall(r"loss ([\d.]+)", output)]
     widths = [float(value) for value in re.findall(r"fovea ([\d.]+) px", output)]
     assert losses[1] < losses[0]

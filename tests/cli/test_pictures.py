@@ -99,7 +99,7 @@ def test_a_name_of_a_picture_gets_the_figure_of_one(run, photo, folder, tmp_path
     assert "out: expected a folder for the figures of 3 pictures, got" in printed.err
 
 
-@pytest.mark.parametrize("words", [("find",), ("gaze",), ("explore", "--how", "fovea")])
+@pytest.mark.parametrize("words", [("find",), ("gaze",), ("explore", "--how", "fovea", "--shifts", 1)])
 def test_no_figure_takes_the_place_of_the_picture_that_is_looked_at(run, tmp_path, photo, words, monkeypatch):
     picture = photo.rename(tmp_path / "scanpath.png")
     before = picture.read_bytes()

@@ -248,10 +248,10 @@ def test_the_agent_for_any_picture_finds_all_classes_with_a_head(agent, panorama
 @pytest.mark.slow
 def test_finding_all_is_an_exploration_about_the_targets(agent, panorama):
     world = Panorama(panorama)
-    everything = agent.find_all(world, settings=FindSettings(passes=16))
-    both = agent.find_all(world, ["red", "blue"], FindSettings(passes=16))
-    blue = agent.find_all(world, "blue", FindSettings(passes=16))
-    explored = agent.explore(world, ExploreSettings(passes=16))
+    everything = agent.find_all(world, settings=FindSettings(passes=8))
+    both = agent.find_all(world, ["red", "blue"], FindSettings(passes=8))
+    blue = agent.find_all(world, "blue", FindSettings(passes=8))
+    explored = agent.explore(world, ExploreSettings(passes=8))
     assert everything.actions == both.actions == blue.actions == explored.actions
     assert (both.target, both.targets, blue.target) == (None, (1, 3), 3)
     assert both.decision is None
