@@ -15,6 +15,7 @@ from semfov.baselines.saliency.itti import _promote
 from semfov.baselines.saliency.opponent import double_opponency, lab_colours, opponent_colours
 from semfov.gaze.saliency import VOCUS2, IttiKoch, itti_koch_saliency, vocus2_saliency
 from tests.lightness import lab_of
+from tests.pretended import a_gpu
 from tests.refusals import refused
 
 
@@ -309,7 +310,7 @@ def test_saliency_in_lab_equals_that_of_lab_channels(photograph: np.ndarray) -> 
     assert np.abs(expected - opencv_vocus2(opponents(photograph), 2.0, 6.0, 2, "mean")).max() > 0.05
 
 
-@pytest.mark.parametrize(
+MODELS = pytest.mark.parametrize(
     ("model", "settings"),
     [
         (itti_koch_saliency, [{}]),
@@ -318,11 +319,24 @@ def test_saliency_in_lab_equals_that_of_lab_channels(photograph: np.ndarray) -> 
     ],
     ids=["itti-koch", "opponent", "lab"],
 )
+
+
+@MODELS
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 3), (7, 5), (20, 33), (64, 64), (33, 200)])
-def test_any_size_and_uniform_images(size, model, settings, dtype, device):
-    image = torch.rand(1, 3, *size, dtype=dtype, device=device)
+def test_any_size_and_uniform_images(size, model, settings, dtype):
+    check_any_size_and_uniform_images(model, settings, torch.rand(1, 3, *size, dtype=dtype))
+
+
+@MODELS
+@pytest.mark.parametrize("size", [(1, 1), (33, 200)])
+def test_any_size_and_uniform_images_on_cuda(size, model, settings):
+    with a_gpu():
+        check_any_size_and_uniform_images(model, settings, torch.rand(1, 3, *size, device="cuda"))
+
+
+def check_any_size_and_uniform_images(model, settings, image):
     saliency = model(image)
-    assert saliency.shape == (1, *size)
+    assert saliency.shape == (1, *image.shape[-2:])
     assert torch.isfinite(saliency).all()
     for each in settings:
         for uniform in (image[..., :1, :1].expand_as(image), torch.zeros_like(image)):
