@@ -6,6 +6,7 @@ Each table has our words, and beside them those of others, separated by blanks.
 import warnings
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
+from functools import lru_cache
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
@@ -487,7 +488,7 @@ def missing(
     Returns:
         The error, to raise.
     """
-    remedy = _use(words.get(name, of_class)) or _near(name, known)
+    remedy = _use(words.get(name, of_class)) or _near(name, tuple(known))
     attributes = set(known)
     for part in [] if name.startswith("_") else parts_of(name):
         remedy = remedy or _use(words.get(part, part if part in attributes else ""))
@@ -499,7 +500,8 @@ def _use(ours: str) -> str:
     return f"; use {ours}" if ours else ""
 
 
-def _near(name: str, known: Iterable[str]) -> str:
+@lru_cache(maxsize=1024)  # a parser of options asks the package for the same dozens of names at every command
+def _near(name: str, known: tuple[str, ...]) -> str:
     """Suggest the public names that are near to one; empty if there are none, or it is a private one."""
     if name.startswith("_"):  # which programs ask for, and not people
         return ""
