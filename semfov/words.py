@@ -488,8 +488,8 @@ def missing(
     Returns:
         The error, to raise.
     """
-    remedy = _use(words.get(name, of_class)) or _near(name, tuple(known))
-    attributes = set(known)
+    attributes = tuple(known)
+    remedy = _use(words.get(name, of_class)) or _near(name, attributes)
     for part in [] if name.startswith("_") else parts_of(name):
         remedy = remedy or _use(words.get(part, part if part in attributes else ""))
     return AttributeError(f"{owner} has no attribute {name!r}{remedy}")
