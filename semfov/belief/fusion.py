@@ -22,8 +22,10 @@ from semfov.threads import one_thread_if_small
 __all__ = ["fuse", "kaplan", "product", "semba", "sum"]
 
 _Rule = Callable[[Tensor, Tensor], Tensor]
-# Elements of the maps that are fused together on a CPU; those of many episodes leave the processor's cache.
-_BLOCK = 1 << 17
+# Elements of the maps that are fused together on a CPU: those of many episodes leave the processor's cache, and with
+# half as many the calls take a tenth more time.
+_BLOCK = 1 << 18
+_LARGEST_SHORT = torch.iinfo(torch.int16).max
 RULES: dict[str, _Rule] = {}  # the rules by name, without checks, for likelihoods from `_scale_likelihood`
 
 
@@ -287,13 +289,13 @@ def _fuse_covered(beta: Tensor, scaled: Tensor, footprint: Tensor, update: _Rule
     Returns:
         `beta`.
     """
-    covered = footprint > 0
+    covered = _covers(footprint)
     image, detection, cell = covered.nonzero(as_tuple=True)
     if len(image) == 0:
         return beta
     # The pairs of a cell and a detection that covers it, by the rank of the detection among those of its cell.
     rank = covered.cumsum(1, dtype=torch.int32)[image, detection, cell]
-    order = rank.argsort(stable=True)
+    order = _order_of(rank, footprint.shape[1])
     steps = torch.bincount(rank)[1:].tolist()  # pairs of each rank; ranks begin at 1
     cells = (image * beta.shape[1] + cell)[order].split(steps)
     detections = (image * scaled.shape[1] + detection)[order].split(steps)
@@ -311,6 +313,19 @@ def _fuse_covered(beta: Tensor, scaled: Tensor, footprint: Tensor, update: _Rule
     return beta
 
 
+def _covers(footprint: Tensor) -> Tensor:
+    """Tell which cells a footprint `(B, L, X·Y)` covers, boolean."""
+    return footprint if footprint.dtype == torch.bool else footprint > 0
+
+
+def _order_of(rank: Tensor, largest: int) -> Tensor:
+    """Sort ranks `(N,)`, none of which is above the largest, and keep the order of equal ones; `(N,)` indices."""
+    if rank.device.type != "cpu" or largest > _LARGEST_SHORT:
+        return rank.argsort(stable=True)
+    # NumPy sorts numbers of 16 bits by their digits, in a third of the time.
+    return torch.from_numpy(rank.short().numpy().argsort(kind="stable"))
+
+
 def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
     """Scale the likelihoods of the detections that cover a cell; those of the others, such as padding, become 1.
 
@@ -321,5 +336,5 @@ def scale_covering(likelihood: Tensor, footprint: Tensor) -> Tensor:
     Returns:
         `(B, L, K+1)`, with a maximum of 1 in each row.
     """
-    covers_cell = (footprint > 0).any(-1, keepdim=True)  # (B, L, 1)
+    covers_cell = _covers(footprint).any(-1, keepdim=True)  # (B, L, 1)
     return _scale_likelihood(torch.where(covers_cell, likelihood, 1.0))
