@@ -132,4 +132,6 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
 
 def in_bytes(image: Tensor) -> Tensor:
     """Convert pixels in [0, 1] to bytes, on the CPU."""
-    return image.detach().clamp(0, 1).mul_(255).round_().to("cpu", torch.uint8)
+    values = image.detach().clamp(0, 1).mul_(255).round_()
+    # By way of whole numbers of 16 bits, as PyTorch converts floats to bytes one by one.
+    return values.to(torch.int16).to("cpu", torch.uint8)
