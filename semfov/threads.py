@@ -85,6 +85,8 @@ def beside(work: Callable[[], object] | None, *, idle: bool) -> Iterator[None]:
         return
 
     def run() -> None:
+        # Until a thread has asked PyTorch for its number of threads, its matrix products run on all cores.
+        torch.get_num_threads()
         with suppress(Exception), torch.no_grad():
             work()
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info
 from torch import Tensor, nn
 
 import semfov
@@ -366,3 +367,17 @@ def test_work_is_done_beside_a_block_where_a_core_is_left(monkeypatch):
             pass
         assert len(names) == done
         assert threading.current_thread().name not in names
+
+
+def test_products_beside_a_block_take_one_thread_where_pytorch_has_one():
+    """PyTorch tells a new thread its number when it is asked there; before that, products run on all cores."""
+    counts = []
+
+    def work() -> None:
+        of_products = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "openmp"]
+        counts.extend(of_products)
+
+    with one_thread(), beside(work, idle=True):
+        pass
+    assert counts
+    assert set(counts) == {1}
