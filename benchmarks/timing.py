@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 Run = Callable[[], object]
@@ -87,16 +87,37 @@ def interleaved(
     Returns:
         Milliseconds of every program in every repetition.
     """
-    durations: dict[str, list[float]] = {name: [] for name in runs}
+    (durations,) = interleaved_by((clock,), runs, seconds, least, times)
+    return durations
+
+
+def interleaved_by(
+    clocks: Sequence[Clock], runs: Mapping[str, Run], seconds: float, least: int = 5, times: int = 1
+) -> list[dict[str, list[float]]]:
+    """Time programs in turn (`interleaved`) by several clocks, which all see the same repetitions.
+
+    Args:
+        clocks: the clocks.
+        runs: the programs by name.
+        seconds: approximate duration of the whole measurement.
+        least: smallest number of repetitions.
+        times: number of runs per turn.
+
+    Returns:
+        For each clock, milliseconds of every program in every repetition.
+    """
+    durations: list[dict[str, list[float]]] = [{name: [] for name in runs} for _ in clocks]
     names, began, repetition = list(runs), time.perf_counter(), 0
     while repetition <= least or time.perf_counter() - began < seconds:
         first = repetition % len(names)
         for name in names[first:] + names[:first]:
-            start = clock()
+            starts = [clock() for clock in clocks]
             for _ in range(times):
                 runs[name]()
+            ends = [clock() for clock in clocks]
             if repetition:
-                durations[name].append(1e3 * (clock() - start) / times)
+                for of_clock, start, end in zip(durations, starts, ends, strict=True):
+                    of_clock[name].append(1e3 * (end - start) / times)
         repetition += 1
     return durations
 

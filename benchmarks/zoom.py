@@ -10,9 +10,10 @@ have both.
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from PIL import Image
 
 from benchmarks.bare import BareYolox, Pixels, bare_looks
 from benchmarks.tables import begin, command, number, page, spread, table, write
-from benchmarks.timing import Clock, Run, Spread, interleaved
+from benchmarks.timing import Clock, Run, Spread, interleaved_by
 from semfov import EmbeddedScenes, ZoomAgent
 from semfov.data.images import to_bytes
 from semfov.data.mosaics import Mosaics
@@ -38,8 +39,9 @@ TEXT = f"""\
 Written by `python -m benchmarks.zoom`. YOLOX-nano, {PASSES} passes over mosaics of embedded scenes. A photograph of
 640 × 480 px takes five, the whole and four quarters, and a search of it the whole and closer looks. The plain loop
 looks at the same windows by onnxruntime, OpenCV's letterbox and its suppression of boxes (`benchmarks/bare.py`), and a
-JPEG is decoded by OpenCV. Medians over repetitions; ratios with quartiles. With one thread for the detector, windows
-are resampled ahead by a second thread: the calling thread has what is left to wait for where a second core is free."""
+JPEG is decoded by OpenCV. Medians over repetitions; ratios with quartiles, both of the same repetitions. With one
+thread for the detector, windows are resampled ahead by a second thread: the calling thread has what is left to wait for
+where a second core is free."""
 
 
 def programs(agent: ZoomAgent, bare: BareYolox, side: int, height: int) -> dict[str, tuple[Run, Run, int]]:
@@ -90,31 +92,64 @@ def from_file(agent: ZoomAgent, bare: BareYolox, path: Path) -> tuple[Run, Run, 
     return task, loop, record.passes
 
 
-def cost(task: Run, loop: Run, seconds: float, clock: Clock) -> tuple[Spread, Spread, Spread]:
-    """Milliseconds of a task and of the plain loop, and their ratio."""
-    durations = interleaved({"task": task, "loop": loop}, seconds, clock)
-    ratios = [ours / theirs for ours, theirs in zip(durations["task"], durations["loop"], strict=True)]
-    return Spread.of(durations["task"]), Spread.of(durations["loop"]), Spread.of(ratios)
+class Cost(NamedTuple):
+    """Cost of a task beside the plain loop.
+
+    Attributes:
+        repetitions: how often both ran.
+        task: milliseconds of the task.
+        loop: milliseconds of the plain loop.
+        ratio: task by loop.
+        waiting: the same by the times of the calling thread.
+    """
+
+    repetitions: int
+    task: Spread
+    loop: Spread
+    ratio: Spread
+    waiting: Spread
+
+
+def cost(task: Run, loop: Run, seconds: float, clocks: tuple[Clock, Clock]) -> Cost:
+    """Measure a task and the plain loop by a clock, and by one of the calling thread."""
+    by_clock, by_thread = interleaved_by(clocks, {"task": task, "loop": loop}, seconds)
+    return Cost(
+        len(by_clock["task"]),
+        Spread.of(by_clock["task"]),
+        Spread.of(by_clock["loop"]),
+        _ratio(by_clock),
+        _ratio(by_thread),
+    )
+
+
+def _ratio(durations: Mapping[str, list[float]]) -> Spread:
+    """Divide the times of the task by those of the loop in the same repetitions."""
+    return Spread.of([ours / theirs for ours, theirs in zip(durations["task"], durations["loop"], strict=True)])
 
 
 @torch.inference_mode()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure all tasks and write the table."""
-    parser = command("benchmarks.zoom", __doc__, seconds=10.0)
+    parser = command("benchmarks.zoom", __doc__, seconds=4.0)
     options = parser.parse_args(arguments)
     clock, about = begin(options)
     agent = ZoomAgent.recommended("yolox-nano")
     bare = BareYolox(fetch("yolox-nano"), options.threads)
     rows, figures = [], {}
 
+    clocks = (clock, time.thread_time if options.threads == 1 else clock)
+
     def measured(name: str, task: Run, loop: Run, passes: int) -> None:
-        whole, alone, ratio = cost(task, loop, options.seconds, clock)
-        each = [number(whole.middle / passes), number(alone.middle / passes)]
-        *_, waiting = cost(task, loop, options.seconds, time.thread_time if options.threads == 1 else clock)
-        rows.append([name, *each, spread(ratio), spread(waiting)])
+        found = cost(task, loop, options.seconds, clocks)
+        each = [number(found.task.middle / passes), number(found.loop.middle / passes)]
+        rows.append([name, *each, spread(found.ratio), spread(found.waiting), str(found.repetitions)])
         figures[name] = {
-            "task": asdict(whole), "loop": asdict(alone), "ratio": asdict(ratio), "waiting": asdict(waiting)
-        }  # fmt: skip
+            "repetitions": found.repetitions,
+            "task": asdict(found.task),
+            "loop": asdict(found.loop),
+            "ratio": asdict(found.ratio),
+            "waiting": asdict(found.waiting),
+        }
         print(" | ".join(rows[-1]), flush=True)
 
     for size, (side, height) in TILES.items():
@@ -125,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             path = Path(folder, f"{len(rows)}.jpg")
             Image.fromarray(mosaic(agent, *TILES[size])).save(path, quality=90)
             measured(f"find all, {size}, from a JPEG", *from_file(agent, bare, path))
-    head = ["task", "pass, ms", "plain loop, ms", "task by loop", "in the calling thread"]
+    head = ["task", "pass, ms", "plain loop, ms", "task by loop", "in the calling thread", "repetitions"]
     text = page("Large pictures", TEXT, about, table(head, rows))
     write(options.out, "zoom", text, {"machine": about, "milliseconds": figures})
 
