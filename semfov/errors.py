@@ -150,7 +150,7 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
     """Raise `InputError` unless the last dimensions of a tensor have the given sizes; None stands for any."""
     check_tensor(tensor, argument)
     sizes = tuple(tensor.shape[-len(shape) :])
-    has_shape = len(sizes) == len(shape) and all(_is_size(*pair) for pair in zip(sizes, shape, strict=True))
+    has_shape = len(sizes) == len(shape) and all(map(_is_size, sizes, shape))
     if not has_shape:
         # The message is built only now, because a graph with dynamic sizes cannot write the sizes out.
         expected = ", ".join("any" if size is None else str(size) for size in shape)
