@@ -92,10 +92,11 @@ class SearchFacts:
         score = float(look.show[target - 1])
         is_closest = look.window.level == self.belief.lattice.levels - 1
         closest = score if is_closest else 0.0
-        scores = look.detections.scores[0, :, target].detach().float().numpy()
+        vectors = look.detections.scores[0].detach().float().numpy()  # (L, K+1)
+        scores = vectors[:, target]
         if not len(scores):
             return _LookFacts(look, score, closest, named=0.0, found=0.0, box=None)
-        is_named = look.detections.labels[0].numpy() == target
+        is_named = vectors[:, 1:].argmax(1) == target - 1
         named = float(scores[is_named].max(initial=0))
         best = int(scores.argmax())
         return _LookFacts(look, score, closest, named, float(scores[best]), look.detections.boxes[0, best])
