@@ -16,7 +16,7 @@ Nothing is computed until it is asked for, and then only what has changed:
 
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -51,6 +51,22 @@ class Rates(Protocol):
     def taper(self, span: int) -> Tensor: ...
 
 
+class _Prediction(NamedTuple):
+    """Rates `(octaves, rows, columns)` that a look predicts, and what they were predicted from."""
+
+    gist: Gist
+    before: Tensor | None
+    rates: Cells
+
+    def suits(self, gist: Gist, before: Tensor | None) -> bool:
+        """Tell whether a look predicts the same."""
+        if gist is not self.gist:
+            return False
+        if before is None or self.before is None:
+            return before is self.before
+        return torch.equal(before, self.before)
+
+
 class ZoomBelief:
     r"""Belief about what looks at any window will show, for one class or for all.
 
@@ -66,7 +82,8 @@ class ZoomBelief:
 
     Private attributes: `_rate` `(levels, rows, columns)` has λ of each cell for looks of each level, and `_rated_level`
     `(rows, columns)` the level of the look that this is from. `_gists_rated` counts the gists that both know. `_sums`
-    has the sums over windows that were asked for, by quantity and level.
+    has the sums over windows that were asked for, by quantity and level. `_predictions` has what looks predict, by the
+    `id` of their gists: of present ones, and of those before the last `clear`.
 
     Invariant: `closest_level` knows all gists, `_rate` and `_rated_level` the first `_gists_rated`; when these are all,
     `_rated_level` equals `closest_level`. The sums are those of the cells but for windows over cells that were marked.
@@ -90,10 +107,14 @@ class ZoomBelief:
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self.foresight = self._rates.foresight
         self._targets = torch.tensor([target])
+        self.gists: list[Gist] = []
+        self._predictions: dict[int, _Prediction] = {}
         self.clear()
 
     def clear(self) -> None:
-        """Forget all looks."""
+        """Forget all looks; what they predict is kept for those that are added again before the next `clear`."""
+        known = self._predictions
+        self._predictions = {id(gist): known[id(gist)] for gist in self.gists if id(gist) in known}
         shape = self.lattice.rows, self.lattice.columns
         self._rate = np.zeros((self.lattice.levels, *shape), np.float32)  # λ of each cell for looks of each level
         self._rated_level = np.full(shape, -1, np.int8)  # level of the look that the rates of a cell are from
@@ -101,7 +122,7 @@ class ZoomBelief:
         self.closest_level = torch.full(shape, -1, dtype=torch.int8)
         # Made anew when it is asked for: which cells are blank is known after the overview alone.
         self.__dict__.pop("unexplored", None)
-        self.gists: list[Gist] = []
+        self.gists = []
         self._sums: dict[tuple[_CellQuantity, int], WindowSums] = {}
 
     @cached_property
@@ -202,7 +223,7 @@ class ZoomBelief:
         rate = self._rate[:, y1:y2, x1:x2]
         rated_level = self._rated_level[y1:y2, x1:x2]
         before = _rates_before(rate, rated_level, gist) if gist.level > 0 else None
-        predicted = self._rates.rates(gist, self._targets, before)[0].exp().numpy()
+        predicted = self._rates_of(gist, before)
         by_cell = _by_cell(predicted, gist.scale, rated_level.shape)
         is_closer = rated_level < gist.level
         for level, rate_of_level in enumerate(rate):
@@ -213,6 +234,22 @@ class ZoomBelief:
             elif rate_of_level.any():  # memory that was never written to is not taken
                 np.copyto(rate_of_level, 0, where=is_closer)
         rated_level[is_closer] = gist.level
+
+    def _rates_of(self, gist: Gist, before: Tensor | None) -> Cells:
+        """Predict the rates of a look, unless they are known: where a camera moves a little, most hints do not change.
+
+        Args:
+            gist: the look.
+            before: logarithms of the rates that earlier looks gave (`before_of`); None for a look at the whole.
+
+        Returns:
+            `(octaves, rows, columns)`.
+        """
+        known = self._predictions.get(id(gist))
+        if known is None or not known.suits(gist, before):
+            rates = self._rates.rates(gist, self._targets, before)[0].exp().numpy()
+            known = self._predictions[id(gist)] = _Prediction(gist, before, rates)
+        return known.rates
 
     def remaining(self) -> tuple[float, float]:
         """Sum what looks are still expected to find, in each cell by the level that finds most.

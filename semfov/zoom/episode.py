@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Generic, TypeVar
 
@@ -56,6 +57,13 @@ class KeptLook:
         self.in_view = True
         self._motion: Motion | None = None  # of the camera since the look; None as long as it has stood still
 
+    def show(self, current: WindowLook) -> None:
+        """Take where the look lies in the next frame; hints that have not changed stay the same object."""
+        before = self.current.gist
+        if before is not None and current.gist is not None and before.equals(current.gist):
+            current = replace(current, gist=before)
+        self.current = current
+
     def moved(self, motion: Motion) -> Motion:
         """Take a motion of the camera to the next frame, and return that since the look."""
         self._motion = motion if self._motion is None else self._motion.then(motion)
@@ -75,7 +83,7 @@ def carry_along(looks: list[KeptLook], motion: Motion, lattice: Lattice) -> list
     """
     motions = [look.moved(motion) for look in looks]
     for look, current in zip(looks, carried([look.original for look in looks], motions, lattice), strict=True):
-        look.current = current
+        look.show(current)
         look.in_view = share_left(current.window, lattice) >= _LEAST_LEFT
     return looks
 

@@ -93,6 +93,16 @@ class Gist:
             found=torch.from_numpy(found).unflatten(0, cells.shape),
         )
 
+    def equals(self, other: "Gist") -> bool:
+        """Tell whether another gist has the same hints in the same cells."""
+        are_same_cells = (self.level, self.first, self.scale) == (other.level, other.first, other.scale)
+        return (
+            are_same_cells
+            and torch.equal(self.scores, other.scores)
+            and torch.equal(self.size, other.size)
+            and torch.equal(self.found, other.found)
+        )
+
     @cached_property
     def best(self) -> Tensor:
         """Highest score of any class among the hints of each cell, `(rows, columns)`."""

@@ -1,6 +1,8 @@
 """Belief and policy: sums against plain loops, no look twice, jointly chosen batches."""
 
 import tracemalloc
+from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +15,7 @@ from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.episode import look_for
 from semfov.zoom.hints import Gist
-from semfov.zoom.looks import LiveWindowLooks, Window
+from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from semfov.zoom.policy import best_find, jointly
 from semfov.zoom.window_sums import WindowSums
 from tests.refusals import refused
@@ -92,6 +94,30 @@ def test_what_is_kept_equals_what_is_computed_from_all_looks(detector, evidence,
         most = np.max([expected[level] for level in range(1, lattice.levels)], 0)
         remaining = most[most >= 0.1].sum(), most[most < 0.1].sum()
         np.testing.assert_allclose(belief.remaining(), remaining, rtol=1e-3, atol=1e-4)
+
+
+def test_a_belief_that_is_made_anew_predicts_changed_looks_alone(source, evidence, monkeypatch):
+    """It equals a new belief of the same looks, also where the first of them, on which others rest, is another one."""
+    lattice = source.lattice
+    looks = source.see([Window.on(lattice, action) for action in ((0, 0, 0), (1, 0, 0), (1, 3, 2))])
+    gist = looks[0].gist
+    changed = replace(looks[0], gist=replace(gist, scores=gist.scores.roll(2, 1)))
+    predicted = []
+    rates = evidence.rates
+    monkeypatch.setattr(evidence, "rates", lambda look, *more: predicted.append(look) or rates(look, *more))
+
+    def values(belief: ZoomBelief, seen: Sequence[WindowLook]) -> list[np.ndarray]:
+        belief.clear()
+        predicted.clear()
+        for look in seen:
+            belief.add(look)
+        return [belief.value(level, 0.5).copy() for level in range(1, lattice.levels)]
+
+    belief = ZoomBelief(lattice, evidence, 1)
+    for seen, count in ((looks, 3), (looks, 0), (looks[:2], 0), (looks, 1), ([changed, *looks[1:]], 3)):
+        found = values(belief, seen)
+        assert len(predicted) == count
+        np.testing.assert_equal(found, values(ZoomBelief(lattice, evidence, 1), seen))
 
 
 @pytest.mark.parametrize("target", [1, 2, 3])
