@@ -26,7 +26,7 @@ from semfov.decision import CandidatePlace, CloseUp, Decision
 from semfov.detection import SCORE_THRESHOLD, Objects
 from semfov.episode import Forgetting
 from semfov.errors import InputError, check
-from semfov.motion import CameraMotion, CameraStep, KnownPoses, LostScene, Motion
+from semfov.motion import CameraMotion, CameraStep, KnownPoses, LostScene, Motion, PatchFlow
 from semfov.observation.matching import inside_frame
 from semfov.paths import Ending, WindowMoment, ZoomPath
 from semfov.paths.conversion import Values
@@ -511,7 +511,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
         camera = self._camera.step(view, pose)
         session.follows = self._camera.is_followed
         if session.newest is not None and session.tracker is not None:
-            session.tracker.follow(passed, camera)
+            session.tracker.follow(passed, camera, self._camera.flow)
         if camera is None or session.newest is None:
             session.source.show(view, passed)
             return
@@ -546,12 +546,14 @@ class _Camera:
 
     Attributes:
         is_followed: whether its motion is known at all, from the first frame on.
+        flow: follows what moves on its own; None where the camera is not followed.
     """
 
     def __init__(self, *, follows: bool) -> None:
         self._follows = follows
         self._estimate: CameraMotion | None = None
         self._poses: KnownPoses | None = None
+        self.flow: PatchFlow | None = None
         self._is_first = True  # whether no frame was seen
 
     @property
@@ -565,6 +567,8 @@ class _Camera:
         # Without OpenCV a warning is given, which does not concern a camera whose poses are known.
         if self._is_first and pose is None and self._follows:
             self._estimate = _camera_motion()
+        if self._is_first and self._estimate is not None:
+            self.flow = PatchFlow()
         self._is_first = False
         if pose is not None:
             self._poses = self._poses or KnownPoses()
@@ -572,7 +576,10 @@ class _Camera:
         if self._estimate is None:
             return None
         width, height = view.picture.size
-        return self._estimate.step(view.picture.pixels((0, 0, width, height)))
+        camera = self._estimate.step(view.picture.pixels((0, 0, width, height)))
+        if self.flow is not None and self._estimate.present is not None:
+            self.flow.step(self._estimate.present.fine, self._estimate.present.fine_ratio)
+        return camera
 
 
 def _camera_motion() -> CameraMotion | None:

@@ -171,6 +171,11 @@ class CameraMotion:
         self._course: NDArray[np.float64] | None = None  # the last motion between two frames, in reduced pixels
         self._lost: _LostFrame | None = None  # what was seen before a disturbance, while it may still be found
 
+    @property
+    def present(self) -> GreyFrame | None:
+        """The frame that was taken last."""
+        return self._last
+
     def step(self, frame: NDArray[np.uint8]) -> CameraStep:
         """Take the next frame, and estimate its motion.
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LONGER = 480  # most pixels of the longer side of the reduced frames
+_FINE_LONGER = 960  # the same of those that are less reduced
 _CORNERS = 150  # most corners that are followed
 _QUALITY = 0.01  # least quality of a corner, as a share of the best one's
 _APART = 8  # least distance between two corners, in reduced pixels
@@ -27,18 +28,25 @@ class GreyFrame:
     Attributes:
         grey: `(h, w)` bytes.
         ratio: `(x, y)`, pixels of the frame for one of the reduced one.
+        fine: the frame less reduced, for what is small in it, `(H, W)` bytes.
+        fine_ratio: `(x, y)`, pixels of the frame for one of these.
     """
 
     def __init__(self, cv2: ModuleType, frame: NDArray[np.uint8]) -> None:
         self._cv2 = cv2
         height, width = frame.shape[:2]
         # Means of whole pixels take a fifth of the time of others; a rest at the right and below is left out.
-        factor = max(1, math.ceil(max(width, height) / _LONGER))
+        factor = _factor(width, height, _LONGER)
         size = max(1, width // factor), max(1, height // factor)
         shown = frame[: size[1] * factor, : size[0] * factor]
         self.ratio = shown.shape[1] / size[0], shown.shape[0] / size[1]
         # A third of the values is left to average where the frame is grey first.
-        self.grey = cv2.resize(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+        full = cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY)
+        self.grey = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
+        fine_factor = _factor(width, height, _FINE_LONGER)
+        fine_size = max(1, full.shape[1] // fine_factor), max(1, full.shape[0] // fine_factor)
+        self.fine: NDArray[np.uint8] = cv2.resize(full, fine_size, interpolation=cv2.INTER_AREA)
+        self.fine_ratio = full.shape[1] / fine_size[0], full.shape[0] / fine_size[1]
 
     @cached_property
     def corners(self) -> NDArray[np.float32]:
@@ -97,3 +105,8 @@ class GreyFrame:
         beyond = np.hypot(down, across) > _LOBE
         order = half[peaks][beyond].argsort()[::-1][:_MOST_REPEATS]
         return [np.array([across[beyond][n], down[beyond][n]], np.float64) for n in order]
+
+
+def _factor(width: int, height: int, longer: int) -> int:
+    """Choose by how many whole pixels a frame is reduced, so that its longer side has no more than some."""
+    return max(1, math.ceil(max(width, height) / longer))

@@ -91,9 +91,24 @@ class Kinematics:
         Returns:
             The objects, seen.
         """
-        gain = self.covariance[:, :, 0] / (self.variance + variance)[:, None]
-        surprise = place - self.place
-        covariance = self.covariance - gain[:, :, None] * self.covariance[:, None, 0]
+        return self._updated(0, place - self.place, variance)
+
+    def moved(self, velocity: Floats, variance: Floats) -> "Kinematics":
+        r"""Update the objects by velocities with which they were seen to move: as `measured`, with H = (0, 1).
+
+        Args:
+            velocity: `(N, 2)`, in pixels a second.
+            variance: `(N,)`, r, of each coordinate of these velocities.
+
+        Returns:
+            The objects, seen to move.
+        """
+        return self._updated(1, velocity - self.velocity, variance)
+
+    def _updated(self, row: int, surprise: Floats, variance: Floats) -> "Kinematics":
+        """Update the objects by what was measured of the place, row 0, or the velocity, 1, beyond what was expected."""
+        gain = self.covariance[:, :, row] / (self.covariance[:, row, row] + variance)[:, None]
+        covariance = self.covariance - gain[:, :, None] * self.covariance[:, None, row]
         return Kinematics(self.place + gain[:, :1] * surprise, self.velocity + gain[:, 1:] * surprise, covariance)
 
     def carried(self, motion: Motion) -> "Kinematics":

@@ -31,6 +31,8 @@ class TrackingModel:
         acceleration: density of the noise of the velocity, in square sides a second cubed.
         place: standard deviation of each coordinate of a place at which a look shows an object, in sides.
         pixel: the same of the finest place that a detector tells, in pixels of its canvas.
+        flow: standard deviation of each coordinate of an object's motion between two frames, in sides.
+        unsteady: the same of the motion of the scene about it, in pixels of the frame.
         size: standard deviation of the logarithm of the width and height of a box.
         entering: the same after a look at an object that the border of the frame cuts, so that the next look decides.
         growth: variance by which the logarithm of the size changes in a second.
@@ -54,6 +56,8 @@ class TrackingModel:
     acceleration: float = 0.25
     place: float = 0.08
     pixel: float = 0.5
+    flow: float = 0.02
+    unsteady: float = 0.5
     size: float = 0.2
     entering: float = 0.5
     growth: float = 0.01

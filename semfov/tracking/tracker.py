@@ -18,12 +18,13 @@ import torch
 from numpy.typing import NDArray
 
 from semfov.detection.selection import Selection, remaining_rows
-from semfov.motion import CameraStep, LostScene, Motion
+from semfov.motion import CameraStep, LostScene, Motion, PatchFlow
 from semfov.tracking.assignment import cheapest_pairs
 from semfov.tracking.kalman import Floats, Kinematics
 from semfov.tracking.model import TrackingModel
 from semfov.tracking.tracks import Tracks, no_trail
 
+_FOLLOWED = 32  # most objects that are followed from frame to frame
 _AS_CLOSE = 0.9  # of the magnification of a look, from which on another one is as close
 _ONE_OF_CLASS = Selection(iou=0.5, limit=10**9, per_class=True)  # two objects that overlap by more than half are one
 
@@ -110,18 +111,38 @@ class Tracker:
         self._last = 0
         self._is_marked = False
 
-    def follow(self, seconds: float, camera: CameraStep | None = None) -> None:
+    def follow(self, seconds: float, camera: CameraStep | None = None, flow: PatchFlow | None = None) -> None:
         """Predict the objects at the next frame.
 
         Args:
             seconds: time since the last frame.
             camera: how the camera moved since the last frame; None for one that stands still.
+            flow: follows the boxes of objects from the last frame to this one; None where nothing does.
         """
+        step = camera or CameraStep(Motion.still())
+        if flow is not None and step.motion is not None and seconds > 0:
+            self._see_motion(seconds, step.motion, flow)
         known = _Known(self.tracks, self._now)
         self._now += seconds
         self._is_marked = False
-        scenes = self._lost.follow([known], camera or CameraStep(Motion.still()), self._at_present)
+        scenes = self._lost.follow([known], step, self._at_present)
         self.tracks = reduce(Tracks.joined, (scene.tracks for scene in scenes)) if scenes else Tracks.none()
+
+    def _see_motion(self, seconds: float, motion: Motion, flow: PatchFlow) -> None:
+        """Update the velocities of the most probable objects by how they have moved since the last frame."""
+        rows = np.argsort(-self.tracks.log_odds, kind="stable")[:_FOLLOWED]
+        tracks = self.tracks[rows]
+        places = tracks.place
+        way = np.where(tracks.moves[:, None], seconds * tracks.kinematics.velocity, 0.0)
+        expected = motion.points(torch.from_numpy(places + way)).numpy()
+        found = flow.follow(tracks.corners, expected)
+        # Beside the scene, in pixels of the last frame: what the camera's motion does not explain.
+        origins = motion.inverse().points(torch.from_numpy(found.places)).numpy()
+        variance = (self.model.flow * tracks.sides) ** 2 + self.model.unsteady**2
+        moved = tracks.kinematics.moved((origins - places) / seconds, variance / seconds**2)
+        followed = found.are_followed
+        kinematics = self.tracks.kinematics.with_rows(rows[followed], moved[followed])
+        self.tracks = replace(self.tracks, kinematics=kinematics)
 
     def _at_present(self, scenes: list["_Known"], motion: Motion) -> list["_Known"]:
         """Predict objects at the present frame, to which the camera moved."""

@@ -15,6 +15,7 @@ from semfov.tracking.kalman import Floats, Kinematics
 
 TRAIL = 32  # frames
 _STANDING = 0.2  # share of the objects that stand still
+_MOVING = 1.5  # log odds for an object that is seen to move: what only looks like one is mostly a part of the ground
 
 _Index = NDArray[np.intp] | NDArray[np.bool_] | slice
 
@@ -132,8 +133,15 @@ class Tracks:
 
     @property
     def log_odds(self) -> Floats:
-        """Log odds that they exist, `(N,)`."""
-        return self.shown_odds + self.missed_odds
+        r"""Log odds that they exist, `(N,)`.
+
+        They are those by the looks, and for an object that is seen to move up to 1.5 more, with the probability s that
+        it stands still, which is .2 before it was seen twice:
+
+        .. math:: 1.5 \, (1 - s / 0.2)_+
+        """
+        moves = (1 - self.standing / _STANDING).clip(0)
+        return self.shown_odds + self.missed_odds + _MOVING * moves
 
     @property
     def existence(self) -> Floats:

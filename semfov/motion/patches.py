@@ -1,0 +1,159 @@
+"""Patches of a frame that are followed into the next one, each by a motion of its own, as objects have it.
+
+    frame before:  a box with its surroundings ──► tile ──┐
+                                                          ├── flow of the tile's middle ──► where the box is now
+    next frame:    where the box is expected  ───► tile ──┘
+
+All tiles have one size, so that one call of the flow follows small objects and large ones, and each by its whole box.
+"""
+
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.errors import needing
+
+_Floats = NDArray[np.float64]
+
+_TILE = 32  # side of a tile in its own pixels
+_SURROUNDINGS = 2  # sides of a tile in those of its box
+_MIDDLE = slice(_TILE // 4, 3 * _TILE // 4)  # rows or columns of a tile that its box fills
+_WINDOW = (15, 15)  # window of the flow in pixels of a tile: nearly all of the box
+_PYRAMID = 1  # further levels of the flow's pyramid
+_STEPS = 10  # most steps of the flow at a level, which end below the next number
+_LEAST_STEP = 0.03  # pixels of a tile
+_SMALLEST = 4.0  # pixels: least side of a box
+_FARTHEST = 12.0  # pixels of a tile by which a patch may be off where it is expected: beyond, it leaves the tile
+_BACK = 0.5  # pixels of a tile within which the flow back ends at the patch
+_OFF = 0.5  # share of its contrast by which a patch may have changed: two that have nothing in common differ by 1.4
+_LEAST_CONTRAST = 3.0  # least mean difference of a patch from its mean, in grey values
+
+
+class FollowedPatches(NamedTuple):
+    """Where patches are in the next frame.
+
+    Attributes:
+        places: `(N, 2)`, the centres of their boxes in pixels; those that were not followed are where they were
+            expected.
+        are_followed: `(N,)` boolean, those that were followed.
+    """
+
+    places: _Floats
+    are_followed: NDArray[np.bool_]
+
+
+class PatchFlow:
+    """Follows the boxes of objects from one frame to the next by pyramidal Lucas–Kanade flow (Bouguet, 2001).
+
+    A box is left out if the border of a frame cuts it, if it has too little contrast, if the flow back into the frame
+    before does not end where it began (Kalal et al., 2010), or if its patch looks otherwise than before, as where it is
+    hidden.
+
+    Private attributes: `_before` and `_present` are the last two frames, None before they were shown.
+
+    Raises:
+        InputError: OpenCV is not installed.
+    """
+
+    def __init__(self) -> None:
+        with needing("OpenCV", "motion of objects", "opencv-python-headless"):
+            import cv2
+        self._cv2: ModuleType = cv2
+        self._before: NDArray[np.uint8] | None = None
+        self._present: NDArray[np.uint8] | None = None
+        self._ratio = np.ones(2)
+
+    def step(self, grey: NDArray[np.uint8], ratio: tuple[float, float] = (1.0, 1.0)) -> None:
+        """Take the next frame.
+
+        Args:
+            grey: `(h, w)` bytes, the frame or a reduced copy.
+            ratio: `(x, y)`, pixels of the frame for one of the copy.
+        """
+        self._before = self._present
+        self._present = grey
+        self._ratio = np.array(ratio)
+
+    def follow(self, boxes: _Floats, expected: _Floats) -> FollowedPatches:
+        """Follow boxes from the frame before into the present one.
+
+        Args:
+            boxes: `(N, 4)`, `(x1, y1, x2, y2)` in pixels of the frame before.
+            expected: `(N, 2)`, where their centres are expected in the present frame.
+
+        Returns:
+            Where they are.
+        """
+        places = expected.copy()
+        are_followed = np.zeros(len(boxes), bool)
+        if self._before is None or self._present is None or self._before.shape != self._present.shape:
+            return FollowedPatches(places, are_followed)
+        centres = (boxes[:, :2] + boxes[:, 2:]) / 2 / self._ratio
+        sides = (boxes[:, 2:] - boxes[:, :2]) / self._ratio
+        guesses = expected / self._ratio
+        size = np.array(self._present.shape[::-1])
+        is_whole = _lie_inside(centres, sides, size) & _lie_inside(guesses, sides, size)
+        rows = np.flatnonzero(is_whole & (sides >= _SMALLEST).all(-1))
+        if len(rows):
+            ends, are_followed[rows] = self._flow(centres[rows], sides[rows], guesses[rows])
+            places[are_followed] = (ends * self._ratio)[are_followed[rows]]
+        return FollowedPatches(places, are_followed)
+
+    def _flow(self, centres: _Floats, sides: _Floats, guesses: _Floats) -> tuple[_Floats, NDArray[np.bool_]]:
+        """Follow boxes that both frames show, in their pixels; returns their centres, and which were followed."""
+        steps = sides * (_SURROUNDINGS / _TILE)  # pixels of the frame for one of a tile
+        first = self._tiles(self._before, centres, steps)
+        second = self._tiles(self._present, guesses, steps)
+        # The middles of the tiles, one below the other: where boxes are, and where they are expected.
+        middles = np.full((len(sides), 2), (_TILE - 1) / 2, np.float32)
+        middles[:, 1] += _TILE * np.arange(len(sides))
+        ends, is_found, change = self._followed(first, second, middles, middles)
+        back, is_found_back, _ = self._followed(second, first, ends, ends)
+        shifts = ends - middles
+        contrast = _contrast(first)
+        is_near = np.abs(shifts).max(-1) < _FARTHEST
+        is_same = (np.linalg.norm(back - middles, axis=-1) < _BACK) & (change < _OFF * contrast)
+        are_followed = is_found & is_found_back & is_near & is_same & (contrast >= _LEAST_CONTRAST)
+        return guesses + shifts * steps, are_followed
+
+    def _tiles(self, frame: NDArray[np.uint8] | None, centres: _Floats, steps: _Floats) -> NDArray[np.uint8]:
+        """Resample parts of a frame, with some of its pixels for one of a tile `(N, 2)`, to tiles, `(32 N, 32)`."""
+        count = len(centres)
+        offsets = np.arange(_TILE) - (_TILE - 1) / 2
+        # The centre of the first pixel of a frame is 0 for OpenCV.
+        x, y = ((centres - 0.5)[:, :, None] + steps[:, :, None] * offsets).astype(np.float32).transpose(1, 0, 2)
+        across = np.broadcast_to(x[:, None], (count, _TILE, _TILE)).reshape(-1, _TILE)
+        down = np.broadcast_to(y[:, :, None], (count, _TILE, _TILE)).reshape(-1, _TILE)
+        cv2 = self._cv2
+        tiles = cv2.remap(frame, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(tiles, np.uint8)
+
+    def _followed(
+        self, first: NDArray[np.uint8], second: NDArray[np.uint8], begin: NDArray[np.float32], guess: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+        """Follow a point of each tile: where it is, whether it was found, and how much its window has changed."""
+        cv2 = self._cv2
+        end, status, change = cv2.calcOpticalFlowPyrLK(
+            first,
+            second,
+            begin[:, None],
+            guess[:, None].copy(),
+            winSize=_WINDOW,
+            maxLevel=_PYRAMID,
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, _LEAST_STEP),
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
+        return end[:, 0], status[:, 0] == 1, change[:, 0]
+
+
+def _lie_inside(centres: _Floats, sides: _Floats, size: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Tell which boxes lie in a frame of a size `(width, height)`, `(N,)`."""
+    return np.asarray(((centres - sides / 2 >= 0) & (centres + sides / 2 <= size)).all(-1))
+
+
+def _contrast(tiles: NDArray[np.uint8]) -> _Floats:
+    """Mean difference of the middle of each tile from its mean, in grey values, `(N,)`."""
+    middles = tiles.reshape(-1, _TILE, _TILE)[:, _MIDDLE, _MIDDLE].astype(np.float64)
+    return np.asarray(np.abs(middles - middles.mean((1, 2), keepdims=True)).mean((1, 2)))
