@@ -543,22 +543,23 @@ class _Camera:
     """How the camera moves between frames: by the poses that are given, or estimated from the frames.
 
     The first frame decides: with a pose `_poses` is made, and without one `_estimate`, where the camera is followed.
-
-    Attributes:
-        is_followed: whether its motion is known at all, from the first frame on.
-        flow: follows what moves on its own; None where the camera is not followed.
     """
 
     def __init__(self, *, follows: bool) -> None:
         self._follows = follows
         self._estimate: CameraMotion | None = None
         self._poses: KnownPoses | None = None
-        self.flow: PatchFlow | None = None
         self._is_first = True  # whether no frame was seen
 
     @property
     def is_followed(self) -> bool:
+        """Whether its motion is known at all, from the first frame on."""
         return self._estimate is not None or self._poses is not None
+
+    @property
+    def flow(self) -> PatchFlow | None:
+        """What follows objects that move on their own; None where the camera's motion is not estimated."""
+        return None if self._estimate is None else self._estimate.flow
 
     def step(self, view: WindowView, pose: Motion | ArrayLike | None) -> CameraStep | None:
         """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
@@ -567,8 +568,6 @@ class _Camera:
         # Without OpenCV a warning is given, which does not concern a camera whose poses are known.
         if self._is_first and pose is None and self._follows:
             self._estimate = _camera_motion()
-        if self._is_first and self._estimate is not None:
-            self.flow = PatchFlow()
         self._is_first = False
         if pose is not None:
             self._poses = self._poses or KnownPoses()
@@ -576,10 +575,7 @@ class _Camera:
         if self._estimate is None:
             return None
         width, height = view.picture.size
-        camera = self._estimate.step(view.picture.pixels((0, 0, width, height)))
-        if self.flow is not None and self._estimate.present is not None:
-            self.flow.step(self._estimate.present.fine, self._estimate.present.fine_ratio)
-        return camera
+        return self._estimate.step(view.picture.pixels((0, 0, width, height)))
 
 
 def _camera_motion() -> CameraMotion | None:

@@ -21,6 +21,7 @@ from semfov.motion.agreement import agreement, blocks_of_rival, largest_change
 from semfov.motion.flow import LEAST_CORNERS, corners_stay, flow_between, rival_between
 from semfov.motion.frames import GreyFrame
 from semfov.motion.motion import Motion
+from semfov.motion.patches import PatchFlow
 from semfov.motion.residual import coarse_shift, share_off, whole_shift
 
 _STILL = np.eye(3)
@@ -147,6 +148,9 @@ class CameraMotion:
     Args:
         patience: number of frames for which what was seen before a disturbance is kept.
 
+    Attributes:
+        flow: follows parts of the last frame into the present one that move on their own.
+
     Raises:
         InputError: OpenCV is not installed.
 
@@ -162,6 +166,7 @@ class CameraMotion:
             import cv2
         self._cv2: ModuleType = cv2
         self.patience = patience
+        self.flow = PatchFlow()
         self._key: GreyFrame | None = None  # None before the first frame
         self._key_to_last = _STILL  # `(3, 3)`, motion from the key frame to the last frame, in reduced pixels
         self._anchor: GreyFrame | None = None  # the first key frame of what has been in view since then
@@ -170,11 +175,6 @@ class CameraMotion:
         self._stands_still = False  # whether the camera stood still between the last two frames
         self._course: NDArray[np.float64] | None = None  # the last motion between two frames, in reduced pixels
         self._lost: _LostFrame | None = None  # what was seen before a disturbance, while it may still be found
-
-    @property
-    def present(self) -> GreyFrame | None:
-        """The frame that was taken last."""
-        return self._last
 
     def step(self, frame: NDArray[np.uint8]) -> CameraStep:
         """Take the next frame, and estimate its motion.
@@ -186,6 +186,7 @@ class CameraMotion:
             The motion since the last frame; none for the first frame, and where the two do not fit together.
         """
         present = GreyFrame(self._cv2, frame)
+        self.flow.step(present.fine, present.fine_ratio)
         last = self._last
         self._last = present
         if last is None or self._key is None:

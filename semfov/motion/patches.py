@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from semfov.errors import needing
 
+_Bytes = NDArray[np.uint8]
 _Floats = NDArray[np.float64]
+_Points = NDArray[np.float32]
 
 _TILE = 32  # side of a tile in its own pixels
 _SURROUNDINGS = 2  # sides of a tile in those of its box
@@ -61,11 +63,11 @@ class PatchFlow:
         with needing("OpenCV", "motion of objects", "opencv-python-headless"):
             import cv2
         self._cv2: ModuleType = cv2
-        self._before: NDArray[np.uint8] | None = None
-        self._present: NDArray[np.uint8] | None = None
+        self._before: _Bytes | None = None
+        self._present: _Bytes | None = None
         self._ratio = np.ones(2)
 
-    def step(self, grey: NDArray[np.uint8], ratio: tuple[float, float] = (1.0, 1.0)) -> None:
+    def step(self, grey: _Bytes, ratio: tuple[float, float] = (1.0, 1.0)) -> None:
         """Take the next frame.
 
         Args:
@@ -118,7 +120,7 @@ class PatchFlow:
         are_followed = is_found & is_found_back & is_near & is_same & (contrast >= _LEAST_CONTRAST)
         return guesses + shifts * steps, are_followed
 
-    def _tiles(self, frame: NDArray[np.uint8] | None, centres: _Floats, steps: _Floats) -> NDArray[np.uint8]:
+    def _tiles(self, frame: _Bytes | None, centres: _Floats, steps: _Floats) -> _Bytes:
         """Resample parts of a frame, with some of its pixels for one of a tile `(N, 2)`, to tiles, `(32 N, 32)`."""
         count = len(centres)
         offsets = np.arange(_TILE) - (_TILE - 1) / 2
@@ -131,8 +133,8 @@ class PatchFlow:
         return np.asarray(tiles, np.uint8)
 
     def _followed(
-        self, first: NDArray[np.uint8], second: NDArray[np.uint8], begin: NDArray[np.float32], guess: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+        self, first: _Bytes, second: _Bytes, begin: _Points, guess: _Points
+    ) -> tuple[_Points, NDArray[np.bool_], _Points]:
         """Follow a point of each tile: where it is, whether it was found, and how much its window has changed."""
         cv2 = self._cv2
         end, status, change = cv2.calcOpticalFlowPyrLK(
@@ -153,7 +155,7 @@ def _lie_inside(centres: _Floats, sides: _Floats, size: NDArray[np.int_]) -> NDA
     return np.asarray(((centres - sides / 2 >= 0) & (centres + sides / 2 <= size)).all(-1))
 
 
-def _contrast(tiles: NDArray[np.uint8]) -> _Floats:
+def _contrast(tiles: _Bytes) -> _Floats:
     """Mean difference of the middle of each tile from its mean, in grey values, `(N,)`."""
     middles = tiles.reshape(-1, _TILE, _TILE)[:, _MIDDLE, _MIDDLE].astype(np.float64)
     return np.asarray(np.abs(middles - middles.mean((1, 2), keepdims=True)).mean((1, 2)))

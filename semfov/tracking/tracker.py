@@ -1,8 +1,8 @@
 """A tracker of objects of which each look shows some: where they are, and the probability that they are there.
 
-tracks ── time passes, the camera moves ──► predicted ── a look at a window ──► seen: place, velocity, more probable
-                                                                                not seen there: less probable
-                                                                                not looked at: as they were
+tracks ── their boxes are followed, ──► predicted ── a look at a window ──► seen: place, velocity, more probable
+          the camera moves, time passes                                     not seen there: less probable
+                                                                            not looked at: as they were
 
 `semfov.agents.window_episode.WindowSession` makes the tracker of a stream, and asks another one for the same: `follow`
 before a frame, `see` after each look, `tracks` for the list, and `model` for the value of looks
@@ -76,7 +76,7 @@ class Tracker:
     .. math:: q \leftarrow q \, (1 - \ell)^t
 
     and the odds p / (1 - p) are those of q, times a factor for each look since then that should have shown the object,
-    and did not (`TrackingModel`).
+    and did not (`TrackingModel`), and times one for an object that is seen to move (`Tracks.log_odds`).
 
     Detections belong to the objects at whose predicted places they most probably lie, all of them jointly; others begin
     objects of their own. What no look covers stays as it was, so that objects go on while they are out of view.

@@ -92,7 +92,8 @@ class Tracks:
 
         .. math:: \frac{\sigma_0^2}{\sigma^2} \exp\Bigl(-\frac{|v|^2}{2 \sigma^2}\Bigr)
         """
-        variance = self.kinematics.covariance[:, 1, 1]
+        # What was not seen for long may have begun to move: that it is known less than at first is no evidence of it.
+        variance = np.minimum(self.kinematics.covariance[:, 1, 1], self.speed**2)
         squared = (self.kinematics.velocity**2).sum(-1)
         by_looks = np.log(self.speed**2 / variance) - squared / (2 * variance)
         prior = np.log(_STANDING / (1 - _STANDING))

@@ -14,7 +14,6 @@ class Textbook:
     def __init__(self, place, variance, speed):
         self.x = np.array([*place, 0.0, 0.0])
         self.P = np.diag([variance, variance, speed**2, speed**2])
-        self.H = np.eye(2, 4)
 
     def predict(self, t, q):
         F = np.eye(4) + t * np.eye(4, k=2)
@@ -22,11 +21,13 @@ class Textbook:
         Q = np.kron([[t**3 / 3, t**2 / 2], [t**2 / 2, t]], np.eye(2))
         self.P = F @ self.P @ F.T + q * Q
 
-    def update(self, z, r):
-        S = self.H @ self.P @ self.H.T + r * np.eye(2)
-        K = self.P @ self.H.T @ np.linalg.inv(S)
-        self.x = self.x + K @ (z - self.H @ self.x)
-        self.P = (np.eye(4) - K @ self.H) @ self.P
+    def update(self, z, r, first=0):
+        """Take a measurement of the two numbers of the state from the first one on."""
+        H = np.eye(2, 4, k=first)
+        S = H @ self.P @ H.T + r * np.eye(2)
+        K = self.P @ H.T @ np.linalg.inv(S)
+        self.x = self.x + K @ (z - H @ self.x)
+        self.P = (np.eye(4) - K @ H) @ self.P
 
 
 def test_places_and_velocities_are_those_of_the_textbook():
@@ -37,10 +38,12 @@ def test_places_and_velocities_are_those_of_the_textbook():
     single = [Textbook(*values) for values in zip(places, variance, speed, strict=True)]
     for _ in range(6):
         seconds, seen, spread = random.uniform(0.02, 0.6), random.uniform(0, 500, (5, 2)), random.uniform(1, 9, 5)
-        many = many.after(seconds, noise).measured(seen, spread)
+        velocities, unsteady = random.uniform(-80, 80, (5, 2)), random.uniform(1, 90, 5)
+        many = many.after(seconds, noise).measured(seen, spread).moved(velocities, unsteady)
         for number, one in enumerate(single):
             one.predict(seconds, noise[number])
             one.update(seen[number], spread[number])
+            one.update(velocities[number], unsteady[number], first=2)
     for number, one in enumerate(single):
         np.testing.assert_allclose(np.concatenate([many.place[number], many.velocity[number]]), one.x, atol=1e-8)
         np.testing.assert_allclose(np.kron(many.covariance[number], np.eye(2)), one.P, atol=1e-8)

@@ -1,13 +1,16 @@
 """Objects through a stream of looks: numbers, places, and the probability while they are not seen."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from semfov.motion import CameraStep, Motion
+from semfov.motion import CameraStep, Motion, PatchFlow
 from semfov.tracking import Seen, Tracker, TrackingModel
 from semfov.tracking.gain import value_of_windows
 from semfov.zoom.lattice import Lattice
+from tests.motion.test_camera import scene
+from tests.motion.test_patches import HIGH, WIDE, paste, textured
 
 WHOLE = (0.0, 0.0, 1000.0, 800.0)
 FRAME = 0.04
@@ -83,6 +86,51 @@ def test_an_object_that_stands_still_does_not_drift_by_the_noise_of_its_places()
     for _ in range(25):
         tracker.follow(FRAME)
     torch.testing.assert_close(tracker.tracks.boxes, seen)
+
+
+def followed(shift, frames=12):
+    """Track a textured box that moves by a shift a frame over a ground that moves, looked at in the first frame."""
+    tracker, flow, ground_shift = Tracker(), PatchFlow(), np.array([3, 2])
+    ground = cv2.cvtColor(scene(0, side=700), cv2.COLOR_RGB2GRAY)
+    for number in range(frames):
+        x, y = 100 - number * ground_shift
+        frame = ground[y : y + 400, x : x + 600].copy()
+        place = np.array([120, 120]) + number * (ground_shift + shift)
+        paste(frame, textured(1), *place)
+        flow.step(frame)
+        if number:
+            tracker.follow(FRAME, CameraStep(Motion.similarity(shift=tuple(ground_shift))), flow)
+        else:
+            tracker.see(look(box_at(*place, WIDE, HIGH)))
+    return tracker.tracks, place
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (6, 0), (-3, 7)])
+def test_an_object_is_followed_between_looks(shift):
+    tracks, place = followed(np.array(shift))
+    assert tracks.boxes[0, :2].tolist() == pytest.approx(place.tolist(), abs=2)
+    assert tracks.velocities[0].tolist() == pytest.approx([part / FRAME for part in shift], abs=8)
+
+
+def test_an_object_that_is_seen_to_move_is_more_probable():
+    standing, moving = (followed(np.array(shift))[0] for shift in ((0, 0), (6, 0)))
+    assert not standing.moves.any()
+    assert moving.moves.all()
+    assert standing.log_odds[0] == pytest.approx(standing.shown_odds[0])
+    assert moving.log_odds[0] == pytest.approx(moving.shown_odds[0] + 1.5, abs=0.01)
+
+
+def test_an_object_is_predicted_as_before_where_nothing_is_followed():
+    """Before the first two frames a flow follows nothing."""
+    tracks = []
+    for flow in (None, PatchFlow()):
+        tracker = Tracker()
+        for frame in range(8):
+            tracker.follow(FRAME, flow=flow)
+            tracker.see(look(box_at(100 + 6 * frame, 300)))
+        tracks.append(tracker.tracks)
+    assert tracks[0].boxes.tolist() == tracks[1].boxes.tolist()
+    assert tracks[0].probability.tolist() == tracks[1].probability.tolist()
 
 
 def test_a_probability_falls_with_time_by_the_share_that_is_lost():
