@@ -32,7 +32,7 @@ def frames(shifts, seed=0, patches=None):
 
 def textured(seed):
     noise = np.random.default_rng(seed).integers(0, 256, (HIGH, WIDE)).astype(np.float32)
-    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 4), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def paste(frame, patch, x, y):
