@@ -23,7 +23,7 @@ class TrackingModel:
 
     .. math:: \max_j \bigl(e_0 + e_1 \operatorname{logit} c_j\bigr) + w \sum_i \log\bigl(1 - d(s_i)\bigr)
 
-    An object that is seen to move is more probable than that (`Tracks.log_odds`).
+    An object that is seen to move is more probable than that (`Tracks.moving_odds`).
 
     Objects that are hard to see are missed again and again, so that w is less than 1. What a look as close has shown is
     seen again with the probability :math:`\rho q`, where q is that of what was shown, and a miss counts in full.

@@ -76,7 +76,7 @@ class Tracker:
     .. math:: q \leftarrow q \, (1 - \ell)^t
 
     and the odds p / (1 - p) are those of q, times a factor for each look since then that should have shown the object,
-    and did not (`TrackingModel`), and times one for an object that is seen to move (`Tracks.log_odds`).
+    and did not (`TrackingModel`), and times one for an object that is seen to move (`Tracks.moving_odds`).
 
     Detections belong to the objects at whose predicted places they most probably lie, all of them jointly; others begin
     objects of their own. What no look covers stays as it was, so that objects go on while they are out of view.

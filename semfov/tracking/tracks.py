@@ -16,6 +16,8 @@ from semfov.tracking.kalman import Floats, Kinematics
 TRAIL = 32  # frames
 _STANDING = 0.2  # share of the objects that stand still
 _MOVING = 1.5  # log odds for an object that is seen to move: what only looks like one is mostly a part of the ground
+_PART = 0.5  # share of a box that lies in that of another object from which on both may be one that moves
+_ROUNDING = 1e-6
 
 _Index = NDArray[np.intp] | NDArray[np.bool_] | slice
 
@@ -134,15 +136,32 @@ class Tracks:
 
     @property
     def log_odds(self) -> Floats:
-        r"""Log odds that they exist, `(N,)`.
+        """Log odds that they exist, `(N,)`: those by the looks, and more for what is seen to move."""
+        return self.shown_odds + self.missed_odds + self.moving_odds
 
-        They are those by the looks, and for an object that is seen to move up to 1.5 more, with the probability s that
-        it stands still, which is .2 before it was seen twice:
+    @cached_property
+    def moving_odds(self) -> Floats:
+        r"""What is added to the log odds of objects that are seen to move, `(N,)`.
+
+        With the probability s that it stands still, which is .2 before an object was seen twice, it is
 
         .. math:: 1.5 \, (1 - s / 0.2)_+
+
+        A part of an object moves with it, so that nothing is added where a more probable object of the class that moves
+        shares half of the smaller box.
         """
         moves = (1 - self.standing / _STANDING).clip(0)
-        return self.shown_odds + self.missed_odds + _MOVING * moves
+        rows = np.flatnonzero(moves > _ROUNDING)
+        by_looks = (self.shown_odds + self.missed_odds)[rows]
+        labels = self.labels[rows]
+        boxes = self.corners[rows]
+        area = self.sides[rows] ** 2
+        shared = np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - np.maximum(boxes[:, None, :2], boxes[:, :2])
+        is_same = shared.clip(0).prod(-1) >= _PART * np.minimum(area[:, None], area)
+        is_same &= labels[:, None] == labels
+        is_part = (is_same & (by_looks > by_looks[:, None])).any(1)
+        moves[rows[is_part]] = 0
+        return _MOVING * moves
 
     @property
     def existence(self) -> Floats:

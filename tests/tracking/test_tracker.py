@@ -120,6 +120,20 @@ def test_an_object_that_is_seen_to_move_is_more_probable():
     assert moving.log_odds[0] == pytest.approx(moving.shown_odds[0] + 1.5, abs=0.01)
 
 
+def test_a_part_of_an_object_that_moves_is_not_more_probable():
+    """A whole object, its upper half, which is shown faintly, and another object beside them move alike."""
+    tracker = Tracker()
+    for frame in range(6):
+        tracker.follow(FRAME)
+        x = 100 + 6 * frame
+        tracker.see(look(box_at(x, 300), box_at(x + 80, 300)))
+        tracker.see(look(box_at(x, 300, high=25), score=0.3, region=(x - 5.0, 295.0, x + 45.0, 330.0)))
+    tracks = tracker.tracks
+    assert len(tracks) == 3
+    assert tracks.moves.all()
+    assert tracks.moving_odds.tolist() == pytest.approx([1.5, 1.5, 0.0], abs=0.01)
+
+
 def test_an_object_is_predicted_as_before_where_nothing_is_followed():
     """Before the first two frames a flow follows nothing."""
     tracks = []
