@@ -25,6 +25,7 @@ from semfov.tracking.model import TrackingModel
 from semfov.tracking.tracks import Tracks, no_trail
 
 _FOLLOWED = 32  # most objects that are followed from frame to frame
+_CLEAR_WAY = 1.0  # pixels between two frames from which on a motion is no noise
 _AS_CLOSE = 0.9  # of the magnification of a look, from which on another one is as close
 _ONE_OF_CLASS = Selection(iou=0.5, limit=10**9, per_class=True)  # two objects that overlap by more than half are one
 
@@ -138,9 +139,13 @@ class Tracker:
         found = flow.follow(tracks.corners, expected)
         # Beside the scene, in pixels of the last frame: what the camera's motion does not explain.
         origins = motion.inverse().points(torch.from_numpy(found.places)).numpy()
+        shifts = origins - places
+        # No object stops from one frame to the next: what stays behind is the ground, or what hides it.
+        far = np.linalg.norm(way, axis=-1)
+        stays_behind = (far > _CLEAR_WAY) & (np.linalg.norm(shifts, axis=-1) < far / 2)
         variance = (self.model.flow * tracks.sides) ** 2 + self.model.unsteady**2
-        moved = tracks.kinematics.moved((origins - places) / seconds, variance / seconds**2)
-        followed = found.are_followed
+        moved = tracks.kinematics.moved(shifts / seconds, variance / seconds**2)
+        followed = found.are_followed & ~stays_behind
         kinematics = self.tracks.kinematics.with_rows(rows[followed], moved[followed])
         self.tracks = replace(self.tracks, kinematics=kinematics)
 

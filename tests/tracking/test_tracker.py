@@ -120,6 +120,23 @@ def test_an_object_that_is_seen_to_move_is_more_probable():
     assert moving.log_odds[0] == pytest.approx(moving.shown_odds[0] + 1.5, abs=0.01)
 
 
+def test_an_object_that_is_hidden_goes_on():
+    """It moves over a ground that stands, is followed for ten frames, and is not in the next ten."""
+    tracker, flow = Tracker(), PatchFlow()
+    ground = cv2.cvtColor(scene(0, side=700), cv2.COLOR_RGB2GRAY)
+    for number in range(20):
+        frame = ground[:400, :600].copy()
+        place = np.array([120 + 6 * number, 120])
+        if number < 10:
+            paste(frame, textured(1), *place)
+        flow.step(frame)
+        if number:
+            tracker.follow(FRAME, flow=flow)
+        else:
+            tracker.see(look(box_at(*place, WIDE, HIGH)))
+    assert tracker.tracks.boxes[0, :2].tolist() == pytest.approx(place.tolist(), abs=5)
+
+
 def test_a_part_of_an_object_that_moves_is_not_more_probable():
     """A whole object, its upper half, which is shown faintly, and another object beside them move alike."""
     tracker = Tracker()
