@@ -17,7 +17,7 @@ picture is its *fit* in bits.
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -29,6 +29,7 @@ from torch.nn.functional import interpolate
 
 from semfov.data.fixations import Fixations
 from semfov.errors import check
+from semfov.human.picture_place import PicturePlace, best_place
 
 _Array = NDArray[np.float64]
 
@@ -46,6 +47,8 @@ _STANDARD_ERRORS = 4.0
 """How many standard errors over the pictures a difference must have: many readings are tried."""
 
 _LEAST_GAIN = 0.25  # bits by which another reading must fit better
+_LEAST_GAIN_OF_PLACE = 1.0  # the same of a place that is searched for in four numbers
+_TIE = 0.05  # bits by which a place that is found by small steps must fit better than one that has a name
 _EXCHANGED = 2.0  # bits by which both of two pictures must fit better if their names were exchanged
 _LEAST_FIT = 0.5  # bits below which fixations do not fit their picture
 _REACH = 20  # cells by which a shift is tried in each direction
@@ -135,28 +138,44 @@ def _shares_in_frame(scale: float) -> _Shares:
 
 _PRESENT_READING = _Reading(_shares_as_read)
 
+_AS_POINTS = _Reading(lambda points, frame, picture: points)  # for those who make shares of them
+
 _PARTS = (0.4, 0.5, 0.6, 2 / 3, 0.75, 0.8, 0.85)
+_FINER_SCALES = tuple(1 + step / 100 for step in range(-10, 11))
 _FRAME_SCALES = (0.4, 0.5, 0.625, 0.75, 0.8, 1.25, 4 / 3, 1.5, 1.6, 1.875, 2.0, 2.4, 2.7)
 
-_OTHER_READINGS = (
+_OTHER_AXES = (
     _Reading(_shares_y_upwards, "y ran upwards", "read them with origin='bottom left'"),
     _Reading(_shares_mirrored, "x ran from right to left", "take the width of the frame less x"),
     _Reading(_shares_half_turned, "they were turned by half a circle", "take the size of the frame less x and y"),
     _Reading(_shares_swapped, "y came before x", "swap the two columns"),
+)
+
+_NAMED_PLACES = (
     _Reading(_shares_at_own_size, "the pictures were shown at their own size", "use in_picture(size, scale=1)"),
     _Reading(
         _shares_stretched, "the pictures were stretched over the frame", "use in_picture(size, place=(0, 0, *frame))"
     ),
-    *(
-        _Reading(
-            _shares_at_part(part),
-            f"the pictures filled about {100 * part:.0f} % of the frame, in the middle",
-            "give the place of the picture, in_picture(size, place=…)",
-        )
-        for part in _PARTS
-    ),
-    *(_Reading(_shares_in_frame(scale), "their frame had another size", frame_scale=scale) for scale in _FRAME_SCALES),
 )
+
+_PARTS_OF_FRAME = tuple(
+    _Reading(
+        _shares_at_part(part),
+        f"the pictures filled about {100 * part:.0f} % of the frame, in the middle",
+        "give the place of the picture, in_picture(size, place=…)",
+    )
+    for part in _PARTS
+)
+
+
+def _in_frame(scale: float) -> _Reading:
+    """Make the reading for a frame that was larger or smaller than the file says."""
+    return _Reading(_shares_in_frame(scale), "their frame had another size", frame_scale=scale)
+
+
+_OTHER_FRAMES = tuple(_in_frame(scale) for scale in _FRAME_SCALES)
+
+_OTHER_READINGS = (*_OTHER_AXES, *_NAMED_PLACES, *_PARTS_OF_FRAME, *_OTHER_FRAMES)
 
 
 def content_suspicions(
@@ -192,6 +211,8 @@ def content_suspicions(
     reading = _better_reading(evidence)
     # A shift and another size of the frame look alike where few fixations lie at the borders.
     best = max(filter(None, (shift, reading)), key=lambda finding: finding.fit, default=None)
+    if best is None:
+        best = _place_on_frame(evidence)
     if best is not None:
         return [best.line]
     # A drift may be so large that the later fixations do not fit their pictures.
@@ -269,6 +290,10 @@ class _Evidence:
         places = self._places(self.records, reading)
         return np.array([self._fit(places[name], name) for name in self.names])
 
+    def fit(self, reading: _Reading) -> float:
+        """Compute the mean fit over the pictures in bits."""
+        return float(self.fits(reading).mean())
+
     def fits_in_pictures(self) -> _Array:
         """Compute the fit of the fixations of picture i, as they are read, in picture j, `(N, N)`."""
         places = self._places(self.records, _PRESENT_READING)
@@ -288,6 +313,31 @@ class _Evidence:
         before = [self._fit(places[name], name) for name in places]
         after = [self._fit(places[name] + shift, name) for name in places]
         return _BestShift(shift, np.array(before), np.array(after))
+
+    def place_near(self, reading: _Reading) -> PicturePlace | None:
+        """Find where on the frame the pictures lay, near where a reading places them.
+
+        Args:
+            reading: one that keeps the directions of the axes.
+
+        Returns:
+            The place with the best fit; None where frames or pictures have several sizes, so that no place is theirs.
+        """
+        frames = {tuple(record.size) for record in self.records}
+        pictures = {tuple(self._sizes[name]) for name in self.names}
+        if len(frames) > 1 or len(pictures) > 1:
+            return None
+        frame = np.array(frames.pop(), np.float64)
+        picture = np.array(pictures.pop(), np.float64)
+        edges = np.stack([np.zeros(2), frame]) - 0.5  # corners of the frame, as points
+        start, end = reading.shares(edges, frame, picture)
+        sides = frame / (end - start)
+        points = self._places(self.records, _AS_POINTS)
+
+        def fit_of(place: PicturePlace) -> float:
+            return float(np.mean([self._fit(place.shares(points[name]), name) for name in self.names]))
+
+        return best_place(PicturePlace(-start * sides, sides), fit_of)
 
     def _places(self, records: Sequence[Fixations], reading: _Reading) -> dict[str, _Array]:
         """Places of the fixations of records in shares of the sides, `(n, 2)`, by their pictures."""
@@ -343,18 +393,74 @@ def _better_reading(evidence: _Evidence) -> _Finding | None:
     """Find the reading that fits better than the present one, if one does."""
     present = evidence.fits(_PRESENT_READING)
     fits_by_reading = {reading: evidence.fits(reading) for reading in _OTHER_READINGS}
-    best = max(fits_by_reading, key=lambda reading: fits_by_reading[reading].mean())
-    best_fits = fits_by_reading[best]
-    if not (_is_clear(best_fits - present, _LEAST_GAIN) and _is_clear(best_fits, _LEAST_GAIN)):
+    coarse = max(fits_by_reading, key=lambda reading: fits_by_reading[reading].mean())
+    coarse_fits = fits_by_reading[coarse]
+    if not (_is_clear(coarse_fits - present, _LEAST_GAIN) and _is_clear(coarse_fits, _LEAST_GAIN)):
         return None
+    best = coarse if coarse in _OTHER_AXES else _finer(coarse, evidence)
+    # A shift is compared with what was found as coarsely.
+    return _Finding(_line_of(best, evidence), float(coarse_fits.mean()))
+
+
+def _line_of(reading: _Reading, evidence: _Evidence) -> str:
+    """Say how fixations should be read."""
     width, height = evidence.records[0].size
-    frame = f"give a frame of about {width * best.frame_scale:.0f} × {height * best.frame_scale:.0f}"
-    fit = float(best_fits.mean())
-    line = (
-        f"fixations look as if {best.fault}: they fit their pictures by {fit:.2f} bits then, and by "
-        f"{present.mean():.2f} as they are read ({best.remedy or frame})"
+    frame = f"give a frame of about {width * reading.frame_scale:.0f} × {height * reading.frame_scale:.0f}"
+    return (
+        f"fixations look as if {reading.fault}: they fit their pictures by {evidence.fit(reading):.2f} bits then, and "
+        f"by {evidence.fit(_PRESENT_READING):.2f} as they are read ({reading.remedy or frame})"
     )
-    return _Finding(line, fit)
+
+
+def _place_on_frame(evidence: _Evidence) -> _Finding | None:
+    """Find another place of the pictures on the frame, which none of the readings that are tried comes close to."""
+    coarse = max((*_NAMED_PLACES, *_PARTS_OF_FRAME, *_OTHER_FRAMES), key=evidence.fit)
+    place = evidence.place_near(coarse)
+    if place is None:
+        return None
+    exact = _at(place)
+    fits = evidence.fits(exact)
+    is_clear = _is_clear(fits - evidence.fits(_PRESENT_READING), _LEAST_GAIN_OF_PLACE)
+    if not (is_clear and _is_clear(fits, _LEAST_GAIN_OF_PLACE)):
+        return None
+    return _Finding(_line_of(exact, evidence), float(fits.mean()))
+
+
+def _finer(coarse: _Reading, evidence: _Evidence) -> _Reading:
+    """Find the reading that is meant by a coarse one of a place: one with a name, or else the place in numbers.
+
+    Args:
+        coarse: the best of the readings that are tried, whose place may be a tenth off.
+        evidence: the densities of the pictures.
+
+    Returns:
+        The first reading that fits as well as the best place near the coarse one.
+    """
+    place = evidence.place_near(coarse)
+    exact = coarse if place is None else _at(place)
+    named = [*_NAMED_PLACES, coarse]
+    if coarse in _OTHER_FRAMES:
+        # Between the frames that are tried lie those of other screens.
+        frames = [_in_frame(coarse.frame_scale * factor) for factor in _FINER_SCALES]
+        named.append(max(frames, key=evidence.fit))
+    for reading in named:
+        if evidence.fit(exact) - evidence.fit(reading) >= _TIE:
+            continue
+        # What fills a part of the frame is read by its place, as nothing else says how.
+        has_numbers = place is not None and reading in _PARTS_OF_FRAME
+        return replace(exact, fault=reading.fault) if has_numbers else reading
+    return exact
+
+
+def _at(place: PicturePlace) -> _Reading:
+    """Make the reading for pictures that lay at a place on the frame."""
+    x, y = place.corner.round().astype(int).tolist()
+    width, height = place.sides.round().astype(int).tolist()
+    return _Reading(
+        lambda points, frame, picture: place.shares(points),
+        f"the pictures covered {width} × {height} px of the frame",
+        f"use in_picture(size, place=({x}, {y}, {width}, {height})), which may be some pixels off",
+    )
 
 
 def _wrong_names(evidence: _Evidence) -> list[str]:
