@@ -18,7 +18,7 @@ from semfov.data.pictures import Pictures
 from semfov.detection import Detections, Detector, FeatureMaps, Placement
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity, blurred, cells_of
-from semfov.human.fixations.reading import frame_of, read_fixations
+from semfov.human.fixations.reading import check_usual_frame, frame_of, read_fixations
 from semfov.io.code import modules_digest
 from semfov.io.files import sha256
 from semfov.io.ranges import Count, Range
@@ -43,7 +43,7 @@ class ViewingData(Settings):
     Args:
         fixations: a file of fixations for each data set, in any format that `semfov check` reads.
         pictures: folder of the pictures of each data set.
-        sizes: frame of each file that has none, as `800x600` (none: that of OSIE's files, 800x600).
+        sizes: frame of each file that has none, as `640x480` (none: 800x600 of OSIE, if its pictures have this size).
         seconds: time in seconds for which people viewed a picture, for each data set (none: 3).
         limit: use only the first so many pictures of each data set (none: all).
         cache: folder for the maps of the pictures (None: the user's cache).
@@ -221,7 +221,11 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
     groups: list[Viewed] = []
     for number, root in enumerate(data.pictures):
         people = data.people(number)
-        groups += _grouped(_looks(store, Pictures(root, people, ()), people), data.seconds_of(number), number)
+        scenes = Pictures(root, people, ())
+        if number >= len(data.sizes) and len(scenes):
+            size = scenes.annotation(0).size
+            check_usual_frame(data.fixations[number], f"{data.within}sizes", size, "{width}x{height}")
+        groups += _grouped(_looks(store, scenes, people), data.seconds_of(number), number)
     return groups
 
 

@@ -18,7 +18,7 @@ from eval.human.glimpses import so_far
 from eval.human.viewing import covering
 from semfov import InputError, saliency
 from semfov.cli.main import main
-from semfov.data.fixations import Fixations, write_table
+from semfov.data.fixations import Fixations, write_osie, write_table
 from semfov.fit.gaze import GazeFit, _fit_map, fit_oculomotor, fitted_density, maps_of, score
 from semfov.fit.gaze_adapted import adapted_density
 from semfov.fit.gaze_folds import CENTRE, Fold, FoldStore
@@ -318,6 +318,18 @@ def test_pictures_are_looked_at_once(tmp_path):
     assert len(seen) == 1
     torch.testing.assert_close(first[0].features.maps, again[0].features.maps)
     assert [*first[0].features.maps] == [*again[0].features.maps] == ["red", "itti-koch"]
+
+
+def test_a_frame_that_a_file_lacks_is_asked_for_where_pictures_are_not_those_of_osie(tmp_path):
+    image, place = picture(3)
+    Image.fromarray((image * 255).byte().permute(1, 2, 0).numpy()).save(tmp_path / "3.png")
+    write_osie(tmp_path / "people.json", [replace(one, durations=np.ones(len(one))) for one in people(3, place, 2)])
+    source = MapSource(("red",), lambda image: covering({"red": image[:, :1]}, SIZE), {})
+    given = {"fixations": (tmp_path / "people.json",), "pictures": (tmp_path,), "cache": tmp_path}
+    with pytest.raises(InputError, match=r"^gaze\.sizes: .* pictures of 80 × 60: 80x60 if .* 800x600 if"):
+        look(GazeModelFit(**given), source)
+    (group,) = look(GazeModelFit(**given, sizes=("80x60",)), source)
+    assert group.size == SIZE
 
 
 def test_settings_of_gaze_without_their_fixations_are_refused():

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from semfov import ActivePerception, Eye, Foveation, InputError, foveate
 from semfov.agents.picture import OpenedPicture
 from semfov.data.examples import example_scene
-from semfov.data.fixations import Fixations, read_table, write_table
+from semfov.data.fixations import Fixations, read_osie, read_table, write_osie, write_table
 from semfov.gaze.saliency import FixationDensity, PictureLikeness
 from semfov.gaze.saliency.likeness import pooled
 from semfov.metrics.scanpath import auc, correlation, nss
@@ -386,6 +386,19 @@ def test_comparison_equals_the_measures(gaze):
     assert scores["CC"] == pytest.approx(float(correlation(cells, theirs)), abs=1e-6)
     doubled = [each.resized((208, 156)) for each in people]
     assert gaze.compare(doubled)["NSS"] == pytest.approx(scores["NSS"])
+
+
+def test_a_file_without_a_frame_is_refused_for_pictures_of_another_size_than_osie(gaze, tmp_path):
+    """Read in the frame of OSIE, which has the same proportions, its points would move to the upper left corner."""
+    people = gaze.scanpaths(6, seed=1)
+    write_osie(tmp_path / "people.json", people)
+    with pytest.raises(
+        InputError, match=r"people: expected the frame of .*size=\(104, 78\)\) if .*size=\(800, 600\)\)"
+    ):
+        gaze.compare(tmp_path / "people.json")
+    assert gaze.compare(read_osie(tmp_path / "people.json", size=(104, 78))) == pytest.approx(gaze.compare(people))
+    write_osie(tmp_path / "large.json", [one.resized((800, 600)) for one in people])
+    assert replace(gaze, size=(800, 600)).compare(tmp_path / "large.json")["NSS"] > 0
 
 
 def test_people_are_given_as_to_a_scanpath_and_their_unit_is_looked_at(gaze, tmp_path):

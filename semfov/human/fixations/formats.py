@@ -152,7 +152,11 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
     write_text(path, json.dumps(trials) + "\n")
 
 
-def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) -> list[Fixations]:
+OSIE_FRAME = (800, 600)
+"""Width and height of the pictures of OSIE, the frame of a file of its form for which no other one is given."""
+
+
+def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = OSIE_FRAME) -> list[Fixations]:
     """Read free-viewing fixations of OSIE from a JSON file.
 
     The file is an object with a list under each picture's name. An item of the list has the `x`, `y` and `duration_ms`

@@ -13,7 +13,7 @@ from semfov.human.fixations.columns import DataFrame
 from semfov.human.fixations.encodings import WINDOWS
 from semfov.human.fixations.exports import table_reader
 from semfov.human.fixations.eyelink import read_eyelink
-from semfov.human.fixations.formats import read_cocosearch, read_osie, read_ruarte
+from semfov.human.fixations.formats import OSIE_FRAME, read_cocosearch, read_osie, read_ruarte
 from semfov.io.files import read_text
 
 _Reader = Callable[..., list[Fixations]]
@@ -133,6 +133,31 @@ def _json_reader(source: str | PathLike[str]) -> _Reader:
 def _is_eyelink(source: str | PathLike[str]) -> bool:
     """Tell whether a text is one of EyeLink by its beginning."""
     return read_text(source, WINDOWS).lstrip().startswith(("** CONVERTED FROM", "MSG\t"))
+
+
+def check_usual_frame(path: str | PathLike[str], argument: str, size: tuple[int, int], how: str) -> None:
+    """Refuse a file of OSIE's form for pictures of another size than those of OSIE, unless a frame is given.
+
+    Such a file does not tell its frame. In OSIE's, points of smaller pictures with the same proportions would lie too
+    far left and up, and nothing would show it.
+
+    Args:
+        path: the file, read without a frame.
+        argument: name of the argument, for the message.
+        size: `(width, height)` of a picture of the file.
+        how: how a frame is given, with `{width}` and `{height}` in it.
+
+    Raises:
+        InputError: with how to give the frame.
+    """
+    if reader_of(path) is not read_osie or tuple(size) == OSIE_FRAME:
+        return
+    of_pictures, of_osie = (how.format(width=width, height=height) for width, height in (size, OSIE_FRAME))
+    got = f"pictures of {size[0]} × {size[1]}"
+    raise InputError(
+        f"{argument}: expected the frame of {path}, which has none, got {got}: {of_pictures} if the fixations are in "
+        f"their pixels, {of_osie} if in those of OSIE"
+    )
 
 
 def frame_of(text: str, name: str = "size") -> tuple[int, int]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from semfov.data.fixations import Fixations
 from semfov.data.fixations.record import bare_name
 from semfov.errors import check
-from semfov.human.fixations.reading import read_fixations
+from semfov.human.fixations.reading import check_usual_frame, read_fixations
 from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
 from semfov.human.scanpath.alignment import dynamic_time_warping, multimatch, scanmatch, time_delay_embedding
 from semfov.human.scanpath.maps import auc, auc_judd, correlation, kullback_leibler, log_likelihood, nss, similarity
@@ -152,7 +152,7 @@ def _viewers(people: _People, picture: str | None, size: tuple[int, int]) -> lis
         DataError: the file cannot be read.
     """
     if isinstance(people, str | PathLike):
-        viewed: list[Fixations] = _fixations_in_file(people, picture)
+        viewed: list[Fixations] = _fixations_in_file(people, picture, size)
     else:
         viewed = _as_fixations(people, picture)
     check(len(viewed) > 0, "people", "fixations of at least one person", "none")
@@ -163,8 +163,15 @@ def _viewers(people: _People, picture: str | None, size: tuple[int, int]) -> lis
     return warn_of_frames("people", viewed, stacklevel=5)
 
 
-def _fixations_in_file(path: str | PathLike[str], picture: str | None) -> list[Fixations]:
-    """Read the fixations of a file that are in a picture, whose name counts without folder and suffix."""
+def _fixations_in_file(path: str | PathLike[str], picture: str | None, size: tuple[int, int]) -> list[Fixations]:
+    """Read the fixations of a file that are in a picture, whose name counts without folder and suffix.
+
+    Args:
+        path: the file.
+        picture: name of the picture; None for one without a name.
+        size: `(width, height)` of the picture.
+    """
+    check_usual_frame(path, "people", size, "read_fixations(file, size=({width}, {height}))")
     table = read_fixations(path)
     if picture is None:
         return [*table]
