@@ -1,5 +1,7 @@
 """Fixations that are drawn from known densities, and read wrongly in ways that are known."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -72,6 +74,38 @@ def test_a_fault_is_named(fault, seed):
     change, frame = FAULTS[fault]
     lines = content_suspicions(drawn(change, frame, seed=seed), BY_NAME, SIZES)
     assert [fault in line for line in lines] == [True]
+
+
+PLACES = {
+    "own size in a frame that a part would fit, too": (240, 212, 800, 600, (1280, 1024)),
+    "stretched, off the middle": (300, 60, 700, 800, (1280, 1024)),
+    "own size in a screen that the file does not tell": (240, 212, 800, 600, FRAME),
+    "enlarged in a screen that the file does not tell": (240, 0, 1440, 1080, FRAME),
+}
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("label", PLACES)
+def test_the_place_of_pictures_on_the_frame_is_named(label, seed):
+    """What the line says is done: then the fixations lie where they were made."""
+    x, y, width, height, frame = PLACES[label]
+    scale = np.array([width, height]) / FRAME
+    shown = drawn(lambda points, person, order: (points + 0.5) * scale + (x, y) - 0.5, frame, seed=seed)
+    (line,) = content_suspicions(shown, BY_NAME, SIZES)
+    numbers = re.search(r"place=\((.*?)\)", line)
+    options = {"place": tuple(map(int, numbers[1].split(", ")))} if numbers else {"scale": 1}
+    assert numbers or "own size" in line
+    mended = [record.in_picture(FRAME, **options) for record in shown]
+    for one, right in zip(mended, drawn(seed=seed), strict=True):
+        assert np.abs(one.points - right.points).max() < 20  # of 800, from 960 fixations
+    assert content_suspicions(mended, BY_NAME, SIZES) == []
+
+
+def test_a_frame_between_those_that_are_tried_is_named():
+    (line,) = content_suspicions(drawn(lambda points, person, order: (points + 0.5) * 1.28 - 0.5), BY_NAME, SIZES)
+    width, height = map(int, re.search(r"a frame of about (\d+) × (\d+)", line).groups())
+    assert abs(width - 1024) < 12
+    assert abs(height - 768) < 9
 
 
 @pytest.mark.parametrize("seed", range(20))
