@@ -163,6 +163,18 @@ def fixation_report(path: Path, options: CheckOptions, keep: Callable[[Path], bo
     return _Reading.of(options, keep).report(path)
 
 
+class _FileContent(NamedTuple):
+    """What was read of a file.
+
+    Attributes:
+        records: the fixations.
+        has_frames: whether their frames are those of the file; otherwise they are the pictures.
+    """
+
+    records: list[Fixations]
+    has_frames: bool = True
+
+
 class _Reading(NamedTuple):
     """What files of fixations do not tell themselves.
 
@@ -192,12 +204,14 @@ class _Reading(NamedTuple):
             warnings.simplefilter("ignore")  # of what the lines below say
             warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say
             reader = reader_of(path, self.arguments.get("columns"))
-            records = self._records(reader, path)
+            records, has_frames = self._content_of(reader, path)
         lines = [*suspicions(records, self.sizes), *self._damage(), *self._suspicions_by_content(records)]
         usual_frames = ""
         data_set = DATA_SETS.get(reader)
         if data_set in _WITHOUT_FRAMES and "size" not in self.arguments:
             usual_frames = f" (those of {data_set}, or give --size)"
+        if not has_frames:
+            usual_frames = " (the pictures, as the file has no frame; if they were shown on a screen, give its --size)"
         return FixationReport(_content(records, usual_frames), lines, was_compared=self.sizes is not None)
 
     def _damage(self) -> list[str]:
@@ -215,21 +229,22 @@ class _Reading(NamedTuple):
             return []
         return suspicions_by_content(records, self.sizes.path, self.sizes, quiet=self.options.quiet)
 
-    def _records(self, reader: _Reader, path: Path) -> list[Fixations]:
+    def _content_of(self, reader: _Reader, path: Path) -> "_FileContent":
         """Read the records of a file; of one picture of several, those that were made in it."""
         picture = self.arguments.get("picture")
         if picture is None or self._names_pictures(reader):
             return self._in_frames(reader, path, self.arguments)
         without_picture = {name: value for name, value in self.arguments.items() if name != "picture"}
         try:
-            records = self._in_frames(reader, path, without_picture)
+            content = self._in_frames(reader, path, without_picture)
         except PictureError:
             # The file names no picture, so this is the one.
             return self._in_frames(reader, path, self.arguments)
         if self.sizes is None:
             raise InputError(f"picture: expected a picture or folder that exists, got {picture}")
         # A file with other names is compared as it is, and the report says that their pictures are not there.
-        return [record for record in records if record.picture in self.sizes] or records
+        in_picture = [record for record in content.records if record.picture in self.sizes]
+        return content._replace(records=in_picture or content.records)
 
     def _names_pictures(self, reader: _Reader) -> bool:
         """Tell whether `picture` is a name that the reader gives to fixations without one, and no file."""
@@ -237,15 +252,16 @@ class _Reading(NamedTuple):
         takes_name = reader is not read_table and "picture" in signature(reader).parameters
         return takes_name and self.sizes is None
 
-    def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> list[Fixations]:
+    def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> "_FileContent":
         """Read the records of a file; where it has no frames, they are the pictures."""
         try:
-            return read_by(reader, path, arguments)
+            return _FileContent(read_by(reader, path, arguments))
         except FrameError as error:
             if self.sizes is None:
                 raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
             try:
-                return read_by(reader, path, {**arguments, "size": self.sizes})
+                records = read_by(reader, path, {**arguments, "size": self.sizes})
+                return _FileContent(records, has_frames=False)
             except InputError:
                 if self.sizes.damage:
                     # A file whose frames are its pictures cannot be read without their sizes.

@@ -134,7 +134,7 @@ def test_pictures_of_a_folder_are_compared_with_the_frames_by_their_names(tmp_pa
     # Without a frame in the table, the pictures are the frames.
     table.write_text("picture,subject,x,y\nb,1,600,400\nc,1,390,590\n")
     assert main(command) == 0
-    assert "frames of 400 × 600, 640 × 480" in capsys.readouterr().out
+    assert "frames of 400 × 600, 640 × 480 (the pictures, as the file has no frame; " in capsys.readouterr().out
 
 
 def test_damaged_pictures_are_named_and_the_others_are_compared(tmp_path, capsys):
