@@ -48,7 +48,7 @@ _STANDARD_ERRORS = 4.0
 
 _LEAST_GAIN = 0.25  # bits by which another reading must fit better
 _LEAST_GAIN_OF_PLACE = 1.0  # the same of a place that is searched for in four numbers
-_TIE = 0.05  # bits by which a place that is found by small steps must fit better than one that has a name
+_TIE = 0.05  # bits by which a place that is found by small steps must fit better than a likelier one
 _EXCHANGED = 2.0  # bits by which both of two pictures must fit better if their names were exchanged
 _LEAST_FIT = 0.5  # bits below which fixations do not fit their picture
 _REACH = 20  # cells by which a shift is tried in each direction
@@ -321,7 +321,8 @@ class _Evidence:
             reading: one that keeps the directions of the axes.
 
         Returns:
-            The place with the best fit; None where frames or pictures have several sizes, so that no place is theirs.
+            The place with the best fit, or one of the pictures' own size or proportions that fits as well; None where
+            frames or pictures have several sizes, so that no place is theirs.
         """
         frames = {tuple(record.size) for record in self.records}
         pictures = {tuple(self._sizes[name]) for name in self.names}
@@ -337,7 +338,15 @@ class _Evidence:
         def fit_of(place: PicturePlace) -> float:
             return float(np.mean([self._fit(place.shares(points[name]), name) for name in self.names]))
 
-        return best_place(PicturePlace(-start * sides, sides), fit_of)
+        best = best_place(PicturePlace(-start * sides, sides), fit_of)
+        own_size = best.resized(picture / best.sides)
+        scale = np.sqrt(np.prod(best.sides / picture))
+        own_proportions = own_size.resized(np.full(2, scale))
+        # Pictures are seldom shown at another size than these without a reason.
+        for likely in (own_size, own_proportions):
+            if fit_of(best) - fit_of(likely) < _TIE:
+                return likely
+        return best
 
     def _places(self, records: Sequence[Fixations], reading: _Reading) -> dict[str, _Array]:
         """Places of the fixations of records in shares of the sides, `(n, 2)`, by their pictures."""
