@@ -81,6 +81,9 @@ def _opened(path: Record, picture: LargePicture | ImageLike | None) -> LargePict
 def _outcome_in_words(path: Record) -> str:
     """Tell the decision or the objects, why the record ended, the best place of doubt, and what is assumed."""
     result = f"{path.words.objects}."
+    is_exploration = path.target is None and not path.targets
+    if is_exploration and len(path.objects):
+        result = f"{path.words.objects}: {path.words.classes}."
     if path.decision is not None:
         by_probability = path.words.decided_by == "probability"
         measure = "probability that the picture holds it" if by_probability else "best score"

@@ -63,6 +63,15 @@ def test_detections_are_in_pixels_of_their_window(zoom_path, large_picture, host
     assert explored["looks"][2]["detections"][0]["label"] == "cat"
 
 
+def test_the_page_of_an_exploration_counts_the_objects_of_each_class(zoom_path, large_picture):
+    explored = replace(zoom_path, target=None, decision=None)
+    data = zoom_data(explored, large_picture, name="field")
+    total = len(explored.objects)
+    assert data["decision"].startswith(f"{total} objects found: {explored.words.classes}.")
+    nothing = replace(explored, candidates=explored.objects[:0])
+    assert zoom_data(nothing, large_picture, name="field")["decision"].startswith("No object found.")
+
+
 def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, zoom_path):
     elements = Elements(zoom_page.read_text(encoding="utf-8"))
     assert [each["data-look"] for each in elements.of("window")] == ["1", "2"]
