@@ -2,15 +2,17 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeGuard
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.data.inputs import as_positions
+from semfov.data.inputs import ImageLike, as_positions
 from semfov.errors import check, check_finite, check_tensor, values_known
 from semfov.io.compatibility import Settings
 from semfov.io.state import StatedModule
+from semfov.sensor.pyramid import Bands
 
 
 class Sensor(StatedModule, ABC):
@@ -224,6 +226,18 @@ def stacked_views(view: Callable[[int, int], Tensor], batch: int, number: int, e
         return empty.expand(batch, number, *empty.shape)
     stack = views[0][None] if len(views) == 1 else torch.stack(views)  # one view is not copied
     return stack.unflatten(0, (batch, number))
+
+
+def is_single_picture(image: object) -> TypeGuard[ImageLike]:
+    """Tell whether this is one picture of a common type, not a batch or what a sensor has prepared of one."""
+    if isinstance(image, Tensor | np.ndarray):
+        return image.ndim <= 3
+    return not isinstance(image, tuple | Bands)
+
+
+def of_one_picture(points: Tensor) -> Tensor:
+    """Bring fixations of one picture, `(2,)` or `(G, 2)`, to a shape for a batch of one, `(2,)` or `(1, G, 2)`."""
+    return points[None] if points.ndim == 2 else points
 
 
 def fixations(gaze: Tensor, like: Tensor) -> Tensor:

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points
 from semfov.errors import check, check_shape
 from semfov.io.compatibility import Settings
-from semfov.sensor.base import Sensor, fixations
+from semfov.sensor.base import Sensor, fixations, is_single_picture, of_one_picture
 from semfov.sensor.constants import constant
 from semfov.sensor.pyramid import gaussian_pyramid
 
@@ -70,8 +71,8 @@ class _Retina:
 
 
 def log_polar(
-    image: Tensor | _Levels,
-    gaze: Tensor,
+    image: ImageLike | _Levels,
+    gaze: PointLike,
     *,
     fovea: float,
     spacing: float = 1.0,
@@ -95,17 +96,19 @@ def log_polar(
     between pixels and linear between levels. Receptors outside the image respond to its nearest border pixel.
 
     Args:
-        image: `(B, C, H, W)`, or its levels from `LogPolar.pyramid`, which any number of fixations can share.
+        image: `(B, C, H, W)`, or its levels from `LogPolar.pyramid`, which any number of fixations can share; or one
+            picture of any common type (`semfov.as_image`).
         gaze: fixation `(x, y)` in image pixels, inside or outside: `(2,)` for all images, `(B, 2)` for one fixation of
-            each image, or `(B, G, 2)` for G of each.
+            each image, or `(B, G, 2)` for G of each; of one picture `(2,)`, or `(G, 2)` for G fixations.
         fovea: a in pixels.
         spacing: δ in pixels.
         pooling: width of receptive fields, as a multiple of the distance between neighbours. Smaller values alias,
             larger values blur.
 
     Returns:
-        `(B, C, M, N)`, or `(B, G, C, M, N)` for G fixations: M rings, innermost first, and N wedges, clockwise from the
-        x-axis. The rings extend as far as the diagonal of the image is long.
+        `(B, C, M, N)`, or `(B, G, C, M, N)` for G fixations; of one picture `(3, M, N)` or `(G, 3, M, N)`: M rings,
+        innermost first, and N wedges, clockwise from the x-axis. The rings extend as far as the diagonal of the image
+        is long.
 
     Raises:
         InputError: a shape does not fit, the gaze is not finite, or a setting is not positive.
@@ -115,9 +118,19 @@ def log_polar(
     torch.Size([1, 3, 24, 64])
     """
     retina = _Retina(fovea, spacing, pooling)
-    levels = image if isinstance(image, tuple) else gaussian_pyramid(image, retina.levels(_size(image)))
-    cortical = _sample(levels, fixations(gaze, levels[0]), retina)
-    return cortical if gaze.ndim == 3 else cortical[:, 0]
+    points = as_points(gaze)
+    if is_single_picture(image):
+        levels = _pyramid(as_images(image), retina)
+        row = of_one_picture(points)
+        return log_polar(levels, row, fovea=fovea, spacing=spacing, pooling=pooling)[0]
+    levels = image if isinstance(image, tuple) else _pyramid(as_batch(image), retina)
+    cortical = _sample(levels, fixations(points, levels[0]), retina)
+    return cortical if points.ndim == 3 else cortical[:, 0]
+
+
+def _pyramid(images: Tensor, retina: _Retina) -> _Levels:
+    """Compute the levels of images `(B, C, H, W)` that the receptors of a retina sample."""
+    return gaussian_pyramid(images, retina.levels(_size(images)))
 
 
 def from_log_polar(
@@ -179,49 +192,53 @@ class LogPolar(Sensor):
         super().__init__()
         self.retina = _Retina(fovea, spacing, pooling)
 
-    def pyramid(self, image: Tensor) -> _Levels:
+    def pyramid(self, image: ImageLike) -> _Levels:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
 
         Args:
-            image: `(B, C, H, W)`.
+            image: images `(B, C, H, W)`, or one picture of any common type (`semfov.as_image`).
 
         Returns:
             Levels of the Gaussian pyramid, finest first.
         """
-        return gaussian_pyramid(image, self.retina.levels(_size(image)))
+        return _pyramid(as_batch(image), self.retina)
 
-    def cortical(self, image: Tensor | _Levels, gaze: Tensor) -> Tensor:
+    def cortical(self, image: ImageLike | _Levels, gaze: PointLike) -> Tensor:
         """Compute cortical images, see `log_polar`.
 
         Args:
-            image: `(B, C, H, W)`, or its levels from `pyramid`.
-            gaze: fixations `(x, y)` in image pixels, `(2,)`, `(B, 2)` or `(B, G, 2)`.
+            image: images, or their levels from `pyramid`, as for `log_polar`.
+            gaze: fixations `(x, y)` in image pixels, as for `log_polar`.
 
         Returns:
-            `(B, C, M, N)`, or `(B, G, C, M, N)` for G fixations.
+            Cortical images, in the shapes of `log_polar`.
         """
         retina = self.retina
         return log_polar(image, gaze, fovea=retina.fovea, spacing=retina.spacing, pooling=retina.pooling)
 
-    def forward(self, image: Tensor | _Levels, gaze: Tensor) -> Tensor:
+    def forward(self, image: ImageLike | _Levels, gaze: PointLike) -> Tensor:
         """Compute the back-projection of the cortical images of fixations.
 
         Args:
-            image: `(B, C, H, W)`, or its levels from `pyramid`.
-            gaze: fixations `(x, y)` in image pixels, `(2,)`, `(B, 2)` or `(B, G, 2)`.
+            image: images, or their levels from `pyramid`, as for `log_polar`.
+            gaze: fixations `(x, y)` in image pixels, as for `log_polar`.
 
         Returns:
-            Images `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations.
+            Images `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations; of one picture `(3, H, W)` or `(G, 3, H, W)`.
         """
-        finest = image[0] if isinstance(image, tuple) else image
-        cortical = self.cortical(image, gaze)
-        return from_log_polar(cortical, gaze, _size(finest), fovea=self.retina.fovea, spacing=self.retina.spacing)
+        points = as_points(gaze)
+        if is_single_picture(image):
+            return self(self.pyramid(image), of_one_picture(points))[0]
+        levels = image if isinstance(image, tuple) else self.pyramid(image)
+        cortical = self.cortical(levels, points)
+        retina = self.retina
+        return from_log_polar(cortical, points, _size(levels[0]), fovea=retina.fovea, spacing=retina.spacing)
 
     def open(self, canvas: Tensor, scale: Tensor) -> tuple[_Levels, _Retina]:
         """Compute the pyramid of a canvas, and scale the layout of the receptors."""
         scale_x, scale_y = scale.tolist()
         retina = replace(self.retina, scale=(scale_x, scale_y))
-        return gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina
+        return _pyramid(canvas, retina), retina
 
     def look(self, state: tuple[_Levels, _Retina], gaze: Tensor) -> Tensor:
         """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""

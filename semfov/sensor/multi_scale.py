@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.data.inputs import as_positions
-from semfov.errors import check, check_shape, check_whole
+from semfov.data.inputs import ImageLike, PointLike, as_batch, as_points, as_positions
+from semfov.errors import check, check_whole
 from semfov.io.compatibility import Settings
-from semfov.sensor.base import Sensor, fixations
+from semfov.sensor.base import Sensor, fixations, is_single_picture, of_one_picture
 from semfov.sensor.glimpse import windows_at
 
 _Planes = tuple[Tensor, ...]
@@ -56,19 +56,19 @@ class MultiScaleFovea(Sensor):
         self.side = int(side)
         self.scales = self.crops = int(scales)
 
-    def means(self, image: Tensor) -> _Planes:
+    def means(self, image: ImageLike) -> _Planes:
         """Compute the part of the work that does not depend on the gaze, to share it among fixations.
 
         Args:
-            image: `(B, C, H, W)`.
+            image: images `(B, C, H, W)`, or one picture of any common type (`semfov.as_image`).
 
         Returns:
             Planes of squares at every scale, finest first.
         """
-        check_shape(image, "image", None, None, None, None)
-        check(image.numel() > 0 or not len(image), "image", "at least one pixel", tuple(image.shape))
+        images = as_batch(image)
+        check(images.numel() > 0 or not len(images), "image", "at least one pixel", tuple(images.shape))
         # A border of one pixel is black; it stands for everything that is farther outside.
-        plane = F.pad(image, (1, 1, 1, 1))
+        plane = F.pad(images, (1, 1, 1, 1))
         means = [plane]
         for scale in range(self.scales - 1):
             # The mean of a square is that of four squares of half its side, at all places: of two side by side first,
@@ -80,24 +80,28 @@ class MultiScaleFovea(Sensor):
             means.append(plane)
         return tuple(means)
 
-    def forward(self, image: Tensor | _Planes, gaze: Tensor) -> Tensor:
+    def forward(self, image: ImageLike | _Planes, gaze: PointLike) -> Tensor:
         """Compute the crops around fixations.
 
         Args:
-            image: `(B, C, H, W)`, or its `means`.
+            image: images `(B, C, H, W)`, or their `means`; or one picture of any common type (`semfov.as_image`).
             gaze: fixations `(x, y)` in image pixels, inside or outside: `(2,)` for all images, `(B, 2)` for one
-                fixation of each image, or `(B, G, 2)` for G of each.
+                fixation of each image, or `(B, G, 2)` for G of each; of one picture `(2,)`, or `(G, 2)` for G.
 
         Returns:
-            Crops `(B, L, C, side, side)`, or `(B, G, L, C, side, side)` for G fixations, finest first.
+            Crops `(B, L, C, side, side)`, or `(B, G, L, C, side, side)` for G fixations, finest first; of one picture
+            `(L, 3, side, side)` or `(G, L, 3, side, side)`.
 
         Raises:
             InputError: a shape does not fit, or the gaze is not finite.
         """
+        points = as_points(gaze)
+        if is_single_picture(image):
+            return self(self.means(image), of_one_picture(points))[0]
         means = image if isinstance(image, tuple) else self.means(image)
-        fixation = fixations(gaze, means[0])
+        fixation = fixations(points, means[0])
         crops = torch.stack([self._crop(plane, fixation, scale) for scale, plane in enumerate(means)], 2)
-        return crops if gaze.ndim == 3 else crops[:, 0]
+        return crops if points.ndim == 3 else crops[:, 0]
 
     def windows(self, gaze: Tensor) -> Tensor:
         """Compute the squares that the crops cover.

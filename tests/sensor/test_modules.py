@@ -80,6 +80,28 @@ def test_many_fixations_equal_a_loop_over_them(sensor, prepare, size, device):
 
 
 @of_each_sensor
+def test_one_picture_equals_a_batch_of_one(sensor, prepare):
+    """Of any common type, with one fixation or several, and row by row in `vmap`."""
+    image, gaze = draw(2, 3, 20, 27), torch.tensor([[8.3, 9.1], [12.0, 4.6]], dtype=torch.float64)
+    sensor = copy.deepcopy(sensor).double()
+    first = sensor(image[:1], gaze[:1])[0]
+    close(sensor(image[0], gaze[0]), first)
+    close(sensor(getattr(sensor, prepare)(image[0]), gaze[0])[0], first)
+    close(sensor(image[0], gaze), sensor(image[:1], gaze[None])[0])
+    close(sensor(image[0], gaze[0].tolist()), first)
+    close(torch.func.vmap(sensor)(image, gaze), sensor(image, gaze))
+
+
+@of_each_sensor
+def test_bytes_are_shares_of_white(sensor, prepare):
+    """The same as floats, also where the sum of two bytes is no byte."""
+    pixels = (255 * draw(2, 3, 20, 27)).round()
+    shares = (pixels / 255).to(torch.float32)
+    gaze = torch.tensor([8.0, 9.0])
+    assert torch.equal(sensor(pixels.to(torch.uint8), gaze), sensor(shares, gaze))
+
+
+@of_each_sensor
 def test_bad_input(sensor, prepare):
     image, gaze = torch.rand(2, 3, 8, 8), torch.tensor([4.0, 4.0])
     for arguments, message in (
@@ -88,6 +110,7 @@ def test_bad_input(sensor, prepare):
         *(((image, torch.zeros(shape)), "gaze: expected") for shape in ((3,), (), (3, 2), (1, 4, 2), (1, 2, 4, 2))),
         ((image[0, 0, 0], gaze), "image: expected"),
         ((image[:, :, :0], gaze), "image: expected at least one pixel"),
+        ((image[None], gaze), "image: expected a picture of shape"),
     ):
         refused(message, sensor, *arguments)
 
