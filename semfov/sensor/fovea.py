@@ -20,6 +20,9 @@ from semfov.sensor.base import fixations
 from semfov.sensor.constants import constant
 from semfov.sensor.pyramid import Convention
 
+Width = float | tuple[float, float] | Tensor
+"""Width of a fovea: a number, a pair of numbers along x and y, or a tensor `()`, `(B,)` or `(B, 2)`."""
+
 
 @dataclass(frozen=True)
 class FovealWindow:
@@ -51,12 +54,12 @@ class Fovea:
     growth: float | Tensor
 
     @classmethod
-    def at(cls, gaze: Tensor, sigma: float | Tensor, growth: float | Tensor, images: Tensor) -> Self:
+    def at(cls, gaze: Tensor, sigma: Width, growth: float | Tensor, images: Tensor) -> Self:
         """Make the foveas of images, and check their numbers.
 
         Args:
             gaze: fixations `(2,)`, `(B, 2)` or `(B, G, 2)`.
-            sigma: width: a number, `()`, `(B,)`, or `(B, 2)` along x and y.
+            sigma: width: a number, a pair of numbers along x and y, `()`, `(B,)`, or `(B, 2)` along x and y.
             growth: factor of the widths.
             images: `(B, ...)`, whose device and precision the fovea takes.
 
@@ -67,9 +70,10 @@ class Fovea:
             InputError: a shape does not fit, the gaze is not finite, or σ or growth is not positive.
         """
         fixation = fixations(gaze, images)
-        _check_positive(sigma, "sigma")
+        width = _number_or_tensor(sigma)
+        _check_positive(width, "sigma")
         _check_positive(growth, "growth")
-        return cls(fixation, _widths(sigma, images), growth)
+        return cls(fixation, _widths(width, images), growth)
 
     def __getitem__(self, part: tuple[slice, slice]) -> Self:
         """Select images, and fixations of each."""
@@ -184,6 +188,16 @@ def _check_positive(value: float | Tensor, name: str) -> None:
         raise InputError(f"{name}: expected a positive number, got {got}")
 
 
+def _number_or_tensor(sigma: Width) -> float | Tensor:
+    """Bring a pair of widths, along x and y of all images, to a tensor `(1, 2)`; others stay as they are."""
+    if not isinstance(sigma, tuple | list):
+        return sigma
+    if not all(isinstance(width, Real) for width in sigma):
+        return torch.as_tensor(sigma)
+    check(len(sigma) == 2, "sigma", "a number, a pair (x, y) of numbers, or a tensor", sigma)
+    return torch.tensor([sigma], dtype=torch.float64)
+
+
 def _widths(sigma: float | Tensor, images: Tensor) -> Tensor:
     """Bring σ to widths along x and y for every image, `(B, 2)`."""
     if isinstance(sigma, Real):
@@ -194,7 +208,8 @@ def _widths(sigma: float | Tensor, images: Tensor) -> Tensor:
     width = as_positions(number, images)
     batch = images.shape[0]
     shapes = [(), (1,), (batch,), (1, 2), (batch, 2)]
-    check(tuple(width.shape) in shapes, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", (*width.shape,))
+    expected = f"a number, a pair (x, y) of numbers, or shape (), ({batch},) or ({batch}, 2)"
+    check(tuple(width.shape) in shapes, "sigma", expected, tuple(width.shape))
     if width.ndim == 1:
         width = width[:, None]  # the same along x and y
     return width.expand(batch, 2)

@@ -9,17 +9,16 @@ of a large image without its finest band (`_foveate_large`).
 import warnings
 from collections.abc import Iterator, Sequence
 from numbers import Real
-from typing import TypeGuard, get_args
+from typing import get_args
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from semfov.data.inputs import ImageLike, PointLike, as_batch, as_images, as_points
 from semfov.errors import check, lookup, values_known
 from semfov.io.compatibility import Settings
-from semfov.sensor.base import Sensor
-from semfov.sensor.fovea import Fovea, FovealWindow
+from semfov.sensor.base import Sensor, is_single_picture, of_one_picture
+from semfov.sensor.fovea import Fovea, FovealWindow, Width
 from semfov.sensor.lines import difference, empty
 from semfov.sensor.pyramid import Bands, Convention, expand, expanding, laplacian_pyramid, reduce, widened
 from semfov.threads import one_thread_if_small
@@ -35,7 +34,7 @@ def foveate(
     image: ImageLike | Bands,
     gaze: PointLike,
     *,
-    sigma: float | Tensor,
+    sigma: Width,
     levels: int = 5,
     growth: float | Tensor = 2.0,
     convention: Convention = "kornia",
@@ -59,8 +58,9 @@ def foveate(
         gaze: fixation `(x, y)` in image pixels, inside or outside, as a tensor, an array, a tuple or a list. For a
             batch: `(2,)` for all images, `(B, 2)` for one fixation of each image, or `(B, G, 2)` for G of each. For
             one picture: `(2,)`, or `(G, 2)` for G fixations.
-        sigma: width σ of the fovea in image pixels: a number, `()`, `(B,)`, or `(B, 2)` for widths along x and y.
-            With infinity the result equals the image.
+        sigma: width σ of the fovea in image pixels: a number, or a pair of numbers for widths along x and y; or a
+            tensor `()`, `(B,)` for one width of each image, or `(B, 2)` for a pair of each. With infinity the result
+            equals the image.
         levels: number of bands, K.
         growth: factor g by which the window of each coarser band is wider. With 1 all bands share one window; with 2
             acuity falls off gradually. `semfov.sensor.SENSORS` lists named settings.
@@ -84,10 +84,9 @@ def foveate(
     torch.Size([3, 48, 64])
     """
     points = as_points(gaze)
-    if _is_single_picture(image):
+    if is_single_picture(image):
         bands = laplacian_pyramid(as_images(image), levels, convention)
-        row = points[None] if points.ndim == 2 else points
-        return foveate(bands, row, sigma=sigma, growth=growth)[0]
+        return foveate(bands, of_one_picture(points), sigma=sigma, growth=growth)[0]
     images = image if isinstance(image, Bands) else as_batch(image)
     like = _like(images)
     _warn_of_shares(points, _size(images))
@@ -274,13 +273,6 @@ def _size(images: Tensor | Bands) -> tuple[int, int]:
 def _bands(images: Tensor | Bands, levels: int, convention: Convention) -> Bands:
     """Split images into bands, unless they are split already."""
     return images if isinstance(images, Bands) else laplacian_pyramid(images, levels, convention)
-
-
-def _is_single_picture(image: ImageLike | Bands) -> TypeGuard[ImageLike]:
-    """Tell whether this is one picture of a common type, not a batch or its pyramid."""
-    if isinstance(image, Bands):
-        return False
-    return not isinstance(image, Tensor | np.ndarray) or image.ndim <= 3
 
 
 class Foveation(Sensor):

@@ -162,6 +162,16 @@ def test_views_and_gradients_are_finite_for_extreme_sigma(sigma):
     assert sigma < 1e-3 or torch.isfinite(gaze.grad).all()
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_pair_of_numbers_is_along_x_and_y_for_any_number_of_images(count):
+    """As a tensor, two numbers are the widths of two images."""
+    image, gaze = draw(count, 3, 21, 27), torch.tensor([9.0, 8.0])
+    expected = foveate(image, gaze, sigma=torch.tensor([[4.0, 9.0]] * count))
+    for pair in ((4.0, 9.0), [4, 9]):
+        close(foveate(image, gaze, sigma=pair), expected)
+    close(foveate(image[0], gaze, sigma=(4.0, 9.0)), expected[0])
+
+
 def test_learnable_sigma():
     image, gaze = draw(1, 1, 24, 24, dtype=torch.float32), torch.tensor([8.0, 8.0])
     assert not Foveation(5.0)(image, gaze).requires_grad
@@ -232,9 +242,11 @@ GAZE = torch.tensor([4.0, 4.0])
         ({"sigma": -0.1}, r"sigma: expected a positive number, got -0\.1$"),
         ({"sigma": math.nan}, "sigma: expected a positive number, got nan"),
         ({"sigma": torch.tensor([1.0, -1.0])}, "sigma: expected a positive number"),
-        ({"sigma": torch.ones(3)}, "sigma: expected a number or shape"),
-        ({"sigma": torch.ones(2, 3)}, "sigma: expected a number or shape"),
-        ({"sigma": torch.ones(2, 2, 2)}, "sigma: expected a number or shape"),
+        ({"sigma": (3.0, 4.0, 5.0)}, "sigma: expected a number, a pair"),
+        ({"sigma": (3.0, 0.0)}, "sigma: expected a positive number"),
+        ({"sigma": torch.ones(3)}, "sigma: expected a number, a pair"),
+        ({"sigma": torch.ones(2, 3)}, "sigma: expected a number, a pair"),
+        ({"sigma": torch.ones(2, 2, 2)}, "sigma: expected a number, a pair"),
         ({"growth": 0.0}, "growth: expected a positive number, got 0.0"),
         ({"growth": torch.tensor(-1.0)}, "growth: expected a positive number, got -1.0"),
         ({"convention": "korina"}, "unknown pyramid convention 'korina'; did you mean 'kornia'"),
