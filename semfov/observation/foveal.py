@@ -18,7 +18,7 @@ from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Field, Number, Schema
 from semfov.observation.dirichlet import floor
 from semfov.observation.fitting import fit_tables
-from semfov.observation.linear_map import forget, kept_map, linear_map
+from semfov.observation.linear_map import kept_map, linear_map
 from semfov.observation.mle import Method
 from semfov.observation.presence import PRESENCE, Presence, presence_of
 from semfov.observation.statistics import DirichletStatistics
@@ -470,32 +470,21 @@ class FovealObservationModel(Pretrained):
         """
         return f"classes={len(self.classes)}, levels={len(self.edges) + 1}, epsilon={self.epsilon}"
 
-    def train(self, mode: bool = True) -> Self:
-        """Switch between training and evaluation mode, and drop what evaluation mode keeps.
-
-        Args:
-            mode: True for training mode.
-
-        Returns:
-            This model.
-        """
-        # Fused optimisers change parameters without counting it.
-        forget(self.log_alpha)
-        return super().train(mode)
-
     def _linear(self) -> tuple[Tensor, Tensor]:
         """Compute weights and constants of the log likelihoods (`linear_map`).
 
         They are kept in `eval` mode and without gradients.
         """
         parameter = self.log_alpha
-        if self.training or (torch.is_grad_enabled() and parameter.requires_grad) or torch.compiler.is_exporting():
+        is_recorded = torch.is_grad_enabled() and parameter.requires_grad
+        if self.training or is_recorded or torch.compiler.is_exporting():
             return linear_map(self.alpha)
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_compiling() and parameter.device.type == "cpu":
             # A graph would compute the gamma functions at each call, so that it takes ten times as long.
             weight, constant = torch.ops.semfov.linear_map(parameter)
             return weight, constant
-        return kept_map(parameter)
+        # Values that are not known cannot be compared: those of a graph, and of a model in `torch.func`.
+        return kept_map(parameter) if values_known(parameter) else linear_map(self.alpha)
 
 
 def _checked_borders(edges: Sequence[float] | Tensor, like: Tensor) -> Tensor:

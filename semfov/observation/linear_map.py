@@ -5,6 +5,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from semfov.observation.dirichlet import log_normaliser
+from semfov.threads import one_thread_if_small
 
 
 def linear_map(alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -22,26 +23,30 @@ def linear_map(alpha: Tensor) -> tuple[Tensor, Tensor]:
     return (by_level - 1).flatten(0, 1), constant.flatten()
 
 
-_KEPT = WeakIdKeyDictionary()  # linear maps by the parameters they are made of, with the state of these then
+# Copies of parameters ln α with the linear maps that were made of them, by the parameters.
+_KEPT = WeakIdKeyDictionary()
 
 
 def kept_map(log_alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute `linear_map` of parameters `ln α` once for each of their states, without gradients."""
-    if log_alpha.is_inference():
-        # Such tensors do not count their changes.
-        return linear_map(log_alpha.exp())
-    state = log_alpha._version, log_alpha.data_ptr()
-    entry: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = _KEPT.get(log_alpha)
-    if entry is None or entry[0] != state:
+    """Compute `linear_map` of parameters `ln α` once for each of their values, without gradients.
+
+    The values are compared with those of the last call. The version of a tensor would not do: fused optimisers, and
+    changes of its `data`, as averages of models make them, do not count in it.
+    """
+    entry: tuple[Tensor, tuple[Tensor, Tensor]] | None = _KEPT.get(log_alpha)
+    if entry is None or not _are_equal(log_alpha, entry[0]):
         with torch.inference_mode(False), torch.no_grad():
-            entry = (state, linear_map(log_alpha.exp()))
+            values = log_alpha.detach().clone()
+            entry = (values, linear_map(values.exp()))
         _KEPT[log_alpha] = entry
     return entry[1]
 
 
-def forget(log_alpha: Tensor) -> None:
-    """Drop what `kept_map` keeps for parameters `ln α`."""
-    _KEPT.pop(log_alpha, None)
+@one_thread_if_small
+def _are_equal(parameters: Tensor, before: Tensor) -> bool:
+    """Tell whether parameters have the device, the type and the values of a copy that was made before."""
+    is_alike = parameters.device == before.device and parameters.dtype == before.dtype
+    return is_alike and torch.equal(parameters, before)
 
 
 # An operation into which compilation does not look, and whose results a compiled graph may write over.

@@ -389,15 +389,48 @@ def test_a_compiled_model_follows_its_parameters():
             torch.testing.assert_close(model.calibrate(scores, distance), expected)
 
 
-def test_likelihoods_after_training_are_those_of_the_trained_parameters():
+def fused_step(model):
+    optimiser = torch.optim.Adam([model.log_alpha], lr=0.5, fused=True)
+    model(*looks(dtype=torch.float32)).square().sum().backward()
+    optimiser.step()
+
+
+def averaged(model):
+    model.log_alpha.data.mul_(0.9).add_(0.1)
+
+
+@pytest.mark.parametrize("change", [fused_step, averaged])
+def test_likelihoods_are_those_of_the_present_parameters(change):
     """Fused optimisers and changes of the data of a parameter are not counted in its version."""
     scores, distance = looks(dtype=torch.float32)
     model = FovealObservationModel(table(torch.float32), EDGES, CLASSES).eval()
     with torch.no_grad():
-        model(scores, distance)
-    model.train()
-    model.log_alpha.data.add_(0.5)
+        before = model(scores, distance)
+    change(model)
     with torch.no_grad():
-        after = model.eval()(scores, distance)
-        fresh = FovealObservationModel(model.alpha, EDGES, CLASSES).eval()(scores, distance)
+        after = model(scores, distance)
+        fresh = FovealObservationModel(model.alpha, EDGES, CLASSES)(scores, distance)
     torch.testing.assert_close(after, fresh)
+    assert not torch.allclose(after, before)
+
+
+def test_models_side_by_side_equal_each_alone():
+    """An ensemble in `torch.func`, in evaluation with and without gradients, and the derivative by its parameters."""
+    scores, distance = looks()
+    models = [FovealObservationModel(table() * factor, EDGES, CLASSES).eval() for factor in (1.0, 0.5)]
+    parameters, _ = torch.func.stack_module_state(models)
+
+    def called(parameters):
+        return torch.func.functional_call(models[0], parameters, (scores, distance))
+
+    expected = torch.stack([model(scores, distance) for model in models])
+    torch.testing.assert_close(torch.func.vmap(called)(parameters), expected)
+    with torch.no_grad():
+        torch.testing.assert_close(torch.func.vmap(called)(parameters), expected)
+
+    def of_background(log_alpha):
+        return called({"log_alpha": log_alpha})[..., 0].sum()
+
+    gradient = torch.func.grad(of_background)(models[0].log_alpha.detach())
+    expected[0][..., 0].sum().backward()
+    torch.testing.assert_close(gradient, models[0].log_alpha.grad)
