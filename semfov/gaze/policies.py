@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from semfov.belief import Grid
 from semfov.errors import InputError, check, lookup
 from semfov.gaze.acquisition.base import FUNCTIONS, AcquisitionFunction, Task
-from semfov.gaze.acquisition.lookahead import sampled_likelihoods
+from semfov.gaze.acquisition.lookahead import DrawnLooks
 from semfov.observation.foveal import FovealObservationModel
 
 __all__ = ["Policy", "policy_names"]
@@ -26,7 +26,7 @@ class Policy(nn.Module):
         model: model that the function is made from; one that needs none leaves it out.
         samples: number of looks that are drawn for each class and level, over which a function that predicts looks
             takes the expectation; the model's Dirichlets must be densities of the scores. None takes the look with the
-            expected scores, as published.
+            expected scores, as published. They are drawn anew when the model has changed.
         calibrated: whether the scores of a drawn look are calibrated before they update the belief.
         settings: further arguments of the acquisition function, None included; parameters and modules among them are
             those of the policy. Their names are others than those of arguments and attributes of `Policy`.
@@ -44,8 +44,6 @@ class Policy(nn.Module):
     TargetPosterior()
     """
 
-    likelihoods: Tensor
-
     def __init__(
         self,
         function: str | type[AcquisitionFunction],
@@ -56,6 +54,7 @@ class Policy(nn.Module):
         **settings: object,
     ) -> None:
         super().__init__()
+        self.drawn_looks: DrawnLooks | None = None
         self.function = _function_class(function)
         self.model = self._model_for(model)
         self._check_settings(settings)
@@ -63,7 +62,8 @@ class Policy(nn.Module):
             predicts = "likelihoods" in self.function.takes
             check(predicts, "samples", f"None for policy {self.name!r}, which predicts no look", samples)
             assert isinstance(model, FovealObservationModel)
-            settings["likelihoods"] = sampled_likelihoods(model, samples, calibrated=calibrated)
+            self.drawn_looks = DrawnLooks(samples, calibrated=calibrated)
+            self.drawn_looks(model)  # which raises an error now if it cannot
         self._settings = list(settings)
         for name, value in settings.items():
             if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
@@ -110,7 +110,8 @@ class Policy(nn.Module):
         Raises:
             InputError: the function needs a target or a setting, and has none, or has one of another type.
         """
-        arguments = self._arguments({"target": target, "model": self.model, "grid": grid})
+        likelihoods = None if self.drawn_looks is None else self.drawn_looks(self.model)
+        arguments = self._arguments({"target": target, "model": self.model, "grid": grid, "likelihoods": likelihoods})
         try:
             return self.function(**arguments)
         except TypeError as error:

@@ -336,9 +336,25 @@ def test_policies_take_the_expectation_by_their_settings():
         chosen = replace(settings, scores=scores)
         strategy = _make_strategy(chosen, "exploration", BeliefConfig(), 4, {"observation": model}.__getitem__, 0.1)
         expected = sampled_likelihoods(model, 8, calibrated=scores == "calibrated")
-        assert torch.equal(strategy.policy.likelihoods, expected)
+        assert torch.equal(strategy.policy(None, ROW).likelihoods, expected)
     with pytest.raises(InputError, match="samples: expected null, except for predictive; got 8 for 'neighbourhood'"):
         resolve(PolicyConfig("neighbourhood", samples=8), "search")
+
+
+def test_a_policy_draws_looks_from_the_model_as_it_is_now():
+    """As one that was made of the changed model: after a file was loaded, and after an optimiser's step."""
+    model, other = four_classes(), four_classes()
+    policy = Policy("kl", model, samples=4)
+    first = policy(None, ROW).likelihoods
+    assert policy(None, ROW).likelihoods is first
+    with torch.no_grad():
+        other.log_alpha.mul_(1.5)
+    policy.load_state_dict(Policy("kl", other, samples=4).state_dict())
+    loaded = policy(None, ROW).likelihoods
+    assert torch.equal(loaded, sampled_likelihoods(other, 4))
+    assert not torch.equal(loaded, first)
+    model.log_prior.data[0] += 1
+    assert torch.equal(policy(None, ROW).likelihoods, sampled_likelihoods(model, 4))
 
 
 ACQUISITIONS = {

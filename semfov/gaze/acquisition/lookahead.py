@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
 from semfov.belief.grid import Grid
@@ -189,6 +189,42 @@ def sampled_likelihoods(
     outer = torch.cat([model.edges, model.edges.new_full((1,), torch.inf)])
     distances = outer[None, :, None].expand(scores.shape[:-1])
     return model.calibrate(scores, distances).detach()
+
+
+class DrawnLooks(nn.Module):
+    """Likelihoods of looks that are drawn from an observation model (`sampled_likelihoods`), kept until it changes.
+
+    Args:
+        samples: M, number of looks for each class and level.
+        calibrated: calibrate the scores.
+    """
+
+    likelihoods: Tensor
+    state: Tensor
+
+    def __init__(self, samples: int, *, calibrated: bool = True) -> None:
+        super().__init__()
+        self.samples = samples
+        self.calibrated = calibrated
+        self.register_buffer("likelihoods", torch.empty(0), persistent=False)
+        self.register_buffer("state", torch.empty(0), persistent=False)  # of the model that these looks are of
+
+    def forward(self, model: FovealObservationModel) -> Tensor:
+        """Draw looks from a model, or take those that were drawn from it before.
+
+        Args:
+            model: the observation model.
+
+        Returns:
+            `(K+1, N, M, K+1)`, as from `sampled_likelihoods`.
+        """
+        values = [value.detach().flatten() for value in (*model.parameters(), *model.buffers())]
+        state = torch.cat(values)
+        is_alike = self.state.device == state.device and self.state.dtype == state.dtype
+        if not is_alike or not torch.equal(self.state, state):
+            self.likelihoods = sampled_likelihoods(model, self.samples, calibrated=self.calibrated)
+            self.state = state
+        return self.likelihoods
 
 
 class Lookahead(AcquisitionFunction):
