@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check_shape
+from semfov.observation.precision import without_autocast
 
 
 def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:
@@ -36,7 +37,8 @@ def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:
     """
     check_shape(ratio, "ratio", None, None, miss.shape[-1])
     check_shape(weight, "weight", *ratio.shape[:2], miss.shape[-2])
-    detected = weight.mT @ ratio[..., 1:]
+    with without_autocast(ratio):
+        detected = weight.mT @ ratio[..., 1:]
     background = torch.ones_like(miss[..., :1])
     return torch.cat([background, miss[..., 1:] + detected], -1)
 

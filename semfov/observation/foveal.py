@@ -20,6 +20,7 @@ from semfov.observation.dirichlet import floor
 from semfov.observation.fitting import fit_tables
 from semfov.observation.linear_map import kept_map, linear_map
 from semfov.observation.mle import Method
+from semfov.observation.precision import without_autocast
 from semfov.observation.presence import PRESENCE, Presence, presence_of
 from semfov.observation.statistics import DirichletStatistics
 from semfov.observation.thresholds import THRESHOLDS, thresholds_of, thresholds_record
@@ -239,20 +240,29 @@ class FovealObservationModel(Pretrained):
         Raises:
             InputError: shapes do not fit, or a score is negative or not finite.
         """
-        components = len(self.classes) + 1
         check_tensor(scores, "scores")
+        return self._log_likelihood(scores, distance).to(scores.dtype)
+
+    def _log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:
+        """Compute the log likelihoods in the precision of the scores, or of the parameters where that is higher.
+
+        They are large numbers, and half precision would round them to whole nats.
+        """
+        components = len(self.classes) + 1
         check_tensor(distance, "distance")
         check(scores.is_floating_point(), "scores", "a floating-point tensor", scores.dtype)
         check_shape(scores, "scores", components)
         shape = tuple(scores.shape[:-1])
         check(shape == distance.shape, "distance", f"shape {shape}", tuple(distance.shape))
         weight, constant = self._linear()
-        log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
+        precision = torch.promote_types(scores.dtype, weight.dtype)
+        log_scores = floor(scores.to(precision), self.epsilon).log().to(weight.dtype)
         # One product for all levels and a selection cost less than gathering a matrix for each detection.
-        by_level = F.linear(log_scores, weight, constant).unflatten(-1, (-1, components))
+        with without_autocast(weight):
+            by_level = F.linear(log_scores, weight, constant).unflatten(-1, (-1, components))
         level = self.level(distance)
         index = level[..., None, None].expand(*level.shape, 1, components)
-        return by_level.gather(-2, index).squeeze(-2).to(scores.dtype)
+        return by_level.gather(-2, index).squeeze(-2).to(precision)
 
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
         """Calibrate scores: compute the posterior probability of every class.
@@ -270,7 +280,8 @@ class FovealObservationModel(Pretrained):
         Raises:
             InputError: shapes do not fit, or a score is negative or not finite.
         """
-        likelihood = self.log_likelihood(scores, distance)
+        check_tensor(scores, "scores")
+        likelihood = self._log_likelihood(scores, distance)
         level = self._level(distance)
         # An embedding, since indices of tensors are no part of `torch.func`.
         exponents = F.embedding(level, self.log_exponents.exp()[:, None]).to(likelihood)

@@ -434,3 +434,20 @@ def test_models_side_by_side_equal_each_alone():
     gradient = torch.func.grad(of_background)(models[0].log_alpha.detach())
     expected[0][..., 0].sum().backward()
     torch.testing.assert_close(gradient, models[0].log_alpha.grad)
+
+
+@pytest.mark.parametrize("shipped", ["yolox-nano", "yolox-nano-published"])
+def test_log_likelihoods_of_hundreds_of_nats_are_not_rounded_to_eight_bits(shipped):
+    """By automatic mixed precision, or because the scores come in half precision."""
+    model = FovealObservationModel.from_pretrained(shipped).requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    shares = torch.rand(50, 81, generator=generator) ** 12 + 1e-4
+    scores = (shares / shares.sum(-1, keepdim=True)).bfloat16()
+    distance = 0.5 * torch.rand(50, generator=generator)
+    exact = model.calibrate(scores.float(), distance)
+    assert model.log_likelihood(scores.float(), distance).abs().max() > 200
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(model.calibrate(scores.float(), distance), exact)
+    assert model.log_likelihood(scores, distance).dtype == torch.bfloat16
+    half = model.calibrate(scores, distance)
+    torch.testing.assert_close(half.float(), exact, rtol=2**-8, atol=1e-6)

@@ -1,0 +1,23 @@
+"""Products that automatic mixed precision may not round."""
+
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor
+
+
+def without_autocast(like: Tensor) -> AbstractContextManager[object]:
+    """Make a context in which products keep the precision of their factors.
+
+    Automatic mixed precision computes them with 8 significant bits. A log likelihood is a sum of terms of hundreds of
+    nats, in which that is an error of a nat or two: enough for another class to be the most probable one.
+
+    Args:
+        like: a tensor on the device of the products.
+
+    Returns:
+        The context, which does nothing where autocast is off.
+    """
+    kind = like.device.type
+    is_on = torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)
+    return torch.autocast(kind, enabled=False) if is_on else nullcontext()
