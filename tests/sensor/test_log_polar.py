@@ -310,9 +310,3 @@ def test_a_network_with_a_fixed_input_takes_no_other_crops(tmp_path):
     assert len(Eye(MultiScaleFovea(64, 2), detector)(image, (20.0, 20.0)).boxes) == 1
     with pytest.raises(InputError, match="expected 64 × 64 px, the fixed input of colours, got 32 × 32 px; a sensor"):
         Eye(MultiScaleFovea(32, 2), detector)(image, (20.0, 20.0))
-
-
-def test_a_gaze_of_another_kind_is_refused_with_the_call_that_converts_it():
-    for gaze in (np.array([32.0, 24.0]), [32.0, 24.0]):
-        with pytest.raises(InputError, match=r"gaze: expected a tensor, got .*; give torch\.as_tensor\(gaze\)"):
-            log_polar(torch.rand(1, 3, 48, 64), gaze, fovea=10.0)
