@@ -20,8 +20,6 @@ from semfov.observation.thresholds import Thresholds
 from semfov.presets import PUBLISHED_SENSORS, published_model
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.evidence import CASE
-from semfov.zoom.hint_maps import features
 from semfov.zoom.hints import Gist
 from tests.refusals import refused, unusable
 
@@ -109,14 +107,12 @@ def test_shipped_models_of_glimpse_evidence(path):
         found = torch.stack([model.rates(look, torch.tensor([7])).exp()[0, 0, 7:10, 7:10].sum() for look in looks])
         taper = model.taper(16)
     assert bool((found.diff() > 0).all())
-    # The higher and the more frequent the scores of a class, the more probable is its presence in the image.
+    # The higher the score of a class, and the more of its objects are expected, the more probable is its presence.
     assert model.thresholds is not None
-    case = torch.zeros(3, CASE)
-    best = torch.tensor([0.02, 0.3, 0.9])
-    case[:, [0, 1, 2, 4]] = features(best)[:, None]
-    case[:, 8] = torch.tensor([0.0, 0.35, 0.7])
+    rising = torch.tensor([0.02, 0.3, 0.9])
     with torch.no_grad():
-        assert bool((model.anywhere(best, case).diff() > 0).all())
+        assert bool((model.presence(rising, torch.ones(3)).diff() > 0).all())
+        assert bool((model.presence(torch.full((3,), 0.3), rising).diff() > 0).all())
     # Objects in the middle of a window are detected; objects at its border may be cut.
     assert taper[8] > taper[0]
     torch.testing.assert_close(taper, taper.flip(0))

@@ -19,7 +19,7 @@ from semfov.fit.windows_decisions import (
     MosaicSearch,
     WindowSearches,
     fit_closer_looks,
-    fit_judge,
+    fit_presence,
     judge_searches,
     search_pictures,
 )
@@ -37,9 +37,9 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import half_steps
 from semfov.zoom.survey import Survey
 
-RefitPart = Literal["survey", "decision", "verification", "certainty", "photograph"]
-"""Parts of evidence that may be fitted again: numbers of objects of any class, decisions of searches, probabilities
-after closer looks, the probability that an object is there with the spread of expected numbers, and the evidence for
+RefitPart = Literal["survey", "certainty", "decision", "verification", "photograph"]
+"""Parts of evidence that may be fitted again: numbers of objects of any class, the probability that an object is there
+with the spread of expected numbers, decisions of searches, probabilities after closer looks, and the evidence for
 photographs."""
 
 _CROWDED = 1 / 3  # share of the photographs that the crowded mosaics show, those with the most objects
@@ -81,7 +81,7 @@ class MosaicFit:
 
     Each part uses those before it (`fit`):
 
-        looks ─► numbers of objects of a class ─► of any class ─► decisions ─► closer looks ─► certainty
+        looks ─► numbers of objects of a class ─► of any class ─► certainty ─► decisions ─► closer looks
                  (and, of photographs as they are, the evidence for photographs)
 
     Attributes:
@@ -173,14 +173,14 @@ class MosaicFit:
             lines += [*measure_table(measured), ""]
         if "survey" in parts:
             lines += self.fit_survey(model, examples)
+        if "certainty" in parts:
+            lines += self.fit_certainty(model)
         searched = self.search(model) if {*parts} & {"decision", "verification"} else {}
         if "decision" in parts:
             lines += self.fit_decisions(model, searched)
         if "verification" in parts:
             check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", "one without")
             lines += self.fit_verification(model, searched, priors[0])
-        if "certainty" in parts:
-            lines += self.fit_certainty(model)
         if "photograph" in parts and self.config.photographs:
             scenes = make_scenes(self.config.data, self.eye.detector.classes)
             lines += ["Photographs:", "", fit_photographs(model, scenes, self.eye, self.config, priors[1])]
@@ -269,9 +269,8 @@ class MosaicFit:
 
     def fit_decisions(self, model: GlimpseEvidence, searched: Mapping[str, Sequence[MosaicSearch]]) -> list[str]:
         """Fit the decisions of searches: the probability of presence, and the thresholds; returns lines of Markdown."""
-        torch.manual_seed(self.config.seed)
         searches = {use: WindowSearches.of(of_use, self.config.passes) for use, of_use in searched.items()}
-        fit_judge(model, searches["searched"], self.config.judging)
+        fit_presence(model, searches["searched"])
         rows = judge_searches(model, searches["judged"], self.config)
         # A verification belongs to the probability that it was fitted with.
         model.verification = None

@@ -6,14 +6,13 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
+from semfov.fit.logistic import logistic_regression
 from semfov.fit.searches import TargetSearch
 from semfov.fit.thresholds import Bounds, choose_thresholds
-from semfov.fit.training import descend
 from semfov.fit.verification import OneKindError, examine, fit_to_closer_looks, with_thresholds
 from semfov.fit.verification_report import NO_PLACES, verification_report
 from semfov.fit.windows_settings import FitMosaicsConfig
@@ -39,7 +38,7 @@ class _Known(NamedTuple):
 
     look: WindowLook
     best: float
-    case: Tensor
+    expected: float
     detected: bool
     hit_chance: float
 
@@ -48,7 +47,7 @@ class MosaicSearch(TargetSearch[TargetFacts]):
     """A search of a large picture, without decisions and without closer looks.
 
     Attributes:
-        model: evidence by magnification, which chooses the looks; its `judge` may be fitted to them afterwards.
+        model: evidence by magnification, which chooses the looks; its `whole` may be fitted to them afterwards.
         source: the looks at the picture.
         objects: `(M, 4)`, annotated boxes of the class.
         known: the looks, and what is known after each.
@@ -77,17 +76,14 @@ class MosaicSearch(TargetSearch[TargetFacts]):
         for step in islice(look_for(source, model, target), passes):
             facts = facts or SearchFacts(step.belief)
             facts.add(step.look)
-            case = facts.case(step.next_value)
-            self.known.append(_Known(step.look, facts.best, case, facts.detected, step.next_value))
+            self.known.append(_Known(step.look, facts.best, facts.expected(), facts.detected, step.next_value))
 
     def __len__(self) -> int:
         return len(self.known)
 
     def look(self, index: int, number: int) -> TargetFacts:
         after = self.known[index]
-        best = torch.tensor(after.best)
-        whole = self.known[0].look.show[self.target - 1]
-        presence = self.model.presence(best, after.case, whole, torch.tensor(self.target)).sigmoid()
+        presence = self.model.presence(torch.tensor(after.best), torch.tensor(after.expected)).sigmoid()
         return TargetFacts(after.look.detections, number, float(presence), after.best, after.hit_chance)
 
     def candidates(self) -> CandidateBoxes:
@@ -138,14 +134,14 @@ class WindowSearches(NamedTuple):
 
     Attributes:
         best: `(E, n)`, highest score of the target.
-        case: `(E, n, 10)`, what the probability of presence is computed from, beside `best`.
+        expected: `(E, n)`, expected number of its objects.
         detected: `(E, n)` boolean, whether a detection shows the target.
         hit_chance: `(E, n)`, value of the best look that is left.
         there: `(E,)` boolean, whether the picture holds the target.
     """
 
     best: Tensor
-    case: Tensor
+    expected: Tensor
     detected: Tensor
     hit_chance: Tensor
     there: Tensor
@@ -160,7 +156,7 @@ class WindowSearches(NamedTuple):
             rows.append(
                 (
                     torch.tensor([after.best for after in known]),
-                    torch.stack([after.case for after in known]),
+                    torch.tensor([after.expected for after in known]),
                     torch.tensor([after.detected for after in known]),
                     torch.tensor([after.hit_chance for after in known]),
                     torch.tensor(search.present),
@@ -169,27 +165,20 @@ class WindowSearches(NamedTuple):
         return cls(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def fit_judge(model: GlimpseEvidence, searches: WindowSearches, steps: int, batch: int = 4096) -> None:
-    """Fit the probability that a picture contains the target, by the cross-entropy after all looks of all searches.
+@torch.no_grad()
+def fit_presence(model: GlimpseEvidence, searches: WindowSearches) -> None:
+    """Fit the probability that a picture contains the target, by its likelihood after all looks of all searches.
 
     Args:
-        model: evidence by magnification, whose `judge` is fitted.
+        model: evidence by magnification, whose `whole` is fitted.
         searches: E searches of n looks.
-        steps: number of training steps.
-        batch: largest number of looks in a step.
     """
-    best = searches.best.flatten()
-    case = searches.case.flatten(0, 1)
     # Every look of a search has the answer of its picture.
-    there = searches.there[:, None].expand_as(searches.best).flatten().float()
-
-    def loss_of(_: int) -> Tensor:
-        rows = torch.randint(len(best), (min(batch, len(best)),))
-        return F.binary_cross_entropy_with_logits(model.anywhere(best[rows], case[rows]), there[rows])
-
-    model.judge.requires_grad_(True)
-    descend(model.judge.parameters(), loss_of, steps, 1e-2, decay=1.0, title="fitting decisions")
-    model.judge.requires_grad_(False)
+    there = searches.there[:, None].expand_as(searches.best).flatten()
+    facts = model.presence_facts(searches.best, searches.expected).flatten(0, 1)
+    offset, *weights = logistic_regression(facts, there)
+    model.whole.weight.copy_(torch.tensor([weights]))
+    model.whole.bias.fill_(offset)
 
 
 @torch.no_grad()
@@ -197,14 +186,14 @@ def judge_searches(model: GlimpseEvidence, searches: WindowSearches, bounds: Bou
     """Evaluate the probability of presence on held-out searches, and set the model's thresholds by them.
 
     Args:
-        model: evidence by magnification, with a fitted `judge`.
+        model: evidence by magnification, with a fitted `whole`.
         searches: E searches of n looks, in pictures of held-out photographs.
         bounds: shares of wrong decisions within which thresholds are chosen.
 
     Returns:
         A table in Markdown, line by line.
     """
-    presence = model.anywhere(searches.best, searches.case).sigmoid()
+    presence = model.presence(searches.best, searches.expected).sigmoid()
     there = searches.there
     chosen = choose_thresholds(bounds, presence.mT, searches.detected.mT.to(presence), searches.hit_chance.mT, there)
     # The place is known as soon as a detection shows the target; there is no probability to put a threshold on.

@@ -39,7 +39,6 @@ class FitMosaicsConfig(FitConfig):
             side in longer sides of the place.
         steps: number of training steps for the number of objects of a class.
         survey_steps: the same for objects of any class.
-        judging: number of training steps for the decisions of searches.
     """
 
     unused = ("sensor", "name")
@@ -62,7 +61,6 @@ class FitMosaicsConfig(FitConfig):
     window: tuple[Share, float] = USUAL_WINDOW
     steps: Count = 800
     survey_steps: Count = 1500
-    judging: Count = 300
     out: Path = Path("runs/fit_zoom")
 
     @property

@@ -132,6 +132,10 @@ class Certainty:
         return scale * number, scale * number * (1 + number / rate)
 
 
+BY_SCORE = Certainty.of([0.0, 1.0])
+"""The certainty of an object whose probability is its score, where none was fitted."""
+
+
 def reacts(chances: Tensor) -> bool:
     """Tell whether a detector reacts to objects: several are likely, or the likely ones have most of the sum.
 

@@ -1,6 +1,5 @@
 """Decisions of a search by windows: the facts about its looks, and the outcome after each and after closer looks."""
 
-import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -18,13 +17,13 @@ from semfov.observation.presence import EVEN
 from semfov.observation.thresholds import Thresholds
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.certainty import BY_SCORE
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, TargetFacts
 from semfov.zoom.episode import WindowStep
 from semfov.zoom.evidence import PhotographEvidence
-from semfov.zoom.hint_maps import features
 from semfov.zoom.hints import DETECTION_SCORE
-from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import WindowLook
+from semfov.zoom.objects import merge_with_facts
 
 
 class _LookFacts(NamedTuple):
@@ -33,16 +32,12 @@ class _LookFacts(NamedTuple):
     Attributes:
         look: the look.
         score: highest score of the target, hints included.
-        closest: the same for a look of the last level, 0 for others.
-        named: highest score of a detection whose most probable class is the target.
         found: highest score of a detection.
         box: box `(4,)` of that detection; None without a detection.
     """
 
     look: WindowLook
     score: float
-    closest: float
-    named: float
     found: float
     box: Tensor | None
 
@@ -52,6 +47,7 @@ class SearchFacts:
 
     Attributes:
         belief: the belief of the search.
+        latest: whether later looks replace what earlier ones showed, as in a stream that forgets.
         looks: what each look that counts shows.
         best: highest score of the target in all looks.
         box: box `(4,)` of the detection with the highest score; None without a detection.
@@ -60,8 +56,9 @@ class SearchFacts:
     Invariant: `best`, `box` and `detected` sum up `looks`, of which there is at least one after `see` and `add`.
     """
 
-    def __init__(self, belief: ZoomBelief) -> None:
+    def __init__(self, belief: ZoomBelief, *, latest: bool = False) -> None:
         self.belief = belief
+        self.latest = latest
         self.looks: list[_LookFacts] = []
         self.best = 0.0
         self.box: Tensor | None = None
@@ -90,74 +87,30 @@ class SearchFacts:
         """Read from a look what it shows of the target."""
         target = self.belief.target
         score = float(look.show[target - 1])
-        is_closest = look.window.level == self.belief.lattice.levels - 1
-        closest = score if is_closest else 0.0
-        vectors = look.detections.scores[0].detach().float().numpy()  # (L, K+1)
-        scores = vectors[:, target]
+        scores = look.detections.scores[0, :, target].detach().float().numpy()
         if not len(scores):
-            return _LookFacts(look, score, closest, named=0.0, found=0.0, box=None)
-        is_named = vectors[:, 1:].argmax(1) == target - 1
-        named = float(scores[is_named].max(initial=0))
+            return _LookFacts(look, score, found=0.0, box=None)
         best = int(scores.argmax())
-        return _LookFacts(look, score, closest, named, float(scores[best]), look.detections.boxes[0, best])
-
-    def case(self, hit_chance: float) -> Tensor:
-        """Facts `(10,)` for `GlimpseEvidence.presence`: scores, what remains to be seen, and numbers of looks.
-
-        Args:
-            hit_chance: chance that the best remaining window shows the target.
-        """
-        scores_of_looks = [look.score for look in self.looks]
-        # With a single look, there is no second score.
-        best, second, *_ = sorted([*scores_of_looks, 0.0], reverse=True)
-        closest = max(look.closest for look in self.looks)
-        named = max(look.named for look in self.looks)
-        overview = scores_of_looks[0]
-        scores = torch.tensor([best, second, closest, overview, named, hit_chance], dtype=torch.float32)
-        # A picture may be blank all over.
-        visible = self.belief.visible.sum().clamp(1)
-        unexplored = float(self.belief.unexplored.sum() / visible)
-        detected = sum(score >= DETECTION_SCORE for score in scores_of_looks)
-        # Logarithms and their divisors bring numbers of objects and of looks to the range of the others.
-        other_facts = [
-            math.log(self._expected_finds() + 1e-3) / 4,
-            unexplored,
-            math.log1p(detected) / 2,
-            math.log(len(scores_of_looks)) / 2,
-        ]
-        return torch.cat([features(scores), torch.tensor(other_facts)])
-
-    def _expected_finds(self) -> float:
-        """Estimate how many new objects of the target looks of the last level, side by side, would find."""
-        last = self.belief.lattice.levels - 1
-        if not last:
-            return 0.0
-        # Windows start at every cell: this is the mean over all ways to lay them side by side.
-        return float(self.belief.value(last, 0.0).sum()) / CELLS**2
+        return _LookFacts(look, score, float(scores[best]), look.detections.boxes[0, best])
 
     @torch.no_grad()
-    def presence(self, hit_chance: float) -> float:
-        """Predict whether the picture holds the target, by the prior of the fit.
+    def expected(self) -> float:
+        """Estimate how many objects of the target there are: those that looks show, and those that looks would find."""
+        belief = self.belief
+        looks = [facts.look for facts in self.looks]
+        _, facts = merge_with_facts(looks, belief.lattice, belief.target, latest=self.latest)
+        certainty = belief.evidence.certainty_in(belief.lattice) or BY_SCORE
+        unseen, _ = certainty.unseen(belief.remaining(), promised=0.0, discoveries=0.0)
+        return float(certainty.probability(facts).sum()) + unseen
 
-        Args:
-            hit_chance: chance that the best remaining window shows the target.
-        """
+    @torch.no_grad()
+    def presence(self) -> float:
+        """Predict whether the picture holds the target, by the prior of the fit."""
         best = torch.tensor(self.best)
-        target = torch.tensor(self.belief.target)
         photograph = self.belief.photograph
         if photograph is not None:
-            return float(photograph.presence(best, target).sigmoid())
-        case = self.case(hit_chance)
-        evidence = self.belief.evidence
-        whole = self._score_of_whole
-        if whole is None:
-            return float(evidence.anywhere(best, case).sigmoid())
-        return float(evidence.presence(best, case, torch.tensor(whole), target).sigmoid())
-
-    @property
-    def _score_of_whole(self) -> float | None:
-        """Highest score of the target in the look at the whole; None where a stream's camera has left it behind."""
-        return next((facts.score for facts in self.looks if facts.look.window.level == 0), None)
+            return float(photograph.presence(best, torch.tensor(self.belief.target)).sigmoid())
+        return float(self.belief.evidence.presence(best, torch.tensor(self.expected())).sigmoid())
 
 
 CLOSER = 100  # largest number of closer looks in a large picture: as many as there are passes for
@@ -246,14 +199,14 @@ class DecisionsByPresence(WindowDecisions):
 
     The probability that the picture holds the target takes time, and is computed where it can matter.
 
-    Invariant: `_presence` is that of the present `_facts` and `_fitted_chance`, or None; what changes these clears it.
+    Invariant: `_presence` is that of the present `_facts`, or None; what changes these clears it.
     """
 
-    def __init__(self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior) -> None:
+    def __init__(self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior, *, latest: bool = False) -> None:
         self.thresholds = thresholds
         self.prior = prior
         self.criterion = f"p is {thresholds.confirm:g} and a detection shows the target"
-        self._facts = SearchFacts(belief)
+        self._facts = SearchFacts(belief, latest=latest)
         self._is_large = belief.photograph is None
         self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
         self._presence: float | None = None  # that after the last look, once it was asked for
@@ -299,7 +252,7 @@ class DecisionsByPresence(WindowDecisions):
     def _fitted_presence(self) -> float:
         """Probability that the picture holds the target after the last look, by the prior of the fit."""
         if self._presence is None:
-            self._presence = self._facts.presence(self._fitted_chance)
+            self._presence = self._facts.presence()
         return self._presence
 
     def _hit_chance(self) -> float:
@@ -313,9 +266,15 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     """Decisions of a search by closer looks at the places that seem to hold the target (`semfov.decision.Verifier`)."""
 
     def __init__(
-        self, belief: ZoomBelief, prior: Prior, verifier: Verifier[TargetFacts], places: CandidateBoxes
+        self,
+        belief: ZoomBelief,
+        prior: Prior,
+        verifier: Verifier[TargetFacts],
+        places: CandidateBoxes,
+        *,
+        latest: bool = False,
     ) -> None:
-        super().__init__(belief, verifier.thresholds, prior)
+        super().__init__(belief, verifier.thresholds, prior, latest=latest)
         self.frame = belief.lattice.size
         self.verifier = verifier
         self.places = places  # those of the verifier
@@ -391,6 +350,7 @@ def decisions_of(
         The decisions: by closer looks where their model is fitted, unless the settings ask for none.
     """
     photograph = belief.photograph
+    fades = forgetting is not None and forgetting.rate > 0
     prior = _prior_of(settings.prior, photograph, belief.target)
     if photograph is None:
         fitted = belief.evidence.thresholds
@@ -405,7 +365,7 @@ def decisions_of(
     # Not `confirm` yet, which is about a place where closer looks decide, else about the picture.
     thresholds = (fitted or _DEFAULTS).changed(stop_below=settings.stop_below)
     if not most or verification is None or verification.thresholds is None:
-        return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior)
+        return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior, latest=fades)
     places: CandidateBoxes
     if photograph is None:
         places = CandidateBoxes(belief.target, thresholds.confirm, belief.lattice, forgetting, prior)
@@ -413,7 +373,7 @@ def decisions_of(
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
     thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.stop_below)
     verifier = Verifier(verification, places, thresholds_of_places, most)
-    return DecisionsByCloserLooks(belief, prior, verifier, places)
+    return DecisionsByCloserLooks(belief, prior, verifier, places, latest=fades)
 
 
 def _prior_of(prior: PriorLike, photograph: PhotographEvidence | None, target: int) -> Prior:

@@ -1,11 +1,9 @@
 r"""Learned evidence by magnification: predictions from a look at a window of what closer looks at its parts find.
 
 - `rates` gives λ(x), the expected number of new objects of a class in each cell x, from maps of the hints around it.
-- `anywhere` gives the log odds that the picture holds a class, from the highest score and facts about the search, and
-  `presence` adds those of a photograph.
+- `presence` gives the log odds that the picture holds a class, from the expected number of its objects.
 """
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -28,15 +26,13 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import network
 from semfov.zoom.survey import STEPS, Survey
 
-CASE = 10
-"""Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.decision`)."""
-
 _LARGEST = 1e6
 
-# Inputs and hidden units of the networks λ and j.
+_FEWEST = 0.001  # expected number of objects ε that is added, so that none has a logarithm
+
+# Inputs and hidden units of the network λ.
 _RATE = 14
 _RATE_WIDTH = 32
-_JUDGE_WIDTH = 16
 
 
 class PhotographEvidence(nn.Module):
@@ -117,23 +113,23 @@ _PHOTOGRAPH = Object(
 class GlimpseEvidence(DecidingModule, Pretrained):
     r"""Predicts from a look at a window what looks at its parts find that are one to three octaves closer.
 
-    It answers one question about a part w of the window and a class t, and one about the whole picture. Small networks
-    answer them. They are fitted on mosaics of photographs with annotated boxes.
+    It answers one question about a part w of the window and a class t, and one about the whole picture. It is fitted on
+    mosaics of photographs with annotated boxes.
 
     - How many objects of t does a closer look at w find that were not found before? The expected number is a sum over
       cells. Its weights fall off towards the border of w, which cuts objects that lie there:
 
       .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
 
-    - Does the picture hold t at all, after the looks of a search? The highest score of t in any look, :math:`s^*`, is
-      corrected by further facts about the search, its case c (`semfov.zoom.decision`):
+    - Does the picture hold t at all, after the looks of a search? Its odds grow with the expected number N of its
+      objects: of those that looks show, each with its probability c (`Certainty`), and of those that closer looks would
+      find. They grow with the highest score of t in any look, :math:`s^*`, too, which may be too faint for an object:
 
-      .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
+      .. math:: N = \sum_i c_i + \sum_x \lambda(x), \qquad
+                \operatorname{logit} P(t) = a \operatorname{logit} s^* + b \ln (N + \varepsilon) + c
 
-      With evidence for photographs the odds are the mean of these and of those of a photograph (`presence`).
-
-    Here λ and j are networks. Another network predicts how many objects of any class a look finds (`survey`). Two
-    logistic regressions give the probabilities after a closer look at a place that seems to hold t (`verification`).
+    Here λ is a network. Another network predicts how many objects of any class a look finds (`survey`). Two logistic
+    regressions give the probabilities after a closer look at a place that seems to hold t (`verification`).
 
     Args:
         classes: number of classes of the detector, without background.
@@ -148,7 +144,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         InputError: a setting is outside its range.
 
     >>> evidence = GlimpseEvidence(classes=3)
-    >>> evidence.anywhere(torch.rand(5), torch.rand(5, 10)).shape
+    >>> evidence.presence(torch.rand(5), torch.rand(5)).shape
     torch.Size([5])
     >>> evidence.taper(8).shape
     torch.Size([8])
@@ -160,7 +156,8 @@ class GlimpseEvidence(DecidingModule, Pretrained):
     schema: ClassVar[Schema] = Schema(
         {
             **perceptron("rate", _RATE, _RATE_WIDTH, STEPS),
-            **perceptron("judge", CASE, _JUDGE_WIDTH),
+            "whole.weight": Field((1, 2), low=-1e3, high=1e3),
+            "whole.bias": Field((1,), low=-1e3, high=1e3),
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
             **{f"survey.{name}": field for name, field in Survey.fields().items()},
@@ -198,11 +195,11 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         self.thresholds = thresholds
         self.metadata = dict(metadata or {})
         self.rate = network(_RATE, _RATE_WIDTH, STEPS)
-        self.judge = network(CASE, _JUDGE_WIDTH)
+        self.whole = nn.Linear(2, 1)
         with torch.no_grad():
-            # Until the network is fitted, the best score is the probability.
-            for parameter in self.judge[-1].parameters():
-                parameter.zero_()
+            # Until it is fitted, the highest score is the probability.
+            self.whole.weight.copy_(torch.tensor([[1.0, 0.0]]))
+            self.whole.bias.zero_()
         self.prior = nn.Parameter(torch.zeros(classes + 1, 2))
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
         self.survey = Survey(classes, foresight=foresight)
@@ -245,43 +242,30 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         value = through(self.rate, torch.stack(maps, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
 
-    def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
+    def presence(self, best: Tensor, expected: Tensor) -> Tensor:
         """Predict whether the picture holds a class, after the looks of a search.
 
         Args:
             best: `(...)`, highest score of the class in any look.
-            case: `(..., 10)`, further facts about the search (`semfov.zoom.decision.SearchFacts.case`).
+            expected: `(...)`, expected number of its objects (`semfov.zoom.decision.SearchFacts.expected`).
 
         Returns:
             Log odds, `(...)`.
         """
-        return torch.logit(best, eps=1e-4) + through(self.judge, case)[..., 0]
+        return self.whole(self.presence_facts(best, expected))[..., 0]
 
-    def presence(self, best: Tensor, case: Tensor, whole: Tensor, target: Tensor) -> Tensor:
-        r"""Predict whether a large picture holds a class that it shows small, as a scene, or large, as a photograph.
-
-        Either is as likely before the looks, so that the odds are the mean of both:
-
-        .. math:: \frac{P}{1 - P} = \frac{1}{2} \left( \frac{P_s}{1 - P_s} + \frac{P_l}{1 - P_l} \right)
-
-        :math:`P_s` is that of `anywhere`. :math:`P_l` is that of the look at the whole (`PhotographEvidence.presence`),
-        with a target in half of the searches; without evidence for photographs P is :math:`P_s`.
+    @staticmethod
+    def presence_facts(best: Tensor, expected: Tensor) -> Tensor:
+        """Put together what `presence` is a logistic regression of.
 
         Args:
-            best: `(...)`, highest score of the class in any look.
-            case: `(..., 10)`, further facts about the search.
-            whole: `(...)`, highest score of the class in the look at the whole.
-            target: `(...)`, classes 1..K.
+            best: `(...)`, as for `presence`.
+            expected: `(...)`.
 
         Returns:
-            Log odds, `(...)`.
+            `(..., 2)`.
         """
-        small = self.anywhere(best, case)
-        photograph = self.photograph
-        if photograph is None or photograph.shares is None:
-            return small
-        large = photograph.presence(whole, target) - photograph.shares[target - 1].logit()
-        return torch.logaddexp(small, large) - math.log(2)
+        return torch.stack([best.logit(1e-4), (expected + _FEWEST).log()], -1)
 
     def taper(self, span: int) -> Tensor:
         """Weigh the cells along a side of a window, r; objects at its border are cut.

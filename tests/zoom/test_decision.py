@@ -19,7 +19,7 @@ from semfov.decision import OUTCOMES, settle
 from semfov.detection.objects import unlike
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.windows_certainty import _fit_unseen, _Numbers, explorations_of_kinds, fit_spread
-from semfov.fit.windows_decisions import WindowSearches, fit_judge, judge_searches
+from semfov.fit.windows_decisions import WindowSearches, fit_presence, judge_searches
 from semfov.metrics.calibration import calibration_error
 from semfov.observation.matching import right_boxes
 from semfov.observation.thresholds import Thresholds
@@ -30,12 +30,9 @@ from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import DISPERSION, FACTS, SPREAD, Certainty, number_of
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import find_everything, look_for
-from semfov.zoom.evidence import CASE, PhotographEvidence
-from semfov.zoom.hint_maps import features
-from semfov.zoom.lattice import CELLS
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from semfov.zoom.object_facts import DetectedBoxes, object_facts
-from semfov.zoom.objects import merge, merge_with_facts, without_parts
+from semfov.zoom.objects import merge, merge_with_facts, probable_objects, without_parts
 from tests.refusals import refused
 from tests.small import Tiles, area, iou, shared
 
@@ -67,34 +64,29 @@ def steps(eye, picture, target, most=6):
         return [step for step, _ in zip(steps, range(most), strict=False)]
 
 
-def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
-    """Every feature, computed in another way from the looks."""
-    target, seen = 1, steps(eye, picture, 1)
-    facts = SearchFacts(seen[0].belief)
+def drawn_certainty(seed):
+    """A certainty of objects with weights drawn at random."""
+    offset, *weights = torch.randn(1 + len(FACTS), generator=torch.Generator().manual_seed(seed)).mul(0.3).tolist()
+    return Certainty(offset, tuple(weights))
+
+
+@pytest.mark.parametrize("certainty", [None, drawn_certainty(1)])
+def test_a_search_expects_the_objects_that_an_exploration_lists_and_those_that_looks_would_find(
+    eye, picture, certainty
+):
+    target, seen = 3, steps(eye, picture, 3)
+    belief = seen[0].belief
+    belief.evidence.certainty = certainty
+    facts = SearchFacts(belief)
     for step in seen:
         facts.add(step.look)
-    scores = [float(step.look.show[target - 1]) for step in seen]
-    closest = [s for s, step in zip(scores, seen, strict=True) if step.look.gist is None]
-    named = [
-        float(d.scores[0, n, target])
-        for d in (step.look.detections for step in seen)
-        for n in range(d.scores.shape[1])
-        if int(d.scores[0, n].argmax()) == target
-    ]
-    ordered = sorted(scores, reverse=True)
-    case = facts.case(0.25)
-    raw = torch.tensor([ordered[0], ordered[1], max([0.0, *closest]), scores[0], max([0.0, *named]), 0.25])
-    torch.testing.assert_close(case[:6], features(raw))
-    belief = seen[0].belief
-    finds = belief.value(belief.lattice.levels - 1, 0.0)
-    laid = [finds[row::CELLS, column::CELLS].sum() for row in range(CELLS) for column in range(CELLS)]
-    assert case[6] == pytest.approx(math.log(sum(laid) / len(laid) + 1e-3) / 4)
-    assert case[7] == pytest.approx(float(belief.unexplored.mean()))
-    assert case[8] == pytest.approx(math.log(1 + sum(score >= 0.1 for score in scores)) / 2)
-    assert case[9] == pytest.approx(math.log(len(seen)) / 2)
-    assert case.shape == (CASE,)
-    boxes = torch.cat([step.look.detections.boxes[0] for step in seen])
-    confidence = torch.cat([step.look.detections.scores[0, :, target] for step in seen])
+    looks = [step.look for step in seen]
+    listed, _ = probable_objects(looks, belief.lattice, target, certainty or Certainty.of([0.0, 1.0]))
+    levels = torch.stack([torch.from_numpy(belief.expected(level)) for level in range(1, belief.lattice.levels)])
+    assert len(listed)
+    assert facts.expected() == pytest.approx(float(listed.scores.sum() + levels.amax(0).sum()), rel=1e-5)
+    boxes = torch.cat([look.detections.boxes[0] for look in looks])
+    confidence = torch.cat([look.detections.scores[0, :, target] for look in looks])
     assert facts.box.tolist() == boxes[confidence.argmax()].tolist()
 
 
@@ -103,24 +95,18 @@ def test_before_fitting_the_probability_is_the_best_score(eye, picture):
     facts = SearchFacts(seen[0].belief)
     for step in seen:
         facts.add(step.look)
-        assert facts.presence(step.next_value) == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
+        assert facts.presence() == pytest.approx(min(max(facts.best, 1e-4), 1 - 1e-4), abs=1e-5)
 
 
-@pytest.mark.parametrize("share", [0.5, 0.02])
-def test_a_large_picture_may_be_a_photograph(share):
-    """The odds are the mean of those of a scene and of those of a photograph, with a target in half of them."""
-    model = GlimpseEvidence(3).eval()
-    torch.nn.init.normal_(model.judge[-1].weight)
-    best, whole, target = torch.rand(50), torch.rand(50), torch.randint(1, 4, (50,))
-    case = torch.randn(50, CASE)
-    small = model.anywhere(best, case)
-    assert torch.equal(model.presence(best, case, whole, target), small)
-    model.photograph = PhotographEvidence(3, shares=torch.full((3,), share))
-    torch.nn.init.normal_(model.photograph.whole.weight)
-    p = model.presence(best, case, whole, target).sigmoid().double()
-    large = model.photograph.presence(whole, target).double().exp() * (1 - share) / share
-    expected = (small.double().exp() + large) / 2
-    assert torch.allclose(p / (1 - p), expected, rtol=1e-3)
+@given(st.floats(1e-3, 0.999), st.floats(0, 100), st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3))
+def test_odds_of_presence_are_powers_of_those_of_the_score_and_of_the_number(score, number, a, b, c):
+    model = GlimpseEvidence(3).double()
+    with torch.no_grad():
+        model.whole.weight.copy_(torch.tensor([[a, b]]))
+        model.whole.bias.fill_(c)
+    odds = math.exp(c) * (score / (1 - score)) ** a * (number + 0.01) ** b
+    values = torch.tensor([score, number], dtype=torch.float64)
+    assert float(model.presence(*values).detach()) == pytest.approx(math.log(odds), abs=1e-5)
 
 
 def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
@@ -140,13 +126,13 @@ def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
 
 
 def synthetic(count, seed):
-    """Random searches; the probability that the target is present follows from their features."""
+    """Random searches; the probability that the target is present follows from the best score and the number."""
     generator = torch.Generator().manual_seed(seed)
-    case = torch.randn(count, 1, CASE, generator=generator)
     best = torch.rand(count, 1, generator=generator)
-    odds = torch.logit(best, eps=1e-4) + 2 * case[..., 2] - case[..., 6] - 1
+    expected = torch.randn(count, 1, generator=generator).exp()
+    odds = 0.5 * torch.logit(best, eps=1e-4) + 2 * (expected + 0.01).log() - 1
     there = torch.rand(count, generator=generator) < odds[:, 0].sigmoid()
-    return WindowSearches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
+    return WindowSearches(best, expected, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
 
 
 @pytest.mark.parametrize("target", [1, 2, 3])
@@ -161,7 +147,7 @@ def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm
         for step in look_for(source, evidence, target):
             facts = facts or SearchFacts(step.belief)
             facts.add(step.look)
-            presence, passes = facts.presence(step.next_value), passes + 1
+            presence, passes = facts.presence(), passes + 1
             state = torch.tensor([presence]), torch.tensor([facts.detected]), torch.tensor([step.next_value])
             ended = int(settle(*state, thresholds))
             if ended or passes == most:
@@ -178,10 +164,10 @@ def test_a_fitted_probability_is_calibrated():
     torch.manual_seed(0)
     model = GlimpseEvidence(3)
     known, _ = synthetic(4000, 1)
-    fit_judge(model, known, steps=250)
+    fit_presence(model, known)
     new, odds = synthetic(4000, 2)
     with torch.no_grad():
-        log_odds = model.anywhere(new.best, new.case)[:, 0]
+        log_odds = model.presence(new.best, new.expected)[:, 0]
     best = F.binary_cross_entropy_with_logits(odds, new.there.float())
     loss = F.binary_cross_entropy_with_logits(log_odds, new.there.float())
     raw = F.binary_cross_entropy(new.best[:, 0], new.there.float())

@@ -5,7 +5,6 @@ import torch
 from semfov.agents import ZoomAgent
 from semfov.settings import ExploreSettings
 from semfov.zoom import GlimpseEvidence, WindowEye
-from semfov.zoom.evidence import CASE
 from tests.base_tester import BaseTester, TensorTester
 from tests.small import Blobs, rand
 
@@ -19,11 +18,11 @@ class TestGlimpseEvidence(TensorTester):
         return GlimpseEvidence(3).eval()
 
     def inputs(self):
-        return rand(5), rand(5, CASE)
+        return rand(5), rand(5)
 
     @staticmethod
-    def call(module, best, case):
-        return module.anywhere(best, case)
+    def call(module, best, expected):
+        return module.presence(best, expected)
 
 
 class TestWindowEye(BaseTester):
