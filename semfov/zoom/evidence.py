@@ -125,7 +125,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
       objects: of those that looks show, each with its probability c (`Certainty`), and of those that closer looks would
       find. They grow with the highest score of t in any look, :math:`s^*`, too, which may be too faint for an object:
 
-      .. math:: N = \sum_i c_i + \sum_x \lambda(x), \qquad
+      .. math:: N = \sum_i c_i + E[n], \qquad
                 \operatorname{logit} P(t) = a \operatorname{logit} s^* + b \ln (N + \varepsilon) + c
 
     Here λ is a network. Another network predicts how many objects of any class a look finds (`survey`). Two logistic

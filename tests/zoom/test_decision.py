@@ -67,7 +67,7 @@ def steps(eye, picture, target, most=6):
 def drawn_certainty(seed):
     """A certainty of objects with weights drawn at random."""
     offset, *weights = torch.randn(1 + len(FACTS), generator=torch.Generator().manual_seed(seed)).mul(0.3).tolist()
-    return Certainty(offset, tuple(weights))
+    return Certainty(offset, tuple(weights), scale=0.5, strength=4.0, faint=0.25)
 
 
 @pytest.mark.parametrize("certainty", [None, drawn_certainty(1)])
@@ -82,9 +82,15 @@ def test_a_search_expects_the_objects_that_an_exploration_lists_and_those_that_l
         facts.add(step.look)
     looks = [step.look for step in seen]
     listed, _ = probable_objects(looks, belief.lattice, target, certainty or Certainty.of([0.0, 1.0]))
-    levels = torch.stack([torch.from_numpy(belief.expected(level)) for level in range(1, belief.lattice.levels)])
+    unseen = 0.0
+    if certainty is not None:
+        levels = torch.stack([torch.from_numpy(belief.expected(level)) for level in range(1, belief.lattice.levels)])
+        of_cells = levels.amax(0)
+        is_clear = of_cells >= 0.1
+        unseen = 0.5 * float((of_cells * torch.where(is_clear, 1.0, 0.25)).sum())
+        assert unseen > 0
     assert len(listed)
-    assert facts.expected() == pytest.approx(float(listed.scores.sum() + levels.amax(0).sum()), rel=1e-5)
+    assert facts.expected() == pytest.approx(float(listed.scores.sum()) + unseen, rel=1e-5)
     boxes = torch.cat([look.detections.boxes[0] for look in looks])
     confidence = torch.cat([look.detections.scores[0, :, target] for look in looks])
     assert facts.box.tolist() == boxes[confidence.argmax()].tolist()
@@ -104,7 +110,7 @@ def test_odds_of_presence_are_powers_of_those_of_the_score_and_of_the_number(sco
     with torch.no_grad():
         model.whole.weight.copy_(torch.tensor([[a, b]]))
         model.whole.bias.fill_(c)
-    odds = math.exp(c) * (score / (1 - score)) ** a * (number + 0.01) ** b
+    odds = math.exp(c) * (score / (1 - score)) ** a * (number + 0.001) ** b
     values = torch.tensor([score, number], dtype=torch.float64)
     assert float(model.presence(*values).detach()) == pytest.approx(math.log(odds), abs=1e-5)
 
