@@ -196,20 +196,17 @@ class WindowSession:
         if self.forgetting is not None:
             oldest = self.source.time - self.forgetting.span
             self._closer_looks = [look for look in self._closer_looks if look.time >= oldest]
-        self.decisions.see(step, self.passes, self.limits.room(self.passes))
+        self.decisions.see(step, self.kept_looks, self.passes, self.limits.room(self.passes))
         return step.newest
 
-    def _look_closely(self, candidate: CandidatePlace) -> KeptLook | None:
-        """Spend a pass on a closer look at the candidate, unless an earlier look shows it as closely."""
-        detections = self.decisions.shown
-        if detections is None:
-            original = look_closely(self.source, candidate.box, self._close_window)
-            look = KeptLook(original, self.source.time, candidate.probability)
-            self._number(look)
-            self._closer_looks.append(look)
-            detections = original.candidates
-        self.decisions.examine(detections)
-        return self.newest
+    def _look_closely(self, candidate: CandidatePlace) -> KeptLook:
+        """Spend a pass on a closer look at the candidate."""
+        original = look_closely(self.source, candidate.box, self._close_window)
+        look = KeptLook(original, self.source.time, candidate.probability)
+        self._number(look)
+        self._closer_looks.append(look)
+        self.decisions.examine(original)
+        return look
 
     def _number(self, look: KeptLook) -> None:
         """Give the newest look the number of its pass and the time at its end."""
@@ -226,7 +223,7 @@ class WindowSession:
             self.step.choose_anew()  # a closer look is due in this frame, and the choice is for one after it
         carry = partial(carry_along, lattice=self.source.lattice)
         self._closer_looks = self._lost_looks.follow(self._closer_looks, camera, carry)
-        self.decisions.follow(camera)
+        self.decisions.follow(camera, self.kept_looks)
 
     @property
     def next_window(self) -> Window:

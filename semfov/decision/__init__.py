@@ -99,7 +99,7 @@ from semfov.decision.rule import (
     place_known,
     settle,
 )
-from semfov.decision.verifier import MOST_CLOSER, Verifier
+from semfov.decision.verifier import MOST_CLOSER, Judgement, PlaceVerifier, Verifier
 
 __all__ = [
     "ABSENT",
@@ -113,7 +113,9 @@ __all__ = [
     "CandidatePlaces",
     "CloseUp",
     "Decision",
+    "Judgement",
     "Outcome",
+    "PlaceVerifier",
     "Verifier",
     "cell_of",
     "check_thresholds",

@@ -176,14 +176,14 @@ class CandidatePlaces(ABC, Generic[LookType]):
             fitted(self.presence),
             fitted.at_place(candidate.probability, self.presence),
             candidate.evidence,
-            self._telling(candidate, detections),
+            self.telling(candidate, detections),
             candidate.box,
             self.target,
         )
         self.dismiss(candidate, box)
         return features, box
 
-    def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
+    def telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
         """Count the closer look, and choose which of its detections tell of the candidate."""
         self._index = self._next
         self._next += 1

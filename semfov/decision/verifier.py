@@ -1,6 +1,7 @@
 """Verification of the target by closer looks, before a search decides."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -40,8 +41,16 @@ class _JudgedPlace(NamedTuple):
     probability: float
 
 
-class Verifier(Generic[LookType]):
-    r"""Decides one search by looks, and by closer looks at the places that seem to hold the target.
+class Judgement(NamedTuple):
+    """What a closer look says: probabilities that the target is at the place and in the picture, and its box `(4,)`."""
+
+    place: float
+    presence: float
+    box: torch.Tensor
+
+
+class PlaceVerifier(ABC, Generic[LookType]):
+    r"""Base of what decides one search by looks, and by closer looks at the places that seem to hold the target.
 
     It makes no look itself. After each one (`see`) it names the place that is to be looked at closely (`candidate`),
     the most evident one, if it is probable enough, and is told what a closer look shows (`examine`). The search ends at
@@ -68,18 +77,8 @@ class Verifier(Generic[LookType]):
         candidate: the place that is to be looked at closely now; None if there is none, and before the first look.
     """
 
-    def __init__(
-        self,
-        model: Verification,
-        places: CandidatePlaces[LookType],
-        thresholds: Thresholds | None = None,
-        most: int = MOST_CLOSER,
-    ) -> None:
-        thresholds = model.thresholds if thresholds is None else thresholds
-        check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
-        assert thresholds is not None
+    def __init__(self, places: CandidatePlaces[LookType], thresholds: Thresholds, most: int = MOST_CLOSER) -> None:
         check_whole(most, "most", 1, 100)
-        self.model = model
         self.places = places
         self.thresholds = thresholds
         self.most = most
@@ -166,12 +165,8 @@ class Verifier(Generic[LookType]):
         """
         candidate = self.candidate
         assert candidate is not None
-        features, box = self.places.examine(candidate, detections)
-        place, presence = self._verified(features)
-        # The look that told of the picture before would count twice.
-        if self.places.shows_nothing_new(candidate):
-            presence = self.places.presence
-        look = self.places.record(box, place, presence)
+        judgement = self._judge(candidate, detections)
+        look = self.places.record(judgement.box, judgement.place, judgement.presence)
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [verdict for verdict in self.verdicts if not self._is_replaced(verdict, look)]
         self.verdicts.append(_Verdict(look))
@@ -179,12 +174,9 @@ class Verifier(Generic[LookType]):
         self._choose()
         return look
 
-    @torch.no_grad()
-    def _verified(self, features: torch.Tensor) -> tuple[float, float]:
-        """Compute the probabilities of the place and of the picture after a closer look with features `(7,)`."""
-        fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
-        prior = self.places.prior
-        return prior.at_place(fitted_place, fitted_presence), prior(fitted_presence)
+    @abstractmethod
+    def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:
+        """Judge a candidate by what a look shows closely, with the prior of the places, and dismiss it."""
 
     def look_closely(self, close_up: LookAt, room: float = math.inf) -> list[CandidatePlace]:
         """Make all closer looks that are due.
@@ -331,6 +323,37 @@ class Verifier(Generic[LookType]):
             return fresh
         logit = weight * _log_odds(fresh) + (1 - weight) * _log_odds(without)
         return 1 / (1 + math.exp(-logit))
+
+
+class Verifier(PlaceVerifier[LookType]):
+    """Decides one search by closer looks, which a fitted model of verification judges.
+
+    Attributes:
+        model: the model.
+    """
+
+    def __init__(
+        self,
+        model: Verification,
+        places: CandidatePlaces[LookType],
+        thresholds: Thresholds | None = None,
+        most: int = MOST_CLOSER,
+    ) -> None:
+        thresholds = model.thresholds if thresholds is None else thresholds
+        check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
+        assert thresholds is not None
+        super().__init__(places, thresholds, most)
+        self.model = model
+
+    @torch.no_grad()
+    def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:
+        features, box = self.places.examine(candidate, detections)
+        fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
+        prior = self.places.prior
+        place = prior.at_place(fitted_place, fitted_presence)
+        # The look that told of the picture before would count twice.
+        is_new = not self.places.shows_nothing_new(candidate)
+        return Judgement(place, prior(fitted_presence) if is_new else self.places.presence, box)
 
 
 def _moved_verdicts(verdicts: list[_Verdict], motion: Motion, size: tuple[int, int]) -> list[_Verdict]:

@@ -126,8 +126,8 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). In a stream scores fade, and
     places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
 
-    An object that fills the picture needs no closer look. Its place is verified, and the picture keeps its P, as the
-    same look says nothing new of it.
+    An object that fills the picture needs no closer look. Its place is judged, and the picture keeps its P, as the same
+    look says nothing new of it.
 
     Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
     that of the whole, unless other frames or a motion of the camera have followed. `_scored` has the boxes of the
@@ -203,11 +203,11 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
             return Window.overview(self._lattice)
         return window
 
-    def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
+    def telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
         """Count the look, unless the look at the whole shows the place as closely."""
         shown = self._shown.get(self._showing(candidate))
         if shown is None:
-            return super()._telling(candidate, detections)
+            return super().telling(candidate, detections)
         self._index = shown.number
         return detections
 
@@ -340,11 +340,11 @@ class PhotographPlaces(CandidateBoxes):
         place = self._most_evident
         return None if place is None or self._hit_chance_at(place) < thresholds.stop_below else place
 
-    def _telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
+    def telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
         """Count the look, unless its window was looked at before; objects that were examined are left out."""
         window = self._showing(candidate)
         if window not in self._shown:
-            super()._telling(candidate, detections)
+            super().telling(candidate, detections)
             self._shown[window] = _ShownWindow(self._next - 1, detections)
         self._index = self._shown[window].number
         others = detections.mask & ~self._are_examined(detections.boxes[0])

@@ -7,19 +7,31 @@ import torch
 from torch import Tensor
 
 from semfov.belief.prior import Prior, PriorLike
-from semfov.decision import FOUND, GO_ON, OUTCOMES, CandidatePlace, CloseUp, Decision, Verifier, settle
+from semfov.decision import (
+    FOUND,
+    GO_ON,
+    OUTCOMES,
+    CandidatePlace,
+    CloseUp,
+    Decision,
+    Judgement,
+    PlaceVerifier,
+    Verifier,
+    settle,
+)
 from semfov.decision.state import DecisionState
 from semfov.detection.detections import Detections
+from semfov.detection.objects import Objects
 from semfov.episode import Forgetting
 from semfov.motion import CameraStep
-from semfov.observation.matching import inside_frame
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.presence import EVEN
 from semfov.observation.thresholds import Thresholds
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.certainty import BY_SCORE
+from semfov.zoom.certainty import BY_SCORE, Certainty
 from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, CandidateBoxes, PhotographPlaces, TargetFacts
-from semfov.zoom.episode import WindowStep
+from semfov.zoom.episode import KeptLook, WindowStep
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.looks import WindowLook
@@ -54,6 +66,7 @@ class SearchFacts:
         detected: whether a detection shows the target.
 
     Invariant: `best`, `box` and `detected` sum up `looks`, of which there is at least one after `see` and `add`.
+    `_objects` are those of `looks`, or None; what changes these clears it.
     """
 
     def __init__(self, belief: ZoomBelief, *, latest: bool = False) -> None:
@@ -63,6 +76,7 @@ class SearchFacts:
         self.best = 0.0
         self.box: Tensor | None = None
         self.detected = False
+        self._objects: tuple[Objects, Tensor] | None = None  # once they were asked for
 
     def see(self, looks: Sequence[WindowLook]) -> None:
         """Take the looks that count now; those that were carried along are others, and show what is in view."""
@@ -82,6 +96,7 @@ class SearchFacts:
         surest = max(self.looks, key=lambda facts: facts.found)
         self.box = surest.box if surest.found > 0 else None
         self.detected = surest.found >= DETECTION_SCORE
+        self._objects = None
 
     def _facts_of(self, look: WindowLook) -> _LookFacts:
         """Read from a look what it shows of the target."""
@@ -93,15 +108,25 @@ class SearchFacts:
         best = int(scores.argmax())
         return _LookFacts(look, score, float(scores[best]), look.detections.boxes[0, best])
 
+    @property
+    def _certainty(self) -> Certainty:
+        return self.belief.evidence.certainty_in(self.belief.lattice) or BY_SCORE
+
     @torch.no_grad()
+    def objects(self) -> tuple[Objects, Tensor]:
+        """List the objects of the target that looks show, with the probability `(M,)` that each is there."""
+        if self._objects is None:
+            looks = [facts.look for facts in self.looks]
+            belief = self.belief
+            objects, facts = merge_with_facts(looks, belief.lattice, belief.target, latest=self.latest)
+            self._objects = objects, self._certainty.probability(facts)
+        return self._objects
+
     def expected(self) -> float:
         """Estimate how many objects of the target there are: those that looks show, and those that looks would find."""
-        belief = self.belief
-        looks = [facts.look for facts in self.looks]
-        _, facts = merge_with_facts(looks, belief.lattice, belief.target, latest=self.latest)
-        certainty = belief.evidence.certainty_in(belief.lattice) or BY_SCORE
-        unseen, _ = certainty.unseen(belief.remaining(), promised=0.0, discoveries=0.0)
-        return float(certainty.probability(facts).sum()) + unseen
+        _, chances = self.objects()
+        unseen, _ = self._certainty.unseen(self.belief.remaining(), promised=0.0, discoveries=0.0)
+        return float(chances.sum()) + unseen
 
     @torch.no_grad()
     def presence(self) -> float:
@@ -111,6 +136,43 @@ class SearchFacts:
         if photograph is not None:
             return float(photograph.presence(best, torch.tensor(self.belief.target)).sigmoid())
         return float(self.belief.evidence.presence(best, torch.tensor(self.expected())).sigmoid())
+
+
+_NOTHING = 1e-3  # probability of a place where looks show no object of the target
+
+
+class ObjectVerifier(PlaceVerifier[TargetFacts]):
+    """Decides a search of a large picture: a place is as probable as the object of the target there.
+
+    A closer look is one more look at the picture, which `facts` have before it is judged (`SearchFacts.add`). The place
+    has the probability of the surest object whose box overlaps that of the candidate, and its box. The probability of
+    the picture is that after all looks, and no smaller than that of the place.
+
+    Attributes:
+        facts: what the looks of the search have shown.
+    """
+
+    def __init__(self, facts: SearchFacts, places: CandidateBoxes, thresholds: Thresholds, most: int) -> None:
+        super().__init__(places, thresholds, most)
+        self.facts = facts
+
+    def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:
+        self.places.telling(candidate, detections)
+        place, box = self._object_at(candidate.box)
+        presence = max(self.facts.presence(), place)
+        self.places.dismiss(candidate, box)
+        prior = self.places.prior
+        return Judgement(prior.at_place(place, presence), prior(presence), box)
+
+    def _object_at(self, box: Tensor) -> tuple[float, Tensor]:
+        """Find the surest object at a box `(4,)`: its probability and its box; `_NOTHING` and the same box for none."""
+        objects, chances = self.facts.objects()
+        overlaps = box_iou(objects.boxes, box[None].to(objects.boxes))[:, 0]
+        chances_there = chances * (overlaps >= SAME_OBJECT_IOU)
+        if not bool((chances_there > 0).any()):
+            return _NOTHING, box
+        surest = int(chances_there.argmax())
+        return float(chances_there[surest]), objects.boxes[surest]
 
 
 CLOSER = 100  # largest number of closer looks in a large picture: as many as there are passes for
@@ -129,11 +191,12 @@ class WindowDecisions(DecisionState):
     ending: Literal["decision", "detection"] = "decision"
     prior = Prior(known=False)
 
-    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
+    def see(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook], number: int, room: float) -> None:
         """Take in a step, and choose the place that is to be looked at closely.
 
         Args:
             step: the step.
+            kept: the looks that count and show some of the present frame, closer looks included.
             number: number of looks up to it, closer looks included.
             room: number of passes that remain.
         """
@@ -142,19 +205,19 @@ class WindowDecisions(DecisionState):
         """Make the decision of a search that ends as it is, also if a closer look is due."""
         return self.decision
 
-    @property
-    def shown(self) -> Detections | None:
-        """What an earlier look shows of the candidate as closely; None where that takes a pass, and without one."""
-        return None
-
-    def examine(self, detections: Detections) -> None:
-        """Judge the candidate by what a look shows closely, a batch of one, and choose the next one."""
+    def examine(self, look: WindowLook) -> None:
+        """Judge the candidate by a closer look, and choose the next one."""
 
     def wait(self, passed: float) -> None:
         """Let seconds pass. In a stream, call it before every frame."""
 
-    def follow(self, camera: CameraStep) -> None:
-        """Carry examined places along with the camera, or set them aside where a frame fits none before."""
+    def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
+        """Carry examined places along with the camera, or set them aside where a frame fits none before.
+
+        Args:
+            camera: how the camera moved.
+            kept: the looks that count and show some of the next frame, closer looks included.
+        """
 
 
 class DecisionsByScore(WindowDecisions):
@@ -168,7 +231,7 @@ class DecisionsByScore(WindowDecisions):
         self._decision: Decision | None = None
         self.criterion = f"a detection scores {self._confirm:g}"
 
-    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
+    def see(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook], number: int, room: float) -> None:
         score, box = self._best(step.looks)
         if score >= self._confirm:
             self.outcome = FOUND
@@ -202,25 +265,29 @@ class DecisionsByPresence(WindowDecisions):
     Invariant: `_presence` is that of the present `_facts`, or None; what changes these clears it.
     """
 
-    def __init__(self, belief: ZoomBelief, thresholds: Thresholds, prior: Prior, *, latest: bool = False) -> None:
+    def __init__(self, facts: SearchFacts, thresholds: Thresholds, prior: Prior) -> None:
         self.thresholds = thresholds
         self.prior = prior
         self.criterion = f"p is {thresholds.confirm:g} and a detection shows the target"
-        self._facts = SearchFacts(belief, latest=latest)
-        self._is_large = belief.photograph is None
+        self._facts = facts
+        self._is_large = facts.belief.photograph is None
         self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
         self._presence: float | None = None  # that after the last look, once it was asked for
         self._step: WindowStep[ZoomBelief | None] | None = None  # the last one
 
-    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
+    def see(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook], number: int, room: float) -> None:
         self._step = step
-        self._facts.see(step.looks)
+        self._facts.see(self._telling(step, kept))
         self._fitted_chance = step.next_value
         self._presence = None
         self.outcome = GO_ON
         if not self._goes_on():
             # With one pass left no other look follows a closer one, so that less probable places are due, too.
             self._judge(step, number, last=step.next_value == 0 or room <= 1)
+
+    def _telling(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook]) -> list[WindowLook]:
+        """List the looks that tell of the picture; a closer look at a photograph tells of its place alone."""
+        return [look.current for look in kept] if self._is_large else step.looks
 
     def _goes_on(self) -> bool:
         """Whether the search goes on, whatever the presence is: nothing was found, and a look is worth a pass."""
@@ -243,8 +310,8 @@ class DecisionsByPresence(WindowDecisions):
         box = self._facts.box if outcome == "found" else None
         return Decision(outcome, self.prior(self._fitted_presence()), None, box, confirm=self.thresholds.confirm)
 
-    def follow(self, camera: CameraStep) -> None:
-        looks = () if camera.motion is None or self._step is None else self._step.looks
+    def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
+        looks = [] if camera.motion is None or self._step is None else self._telling(self._step, kept)
         if looks:
             self._facts.see(looks)
             self._presence = None
@@ -263,27 +330,21 @@ class DecisionsByPresence(WindowDecisions):
 
 
 class DecisionsByCloserLooks(DecisionsByPresence):
-    """Decisions of a search by closer looks at the places that seem to hold the target (`semfov.decision.Verifier`)."""
+    """Decisions of a search by closer looks at the places that seem to hold the target: by certainty, or verified."""
 
     def __init__(
-        self,
-        belief: ZoomBelief,
-        prior: Prior,
-        verifier: Verifier[TargetFacts],
-        places: CandidateBoxes,
-        *,
-        latest: bool = False,
+        self, facts: SearchFacts, prior: Prior, verifier: PlaceVerifier[TargetFacts], places: CandidateBoxes
     ) -> None:
-        super().__init__(belief, verifier.thresholds, prior, latest=latest)
-        self.frame = belief.lattice.size
+        super().__init__(facts, verifier.thresholds, prior)
+        self.frame = facts.belief.lattice.size
         self.verifier = verifier
         self.places = places  # those of the verifier
         self.criterion = verifier.criterion
 
-    def see(self, step: WindowStep[ZoomBelief | None], number: int, room: float) -> None:
+    def see(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook], number: int, room: float) -> None:
         if step.look.window.is_overview:
             self.places.keep_whole(number - 1, step.look.candidates)
-        super().see(step, number, room)
+        super().see(step, kept, number, room)
 
     def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""
@@ -300,17 +361,16 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def looks(self) -> list[CloseUp]:
         return self.verifier.looks
 
-    @property
-    def shown(self) -> Detections | None:
-        return self.verifier.shown
-
-    def examine(self, detections: Detections) -> None:
-        self.verifier.examine(detections)
+    def examine(self, look: WindowLook) -> None:
+        if self._is_large:
+            self._facts.add(look)
+            self._presence = None
+        self.verifier.examine(look.candidates)
         self._examine_shown()
 
     def _examine_shown(self) -> None:
         """Examine the places that need no pass, and decide."""
-        while (shown := self.shown) is not None:
+        while (shown := self.verifier.shown) is not None:
             self.verifier.examine(shown)
         self.outcome = self.verifier.outcome()
 
@@ -324,14 +384,14 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def wait(self, passed: float) -> None:
         self.verifier.wait(passed)
 
-    def follow(self, camera: CameraStep) -> None:
+    def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
         self.verifier.follow(camera, self.frame)
         candidate = self.candidate
         if candidate is not None and not bool(inside_frame(candidate.box, self.frame)):
             self.verifier.candidate = None  # a closer look would show another place
         if self.candidate is None:
             return  # the look that follows has facts of its own
-        super().follow(camera)
+        super().follow(camera, kept)
         if self._facts.looks:
             self.verifier.places.presence = self.prior(self._fitted_presence())
 
@@ -347,33 +407,35 @@ def decisions_of(
         forgetting: how evidence fades in a stream.
 
     Returns:
-        The decisions: by closer looks where their model is fitted, unless the settings ask for none.
+        The decisions: by closer looks where their thresholds are fitted, unless the settings ask for none.
     """
     photograph = belief.photograph
     fades = forgetting is not None and forgetting.rate > 0
     prior = _prior_of(settings.prior, photograph, belief.target)
+    facts = SearchFacts(belief, latest=fades)
     if photograph is None:
         fitted = belief.evidence.thresholds
-        verification = belief.evidence.verification
+        of_places = belief.evidence.places
         most = CLOSER
     else:
-        fitted = photograph.verification.thresholds
-        verification = photograph.verification
+        fitted = of_places = photograph.verification.thresholds
         most = MOST_IN_PHOTOGRAPH
     if settings.closer is not None:
         most = settings.closer
     # Not `confirm` yet, which is about a place where closer looks decide, else about the picture.
     thresholds = (fitted or _DEFAULTS).changed(stop_below=settings.stop_below)
-    if not most or verification is None or verification.thresholds is None:
-        return DecisionsByPresence(belief, thresholds.changed(settings.confirm), prior, latest=fades)
+    if not most or of_places is None:
+        return DecisionsByPresence(facts, thresholds.changed(settings.confirm), prior)
+    of_places = of_places.changed(settings.confirm, thresholds.stop_below)
     places: CandidateBoxes
+    verifier: PlaceVerifier[TargetFacts]
     if photograph is None:
         places = CandidateBoxes(belief.target, thresholds.confirm, belief.lattice, forgetting, prior)
+        verifier = ObjectVerifier(facts, places, of_places, most)
     else:
         places = PhotographPlaces(belief.target, belief.lattice, forgetting, photograph.window, prior)
-    thresholds_of_places = verification.thresholds.changed(settings.confirm, thresholds.stop_below)
-    verifier = Verifier(verification, places, thresholds_of_places, most)
-    return DecisionsByCloserLooks(belief, prior, verifier, places, latest=fades)
+        verifier = Verifier(photograph.verification, places, of_places, most)
+    return DecisionsByCloserLooks(facts, prior, verifier, places)
 
 
 def _prior_of(prior: PriorLike, photograph: PhotographEvidence | None, target: int) -> Prior:

@@ -85,18 +85,19 @@ class PhotographEvidence(nn.Module):
     @staticmethod
     def shapes() -> dict[str, tuple[int | str, ...]]:
         """Shapes of the tensors of a fitted one in the file of a model, by name."""
-        return {"usual": ("K",), "whole.weight": (1, 2), "whole.bias": (1,), **_VERIFICATION_SHAPES}
+        return {
+            "usual": ("K",),
+            "whole.weight": (1, 2),
+            "whole.bias": (1,),
+            "verification.linear.weight": (2, CLOSER_FEATURES),
+            "verification.linear.bias": (2,),
+        }
 
 
-_VERIFICATION_SHAPES: dict[str, tuple[int | str, ...]] = {
-    "verification.linear.weight": (2, CLOSER_FEATURES),
-    "verification.linear.bias": (2,),
-}
-
-
-def _optional_fields(shapes: Mapping[str, tuple[int | str, ...]], prefix: str = "") -> dict[str, Field]:
-    """List the requirements of tensors that are there where their part was fitted."""
-    return {f"{prefix}{name}": Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in shapes.items()}
+def _fields_of_photographs() -> dict[str, Field]:
+    """List the requirements of the tensors of evidence for photographs, which are there where it was fitted."""
+    shapes = PhotographEvidence.shapes()
+    return {f"photograph.{name}": Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in shapes.items()}
 
 
 _CERTAINTY = Maybe(Array(Number(low=-_LARGEST, high=_LARGEST)))
@@ -128,14 +129,14 @@ class GlimpseEvidence(DecidingModule, Pretrained):
       .. math:: N = \sum_i c_i + E[n], \qquad
                 \operatorname{logit} P(t) = a \operatorname{logit} s^* + b \ln (N + \varepsilon) + c
 
-    Here λ is a network. Another network predicts how many objects of any class a look finds (`survey`). Two logistic
-    regressions give the probabilities after a closer look at a place that seems to hold t (`verification`).
+    Here λ is a network. Another network predicts how many objects of any class a look finds (`survey`). A closer look
+    at a place that seems to hold t is one more look: the place is as probable as the object there.
 
     Args:
         classes: number of classes of the detector, without background.
         foresight: share of what still closer looks would find in a window that counts towards its value.
         thresholds: thresholds at which searches decide; None where none were chosen.
-        verification: probabilities after closer looks; None decides searches without them.
+        places: thresholds of places after closer looks; None decides searches without them.
         certainty: probability that an object is there; None where it was not fitted.
         photograph: evidence for photographs; None where it was not fitted.
         metadata: JSON values kept with the model.
@@ -161,8 +162,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
             **{f"survey.{name}": field for name, field in Survey.fields().items()},
-            **_optional_fields(_VERIFICATION_SHAPES),
-            **_optional_fields(PhotographEvidence.shapes(), "photograph."),
+            **_fields_of_photographs(),
             "photograph.shares": SHARES,
         },
         {
@@ -170,7 +170,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
             "survey": Object({"foresight": Number(0, 1)}),
-            "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
+            "places": THRESHOLDS,
             "certainty": _CERTAINTY,
             "photograph": Maybe(_PHOTOGRAPH),
         },
@@ -182,7 +182,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         *,
         foresight: float = 0.35,
         thresholds: Thresholds | None = None,
-        verification: Verification | None = None,
+        places: Thresholds | None = None,
         certainty: Certainty | None = None,
         photograph: PhotographEvidence | None = None,
         metadata: Mapping[str, Any] | None = None,
@@ -203,7 +203,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         self.prior = nn.Parameter(torch.zeros(classes + 1, 2))
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
         self.survey = Survey(classes, foresight=foresight)
-        self.verification = verification
+        self.places = places
         self.certainty = certainty
         self.photograph = photograph
 
@@ -302,20 +302,26 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         """Whether windows that reach beyond the picture filled the canvas in the fit (`WindowEye`)."""
         return bool(self.metadata.get("sensor", {}).get("stretch", False))
 
+    def _fitted_values(self) -> dict[str, object]:
+        return {**super()._fitted_values(), "places": thresholds_record(self.places)}
+
+    def _load_fitted_values(self, values: Mapping[str, Any]) -> None:
+        super()._load_fitted_values(values)
+        self.places = thresholds_of(values.get("places"))
+
     def _record(self) -> dict[str, Any]:
         return {
             "classes": self.classes,
             "foresight": self.foresight,
             "thresholds": thresholds_record(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
-            "verification": _verification_record(self.verification),
+            "places": thresholds_record(self.places),
             "certainty": _certainty_record(self.certainty),
             "photograph": _photograph_record(self.photograph),
         }
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        verification = record.get("verification")
         photograph = record.get("photograph")
         model = cls(
             classes=record["classes"],
@@ -323,9 +329,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
             metadata=record["metadata"],
             thresholds=thresholds_of(record["thresholds"]),
             certainty=_restored_certainty(record),
-            verification=None
-            if verification is None
-            else Verification(thresholds=thresholds_of(verification["thresholds"])),
+            places=thresholds_of(record.get("places")),
             photograph=None if photograph is None else _restored_photograph(photograph, record["classes"], tensors),
         )
         model.survey.foresight = record["survey"]["foresight"]
@@ -334,10 +338,6 @@ class GlimpseEvidence(DecidingModule, Pretrained):
 
 
 # The parts of a model as values of its record, and back.
-
-
-def _verification_record(verification: Verification | None) -> dict[str, object] | None:
-    return None if verification is None else {"thresholds": thresholds_record(verification.thresholds)}
 
 
 def _certainty_record(certainty: Certainty | None) -> list[float] | None:
