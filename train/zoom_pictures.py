@@ -38,11 +38,10 @@ class FitZoomConfig(FitMosaicsConfig):
         each: number of training pictures of each of these kinds.
         judged_each: number of pictures of held-out photographs of each of these kinds, to choose thresholds.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
-        refit: parts of that model to fit again: `decision`, the decisions of searches, `verification`, the
-            probabilities after closer looks at places that seem to hold the target, `survey`, the number of objects of
-            any class that closer looks find, `certainty`, the probability that an object is there, with the spread of
-            expected numbers, and `photograph`, the evidence for photographs. The verification has to follow new
-            decisions; without it they are made without closer looks.
+        refit: parts of that model to fit again: `certainty`, the probability that an object is there, with the spread
+            of expected numbers, `decision`, the decisions of searches, `survey`, the number of objects of any class
+            that closer looks find, and `photograph`, the evidence for photographs. Decisions have to follow a new
+            certainty, by which they are made.
     """
 
     judged_far: Count = 4
@@ -50,7 +49,7 @@ class FitZoomConfig(FitMosaicsConfig):
     each: Count = 20
     judged_each: Count = 6
     evidence: Path | None = None
-    refit: tuple[RefitPart, ...] = ("decision", "verification", "certainty")
+    refit: tuple[RefitPart, ...] = ("decision", "certainty")
 
 
 class PicturesFit(MosaicFit):

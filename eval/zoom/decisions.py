@@ -60,11 +60,11 @@ def decide_all(
 
     Returns:
         Records for each target: the decision and, for comparison, the target's highest score in the overview, and in
-        the overview and all slices. Evidence without fitted verification makes no closer looks.
+        the overview and all slices. Evidence without thresholds of places makes no closer looks.
     """
     slice_scores = torch.stack([look.show for look in source.see(slices)])
     records: list[ResultRecord] = []
-    ways = {OURS: closer} if evidence.verification is None else {OURS: closer, UNVERIFIED: 0}
+    ways = {OURS: closer} if evidence.places is None else {OURS: closer, UNVERIFIED: 0}
     for target, (way, most) in product(targets, ways.items()):
         task = WindowTask(Goal.of(classes, target), evidence, DecisionSettings(closer=most, prior="fit"))
         path = WindowEpisode(task, source, EpisodeLimits(passes)).run()

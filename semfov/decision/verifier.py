@@ -178,18 +178,17 @@ class PlaceVerifier(ABC, Generic[LookType]):
     def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:
         """Judge a candidate by what a look shows closely, with the prior of the places, and dismiss it."""
 
-    def look_closely(self, close_up: LookAt, room: float = math.inf) -> list[CandidatePlace]:
+    def look_closely(self, close_up: LookAt) -> list[CandidatePlace]:
         """Make all closer looks that are due.
 
         Args:
             close_up: looks closely at a box.
-            room: number of passes that remain.
 
         Returns:
             The places that took a pass.
         """
         examined: list[CandidatePlace] = []
-        while self.candidate is not None and len(examined) < room:
+        while self.candidate is not None:
             detections = self.shown
             if detections is None:
                 examined.append(self.candidate)

@@ -1,6 +1,5 @@
 """Searches that a verification is fitted to; all searches of a photograph share its looks, each made only once."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -57,7 +56,6 @@ class TargetSearch(ABC, Generic[LookType]):
         target: the class, 1..K.
         present: whether the picture holds the class.
         spare: whether the search serves only to choose thresholds.
-        passes: largest number of looks, with closer looks.
     """
 
     after: ClassVar[tuple[int, ...]]
@@ -66,7 +64,6 @@ class TargetSearch(ABC, Generic[LookType]):
     target: int
     present: bool
     spare: bool = False
-    passes: float = math.inf
 
     @abstractmethod
     def __len__(self) -> int:

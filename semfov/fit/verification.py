@@ -1,6 +1,5 @@
 """Fit the verification of targets by closer looks, from searches of photographs with boxes."""
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -163,35 +162,9 @@ def fit_verification(
         )
     models = [fit_to_closer_looks(closer_looks, closer_looks.fold != fold, prior) for fold in range(folds)]
     model = fit_to_closer_looks(closer_looks, closer_looks.fold >= 0, prior)
-    return with_thresholds(model, models, closer_looks, again, limits, false_alarms, surest)
-
-
-def with_thresholds(
-    model: Verification,
-    folds: list[Verification],
-    closer_looks: CloserLookSamples,
-    searches: Iterable[TargetSearch[LookType]],
-    limits: Thresholds,
-    false_alarms: float,
-    surest: float,
-) -> VerificationInFolds:
-    """Decide searches by models that were not fitted to them, and choose `confirm` of a model on that.
-
-    Args:
-        model: gets the thresholds.
-        folds: models by fold of the pictures.
-        closer_looks: those that the models are evaluated on.
-        searches: the searches.
-        limits: `stop_below` and `place` of the model, with `confirm` 1.
-        false_alarms: largest share of the absent targets that may be found.
-        surest: upper limit of `confirm`.
-
-    Returns:
-        The model, and what its report is made of.
-    """
-    decided = list(verify(searches, folds, limits))
+    decided = list(verify(again, models, limits))
     model.thresholds = limits.changed(confirm=choose_confirm(decided, false_alarms, surest))
-    return VerificationInFolds(model, folds, closer_looks, decided)
+    return VerificationInFolds(model, models, closer_looks, decided)
 
 
 @torch.inference_mode()
@@ -277,14 +250,11 @@ def _verify_search(search: TargetSearch[LookType], model: Verification, limits: 
     ends: list[int] = []
     for index in range(len(search)):
         looks += 1
-        room = search.passes - looks
-        # Where passes are limited, a search ends with them, after the last closer look.
-        is_last = index + 1 == len(search) if room == math.inf else room <= 1
-        verifier.see(search.look(index, looks), last=is_last)
-        for _ in verifier.look_closely(search.close_up, room):
+        verifier.see(search.look(index, looks), last=index + 1 == len(search))
+        for _ in verifier.look_closely(search.close_up):
             looks += 1
             ends.append(looks)
-        if verifier.outcome() or looks >= search.passes:
+        if verifier.outcome():
             break
     verifier.end()
     return VerifiedSearch(

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.fit.searches import SearchEnd
-from semfov.fit.verification import VerificationInFolds
+from semfov.fit.verification import VerificationInFolds, VerifiedSearch
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.tables import mean_or_dash, share, table
@@ -18,9 +18,6 @@ _THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)  # values of the threshold `confirm` in 
 NO_PLACES = "None, since there are no places that hold the target, or none that do not.\n"
 """The report where no verification can be fitted."""
 
-IN_FOLDS = "Each photograph is evaluated with a model fitted to other folds."
-"""How a verification is evaluated that is fitted in folds."""
-
 
 class VerificationReport(NamedTuple):
     """A report in Markdown, and its measures by name; None where only one kind was searched for."""
@@ -29,38 +26,64 @@ class VerificationReport(NamedTuple):
     figures: dict[str, float | None]
 
 
-def verification_report(fitted: VerificationInFolds, pictures: str, how: str = IN_FOLDS) -> VerificationReport:
+def verification_report(fitted: VerificationInFolds, pictures: str) -> VerificationReport:
     """Evaluate the models of folds on their closer looks, and the decisions of the searches.
 
     Args:
         fitted: the model with its threshold, the models of folds, closer looks and searches.
         pictures: number and kind of the pictures, in words.
-        how: sentence about which pictures the models were fitted to.
 
     Returns:
         The report.
     """
+    assert fitted.model.thresholds is not None
+    searches = fitted.searches
     chances, figures = _chances(fitted)
-    present = torch.tensor([search.present for search in fitted.searches])
-    area = _area(torch.tensor([search.presence for search in fitted.searches]), present)
-    figures["area"] = area
+    figures["area"] = _area_of(searches)
     text = "\n".join(
         [
-            f"{len(fitted.searches)} searches of {pictures}, {int(present.sum())} of them for a present class; "
-            f"{len(fitted.closer_looks.fold)} closer looks. {how}",
+            f"{_numbers(searches, pictures)}; {len(fitted.closer_looks.fold)} closer looks. "
+            "Each photograph is evaluated with a model fitted to other folds.",
             "",
             "Probability of the target before and after a closer look:",
             "",
             *table(chances),
             "",
-            "Decisions in %, and mean numbers of looks, closer ones included. Area under the ROC of the final "
-            f"probability: {_figure(area)}.",
-            "",
-            *table(_decisions(fitted)),
-            "",
+            *_decisions_report(searches, fitted.model.thresholds.confirm),
         ]
     )
     return VerificationReport(text, figures)
+
+
+def places_report(searches: Sequence[VerifiedSearch], confirm: float, pictures: str) -> list[str]:
+    """Evaluate decisions by closer looks that no model of their own judges.
+
+    Args:
+        searches: searches with all their closer looks.
+        confirm: the threshold that was chosen.
+        pictures: number and kind of the pictures, in words.
+
+    Returns:
+        The report in Markdown, line by line.
+    """
+    return [f"{_numbers(searches, pictures)}.", "", *_decisions_report(searches, confirm)]
+
+
+def _numbers(searches: Sequence[VerifiedSearch], pictures: str) -> str:
+    """Say how many searches there are."""
+    present = sum(search.present for search in searches)
+    return f"{len(searches)} searches of {pictures}, {present} of them for a present class"
+
+
+def _decisions_report(searches: Sequence[VerifiedSearch], confirm: float) -> list[str]:
+    """Report the decisions, in lines of Markdown."""
+    return [
+        "Decisions in %, and mean numbers of looks, closer ones included. Area under the ROC of the final probability: "
+        f"{_figure(_area_of(searches))}.",
+        "",
+        *table(_decisions(searches, confirm)),
+        "",
+    ]
 
 
 def _chances(fitted: VerificationInFolds) -> tuple[list[list[str]], dict[str, float | None]]:
@@ -89,11 +112,8 @@ def _chances(fitted: VerificationInFolds) -> tuple[list[list[str]], dict[str, fl
     return rows, figures
 
 
-def _decisions(fitted: VerificationInFolds) -> list[list[str]]:
+def _decisions(searches: Sequence[VerifiedSearch], chosen: float) -> list[list[str]]:
     """Make rows of a table of the decisions, without closer looks and with them, at several thresholds."""
-    assert fitted.model.thresholds is not None
-    chosen = fitted.model.thresholds.confirm
-    searches = fitted.searches
     present = [search.present for search in searches]
     head = ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
     rows = [head]
@@ -119,6 +139,12 @@ def _rates(present: Sequence[bool], ends: Sequence[SearchEnd]) -> list[str]:
         looks.append(mean_or_dash([end.looks for end in of_kind]))
         verdicts += found
     return [*shares, share(sum(verdicts), len(verdicts)), *looks]
+
+
+def _area_of(searches: Sequence[VerifiedSearch]) -> float | None:
+    """Compute the area under the ROC of the final probabilities."""
+    present = torch.tensor([search.present for search in searches])
+    return _area(torch.tensor([search.presence for search in searches]), present)
 
 
 def _area(score: Tensor, answers: Tensor) -> float | None:

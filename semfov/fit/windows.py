@@ -18,7 +18,7 @@ from semfov.fit.windows_certainty import fit_certainty
 from semfov.fit.windows_decisions import (
     MosaicSearch,
     WindowSearches,
-    fit_closer_looks,
+    choose_places,
     fit_presence,
     judge_searches,
     search_pictures,
@@ -37,10 +37,9 @@ from semfov.zoom.eye import WindowEye
 from semfov.zoom.looks import half_steps
 from semfov.zoom.survey import Survey
 
-RefitPart = Literal["survey", "certainty", "decision", "verification", "photograph"]
+RefitPart = Literal["survey", "certainty", "decision", "photograph"]
 """Parts of evidence that may be fitted again: numbers of objects of any class, the probability that an object is there
-with the spread of expected numbers, decisions of searches, probabilities after closer looks, and the evidence for
-photographs."""
+with the spread of expected numbers, decisions of searches, and the evidence for photographs."""
 
 _CROWDED = 1 / 3  # share of the photographs that the crowded mosaics show, those with the most objects
 
@@ -81,7 +80,7 @@ class MosaicFit:
 
     Each part uses those before it (`fit`):
 
-        looks ─► numbers of objects of a class ─► of any class ─► certainty ─► decisions ─► closer looks
+        looks ─► numbers of objects of a class ─► of any class ─► certainty ─► decisions
                  (and, of photographs as they are, the evidence for photographs)
 
     Attributes:
@@ -142,14 +141,14 @@ class MosaicFit:
         self,
         parts: Collection[RefitPart] = get_args(RefitPart),
         model: GlimpseEvidence | None = None,
-        priors: tuple[Verification | None, Verification | None] = (None, None),
+        prior: Verification | None = None,
     ) -> tuple[GlimpseEvidence, list[str]]:
         """Fit evidence, or parts of it again.
 
         Args:
             parts: the parts to fit, beside the numbers of objects of a class where there is no model.
             model: evidence that was fitted before; it is changed.
-            priors: centres of the priors of the verification in mosaics and in photographs.
+            prior: centre of the prior of the verification in photographs.
 
         Returns:
             The evidence, and lines of Markdown.
@@ -175,15 +174,11 @@ class MosaicFit:
             lines += self.fit_survey(model, examples)
         if "certainty" in parts:
             lines += self.fit_certainty(model)
-        searched = self.search(model) if {*parts} & {"decision", "verification"} else {}
         if "decision" in parts:
-            lines += self.fit_decisions(model, searched)
-        if "verification" in parts:
-            check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", "one without")
-            lines += self.fit_verification(model, searched, priors[0])
+            lines += self.fit_decisions(model, self.search(model))
         if "photograph" in parts and self.config.photographs:
             scenes = make_scenes(self.config.data, self.eye.detector.classes)
-            lines += ["Photographs:", "", fit_photographs(model, scenes, self.eye, self.config, priors[1])]
+            lines += ["Photographs:", "", fit_photographs(model, scenes, self.eye, self.config, prior)]
         return model, lines
 
     def looked(self, parts: Collection[RefitPart], anew: bool) -> list[str]:
@@ -268,14 +263,17 @@ class MosaicFit:
         return searched
 
     def fit_decisions(self, model: GlimpseEvidence, searched: Mapping[str, Sequence[MosaicSearch]]) -> list[str]:
-        """Fit the decisions of searches: the probability of presence, and the thresholds; returns lines of Markdown."""
+        """Fit the decisions of searches: the probability of presence, and thresholds; returns lines of Markdown."""
         searches = {use: WindowSearches.of(of_use, self.config.passes) for use, of_use in searched.items()}
         fit_presence(model, searches["searched"])
         rows = judge_searches(model, searches["judged"], self.config)
-        # A verification belongs to the probability that it was fitted with.
-        model.verification = None
-        model.metadata.pop("verification", None)
         assert model.thresholds is not None
+        try:
+            report = choose_places(model, searched["judged"], self.config)
+        finally:
+            # Looks of a fit that was stopped are those of the next.
+            for search in searched["judged"]:
+                search.source.save()
         return [
             f"The probability that a picture contains the target was fitted on {len(searches['searched'].there)} "
             f"searches, about half of them for absent classes, and evaluated on {len(searches['judged'].there)} "
@@ -286,29 +284,10 @@ class MosaicFit:
             f"Thresholds: a target counts as found from a probability of {model.thresholds.confirm:.2f} on. The search "
             f"gives up when the best remaining look has a value below {model.thresholds.stop_below:g}.",
             "",
+            "Closer looks:",
+            "",
+            *report,
         ]
-
-    def fit_verification(
-        self,
-        model: GlimpseEvidence,
-        searched: Mapping[str, Sequence[MosaicSearch]],
-        prior: Verification | None = None,
-    ) -> list[str]:
-        """Fit the probabilities after closer looks; returns lines of Markdown.
-
-        Args:
-            model: the evidence, with fitted decisions.
-            searched: the searches by which the decisions were fitted.
-            prior: centre of the prior of the parameters.
-        """
-        try:
-            report = fit_closer_looks(model, searched["searched"], searched["judged"], self.config, prior)
-        finally:
-            # Looks of a fit that was stopped are those of the next.
-            for searches in searched.values():
-                for search in searches:
-                    search.source.save()
-        return ["Closer looks:", "", report]
 
     def fit_certainty(self, model: GlimpseEvidence) -> list[str]:
         """Fit the probability that an object is there, and the spread of expected numbers; returns lines."""

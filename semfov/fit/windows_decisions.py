@@ -1,4 +1,4 @@
-"""Fit the decisions of searches in large pictures: the probability of presence, its thresholds, and closer looks."""
+"""Fit the decisions of searches in large pictures: the probability of presence, and thresholds."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -7,14 +7,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from semfov.belief.verification import Verification
+from semfov.agents.episode import EpisodeLimits, Goal
+from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.data.scene import Annotation, Scenes
-from semfov.detection.detections import Detections
+from semfov.decision import MOST_CLOSER
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.searches import TargetSearch
 from semfov.fit.thresholds import Bounds, choose_thresholds
-from semfov.fit.verification import OneKindError, examine, fit_to_closer_looks, with_thresholds
-from semfov.fit.verification_report import NO_PLACES, verification_report
+from semfov.fit.verification import VerifiedSearch, choose_confirm
+from semfov.fit.verification_report import places_report
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
@@ -24,36 +24,36 @@ from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes
 from semfov.runs.tables import table
 from semfov.runs.zoom_store import StoredWindowLooks
-from semfov.zoom.closer import CandidateBoxes, TargetFacts, look_closely
+from semfov.settings import DecisionSettings
 from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.looks import WindowLook
 
 _JUDGED = (1, 4, 8, 16)  # numbers of looks after which the probability of presence is evaluated
 
 
 class _Known(NamedTuple):
-    """A look of a search, and what is known after it; the other fields are those of `WindowSearches`."""
+    """What is known after a look of a search; the fields are those of `WindowSearches`."""
 
-    look: WindowLook
     best: float
     expected: float
     detected: bool
     hit_chance: float
 
 
-class MosaicSearch(TargetSearch[TargetFacts]):
+class MosaicSearch:
     """A search of a large picture, without decisions and without closer looks.
 
     Attributes:
         model: evidence by magnification, which chooses the looks; its `whole` may be fitted to them afterwards.
         source: the looks at the picture.
+        picture: number of the picture among those of its kind.
+        target: the class, 1..K.
         objects: `(M, 4)`, annotated boxes of the class.
-        known: the looks, and what is known after each.
+        present: whether the picture holds the class.
+        passes: largest number of looks.
+        known: what is known after each look.
     """
-
-    after = (1, 3, 5, 8, 12, 16, 24)
 
     def __init__(
         self,
@@ -76,24 +76,25 @@ class MosaicSearch(TargetSearch[TargetFacts]):
         for step in islice(look_for(source, model, target), passes):
             facts = facts or SearchFacts(step.belief)
             facts.add(step.look)
-            self.known.append(_Known(step.look, facts.best, facts.expected(), facts.detected, step.next_value))
+            self.known.append(_Known(facts.best, facts.expected(), facts.detected, step.next_value))
 
-    def __len__(self) -> int:
-        return len(self.known)
-
-    def look(self, index: int, number: int) -> TargetFacts:
-        after = self.known[index]
-        presence = self.model.presence(torch.tensor(after.best), torch.tensor(after.expected)).sigmoid()
-        return TargetFacts(after.look.detections, number, float(presence), after.best, after.hit_chance)
-
-    def candidates(self) -> CandidateBoxes:
-        assert self.model.thresholds is not None
-        places = CandidateBoxes(self.target, self.model.thresholds.confirm, self.source.lattice)
-        places.keep_whole(0, self.known[0].look.detections)
-        return places
-
-    def close_up(self, box: Tensor) -> Detections:
-        return look_closely(self.source, box).detections
+    def verified(self) -> VerifiedSearch:
+        """Search again as an agent does, with its closer looks; a threshold `confirm` of 1 lets it make all of them."""
+        names = tuple(map(str, range(self.model.classes + 1)))
+        task = WindowTask(Goal.of(names, self.target), self.model, DecisionSettings(closer=MOST_CLOSER))
+        path = WindowEpisode(task, self.source, EpisodeLimits(self.passes)).run()
+        assert path.decision is not None
+        closer = [(look, look.index) for look in path.closer if look.index is not None]
+        return VerifiedSearch(
+            picture=self.picture,
+            present=self.present,
+            spare=False,
+            places=tuple((look.place, self.right(look.box)) for look, _ in closer),
+            ends=tuple(index + 1 for _, index in closer),
+            presence=path.decision.probability,
+            looks=path.passes,
+            unverified=None,
+        )
 
     def right(self, box: Tensor) -> bool:
         """Tell whether a box `(4,)` is that of an annotated object of the class."""
@@ -211,42 +212,22 @@ def judge_searches(model: GlimpseEvidence, searches: WindowSearches, bounds: Bou
     return table(rows)
 
 
-def fit_closer_looks(
-    model: GlimpseEvidence,
-    searched: Sequence[MosaicSearch],
-    judged: Sequence[MosaicSearch],
-    config: FitMosaicsConfig,
-    prior: Verification | None = None,
-) -> str:
-    """Fit the verification on some searches, choose its threshold on held-out ones, and add it to the model.
+def choose_places(model: GlimpseEvidence, searches: Sequence[MosaicSearch], config: FitMosaicsConfig) -> list[str]:
+    """Choose the threshold of places on held-out searches with closer looks, and add it to the model.
 
     Args:
         model: evidence by magnification, with thresholds.
-        searched: searches to fit on.
-        judged: searches of pictures of held-out photographs.
+        searches: searches of pictures of held-out photographs.
         config: bounds of the threshold.
-        prior: centre of the prior of the parameters (None: a weak one around 0).
 
     Returns:
-        The report in Markdown. Without places of both kinds, the model has no verification.
+        The report in Markdown, line by line.
     """
-    # From here on the model decides as without closer looks, until it has the new verification.
-    model.verification = None
     assert model.thresholds is not None
+    # With `confirm` 1 all closer looks are made, so that any threshold can be applied to a search afterwards.
     limits = Thresholds(1.0, model.thresholds.stop_below, config.place)
-    searches = track([*searched, *judged], "looking closely", "search")
-    try:
-        # Both take from one iterator, so that one bar shows them: the second goes on where the first ends.
-        training = examine(islice(searches, len(searched)))
-        held_out = examine(searches)
-    except OneKindError:
-        return NO_PLACES
-    fitted = fit_to_closer_looks(training, training.fold == 0, prior)  # all of them, in one fold
-    in_folds = with_thresholds(fitted, [fitted], held_out, judged, limits, config.false_alarms, config.surest)
-    model.verification = fitted
-    report = verification_report(
-        in_folds,
-        f"{len({id(search.source) for search in judged})} pictures of held-out photographs",
-        f"The model was fitted to {len(training.fold)} closer looks at pictures of other photographs.",
-    )
-    return report.text
+    model.places = limits
+    verified = [search.verified() for search in track(searches, "looking closely", "search")]
+    model.places = limits.changed(confirm=choose_confirm(verified, config.false_alarms, config.surest))
+    pictures = f"{len({id(search.source) for search in searches})} pictures of held-out photographs"
+    return places_report(verified, model.places.confirm, pictures)

@@ -145,13 +145,12 @@ def _report_on_curves(curves: Mapping[str, FloatArray], mosaics: Mosaics) -> str
 
 
 def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
-    """Fit all parts; of few photographs, those of closer looks stay near the models shipped for other detectors."""
+    """Fit all parts; closer looks at few photographs stay near the models shipped for other detectors."""
     shipped = [
         GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
     ]
-    of_windows = [other.verification for other in shipped if other.verification is not None]
     of_photographs = [other.photograph.verification for other in shipped if other.photograph is not None]
-    model, lines = fit.fit(priors=(mean_of(of_windows), mean_of(of_photographs)))
+    model, lines = fit.fit(prior=mean_of(of_photographs))
     return model, "\n".join(lines)
 
 

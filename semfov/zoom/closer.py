@@ -65,7 +65,7 @@ def look_closely(source: WindowLooks, box: Tensor, window: tuple[float, float] =
     Returns:
         The look.
     """
-    return source.see([closer_window(source.lattice, box, window)], hints=source.lattice.levels == 1)[0]
+    return source.see([closer_window(source.lattice, box, window)])[0]
 
 
 class TargetFacts(NamedTuple):
