@@ -1,6 +1,5 @@
 """Closer looks of a search by windows, and of one in a photograph."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -19,13 +18,16 @@ from semfov.motion import CameraStep, Motion
 from semfov.observation.thresholds import Thresholds
 from semfov.settings import FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
+from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, TargetFacts, closer_window, look_closely
+from semfov.zoom.decision import ObjectVerifier, SearchFacts
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
+from semfov.zoom.objects import probable_objects
 from semfov.zoom.slices import ranked, raw, usual_slices
 from tests.refusals import refused, unusable
-from tests.zoom.conftest import Squares
+from tests.small import Coloured
 
 AT = Thresholds(confirm=0.6, stop_below=0.01, place=0.2)
 LATTICE = Lattice.over((1024, 768), (128, 128))
@@ -42,28 +44,50 @@ class FromScore(Verification):
         return torch.stack([features[..., 6], torch.full_like(features[..., 6], self.presence).logit()], -1)
 
 
-class Fickle(Squares):
-    """Takes pure green for red, unless it fills most of a cell: seen closely it is green."""
+class Sized(Coloured):
+    """One box around all pixels of a colour, whose score grows with its size up to 16 pixels."""
+
+    def __init__(self):
+        super().__init__(("red", "green", "blue"), (128, 128), fill=0.0)
 
     def propose(self, canvas):
         found = super().propose(canvas)
+        sides = (found.boxes[..., 2:] - found.boxes[..., :2]).amax(-1)
+        return replace(found, classes=found.classes * (sides / 16).clamp(max=1)[..., None])
+
+
+class Fickle(Sized):
+    """Takes a small green thing for red: seen closely, from 30 pixels on, it is green."""
+
+    def propose(self, canvas):
+        found = super().propose(canvas)
+        sides = (found.boxes[..., 2:] - found.boxes[..., :2]).amax(-1, keepdim=True)
         red, green, blue = found.classes.unbind(-1)
-        alike = torch.where(green < 0.6, torch.maximum(red, green), red)
-        classes = torch.stack([alike, green.where(green >= 0.6, torch.zeros(())), blue], -1)
-        return replace(found, classes=classes, objectness=classes.amax(-1))
+        mistaken = torch.stack([0.7 * green, torch.zeros_like(green), blue], -1)
+        return replace(found, classes=torch.where((sides < 30) & (green > red)[..., None], mistaken, found.classes))
 
 
-def evidence(presence=0.4, **thresholds):
+def by(fact):
+    """The certainty of an object whose log odds are one of the facts about it."""
+    return Certainty(0.0, tuple(float(each == fact) for each in FACTS))
+
+
+def evidence(certainty=None, **thresholds):
+    """An object is as probable as its score in the closest look, and the odds of the picture are their number."""
     torch.manual_seed(0)
-    model = FromScore(presence, thresholds=replace(AT, **thresholds))
-    return GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.01), verification=model).eval()
+    model = GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.01), places=replace(AT, **thresholds))
+    model.certainty = by("sharpest") if certainty is None else certainty
+    with torch.no_grad():
+        model.whole.weight.copy_(torch.tensor([[0.0, 1.0]]))
+    return model.eval()
 
 
 def seen(boxes, scores):
     """A look with some detections of class 1 of 2."""
-    vectors = torch.tensor([[1 - score, score, 0.0] for score in scores])[None]
-    found = Detections(torch.tensor(boxes)[None], vectors, torch.ones(1, len(boxes), dtype=torch.bool))
-    return WindowLook(Window.on(LATTICE, (0, 0, 0)), found, torch.zeros(len(boxes), dtype=torch.bool), vectors[0], None)
+    vectors = torch.tensor([[1 - score, score, 0.0] for score in scores]).view(1, -1, 3)
+    found = Detections(torch.tensor(boxes).view(1, -1, 4), vectors, torch.ones(1, len(boxes), dtype=torch.bool))
+    show = torch.tensor([max(scores, default=0.0), 0.0])
+    return WindowLook(Window.on(LATTICE, (0, 0, 0)), found, torch.zeros(len(boxes), dtype=torch.bool), show, None)
 
 
 class Scripted(WindowLooks):
@@ -75,7 +99,7 @@ class Scripted(WindowLooks):
         self.scores, self.side, self.windows = list(scores), side, []
 
     def see(self, windows, *, hints=True):
-        assert not hints
+        assert hints
         (window,) = windows
         self.windows.append(window)
         x, y = (window.within[0] + window.within[2]) / 2, (window.within[1] + window.within[3]) / 2
@@ -154,7 +178,7 @@ ONE, OTHER = [100.0, 100, 140, 140], [500.0, 500, 540, 540]
 def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcome):
     judge, close_up = verifier(FromScore(presence), scores)
     judge.see(look(5, 0.9, 0.0 if over else 0.5, ONE, OTHER))
-    made = judge.look_closely(close_up, 9)
+    made = judge.look_closely(close_up)
     assert [each.index for each in judge.looks] == list(range(5, 5 + count))
     assert [round(each.place, 4) for each in judge.looks] == scores
     assert [round(each.probability, 4) for each in made] == [0.9] * count
@@ -178,12 +202,9 @@ def test_improbable_places_are_examined_only_at_the_end():
     for chance, over, count in ((0.69, False, 0), (0.71, False, 2), (0.21, True, 2), (0.19, True, 0)):
         judge, close_up = verifier(FromScore(), [0.1, 0.1])
         judge.see(look(1, chance, 0.5, ONE, OTHER), last=over)
-        assert len(judge.look_closely(close_up, 9)) == count
+        assert len(judge.look_closely(close_up)) == count
         assert judge.outcome() == (2 if count else 0)
         assert judge.decision_if_ended_now().outcome == ("absent" if count else "undecided")
-    none_left, close_up = verifier(FromScore(), [0.1, 0.1])
-    none_left.see(look(24, 0.9, 0.0, ONE))
-    assert none_left.look_closely(close_up, 0) == []
 
 
 @pytest.mark.parametrize("looks", [0, 1])
@@ -204,8 +225,8 @@ def test_what_the_camera_turns_away_from_is_forgotten_and_found_anew(looks):
     assert judge.candidate.box.tolist() == ONE
 
 
-def test_a_search_looks_closely_before_it_finds(detector, picture):
-    agent = ZoomAgent(WindowEye(detector), evidence())
+def test_a_search_looks_closely_before_it_finds(picture):
+    agent = ZoomAgent(WindowEye(Sized().eval()), evidence())
     plain = agent.search(picture, "red", SearchSettings(closer=0))
     assert (plain.decision.outcome, plain.decision.place, plain.closer) == ("found", None, ())
     path = agent.search(picture, "red")
@@ -230,12 +251,13 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     """Green squares look red until a look enlarges them beyond the magnification of the last level."""
     image = 0.03 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(0))  # ground that is not blank
     image[:, 320:344, 640:664] = torch.tensor([0.0, 1, 0])[:, None, None]
-    agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
+    agent = ZoomAgent(WindowEye(Fickle().eval()), evidence())
     assert agent.search(image, "red", SearchSettings(closer=0)).decision.outcome == "found"
     path = agent.search(image, "red", SearchSettings(closer=1))
     assert path.decision.outcome == "absent"
     assert path.decision.box is None
-    assert len(path.closer) == 1
+    (look,) = path.closer
+    assert look.place < path.looks[look.index].value
     assert path.why_it_ended() == "No closer look was sure enough."
     # As long as nothing is found the search goes on.
     looked = []
@@ -245,45 +267,85 @@ def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
     assert looked == [*range(1, path.passes + 1)]
 
 
-def test_the_limits_of_a_search_hold(detector, picture):
-    agent = ZoomAgent(WindowEye(detector), evidence())
+def test_the_limits_of_a_search_hold(picture):
+    agent = ZoomAgent(WindowEye(Sized().eval()), evidence())
     assert len(agent.search(picture, "red", SearchSettings(confirm=1.0, closer=1)).closer) == 1
     for passes in (1, 2, 3):
         path = agent.search(picture, "red", SearchSettings(passes=passes, confirm=1.0, stop_below=0.0))
         assert path.passes <= passes
 
 
-def test_evidence_without_verification_decides_as_before(detector, picture):
-    with_model = evidence()
-    without = GlimpseEvidence(3, thresholds=with_model.thresholds).eval()
-    without.load_state_dict({name: value for name, value in with_model.state_dict().items() if "verif" not in name})
+def test_evidence_without_thresholds_of_places_makes_no_closer_looks(picture):
     unfitted = evidence()
-    unfitted.verification.thresholds = None
-    expected = ZoomAgent(WindowEye(detector), with_model).search(picture, "red", SearchSettings(closer=0))
-    for other in (without, unfitted):
-        path = ZoomAgent(WindowEye(detector), other).search(picture, "red")
-        assert path.closer == ()
-        assert path.decision.probability == expected.decision.probability
-        assert [look.window for look in path.window_looks] == [look.window for look in expected.window_looks]
+    unfitted.places = None
+    expected = ZoomAgent(WindowEye(Sized().eval()), evidence()).search(picture, "red", SearchSettings(closer=0))
+    path = ZoomAgent(WindowEye(Sized().eval()), unfitted).search(picture, "red")
+    assert path.closer == ()
+    assert path.decision.probability == expected.decision.probability
+    assert [look.window for look in path.window_looks] == [look.window for look in expected.window_looks]
 
 
-def test_the_verification_is_saved_with_the_evidence(tmp_path):
+def some_certainty(seed):
+    """A certainty with weights drawn at random, which tells objects that are there."""
+    weights = 0.3 * torch.randn(len(FACTS), generator=torch.Generator().manual_seed(seed))
+    return Certainty(1.0, (1.0, *weights[1:].tolist()))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("share", [None, 0.4])
+def test_a_place_is_as_probable_as_the_object_that_an_exploration_lists_there(picture, seed, share):
+    """Of the same looks, the closer one among them; the picture's odds are the number of all objects."""
+    certainty = some_certainty(seed)
+    agent = ZoomAgent(WindowEye(Sized().eval()), evidence(certainty))
+    path = agent.search(picture, "red", SearchSettings(confirm=1.0, stop_below=0.0, passes=10, prior=share))
+    assert path.closer
+    prior = Prior(0.5 if share is None else share, 0.5)
+    for look in path.closer:
+        looks = path.window_looks[: look.index + 1]
+        objects, _ = probable_objects(looks, path.lattice, 1, certainty)
+        (number,) = (objects.boxes == look.box).all(-1).nonzero()[:, 0].tolist()
+        place, count = float(objects.scores[number]), float(objects.scores.sum())
+        presence = max((count + 0.001) / (1 + count + 0.001), place)
+        assert look.place == pytest.approx(prior.at_place(place, presence), rel=1e-5)
+        assert look.presence == pytest.approx(prior(presence), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["yolox-nano", "nanodet-plus-m-1.5x", "yolov3-tiny"])
+@pytest.mark.parametrize("score", [0.2, 0.5, 0.8])
+def test_a_closer_look_that_shows_nothing_lowers_the_probability_of_a_place(name, score):
+    certainty = GlimpseEvidence.from_pretrained(name).certainty
+    far = replace(seen([ONE], [score]), window=Window.overview(LATTICE))
+    close = replace(seen([], []), window=closer_window(LATTICE, torch.tensor(ONE)))
+    before, after = (probable_objects(looks, LATTICE, 1, certainty)[0] for looks in ([far], [far, close]))
+    assert float(after.scores) < float(before.scores)
+
+
+def test_where_no_look_shows_the_target_it_hardly_is():
+    facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1))
+    facts.add(replace(seen([ONE, OTHER], [0.5, 0.3]), window=Window.overview(LATTICE)))
+    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE), AT, 9)
+    judge.see(TargetFacts(seen([[700.0, 100, 740, 140]], [0.4]).detections, 1, 0.6, 0.5, 0.0))
+    look = judge.examine(Detections.empty(1, 2))
+    assert look.place == pytest.approx(0.001)
+    assert look.box.tolist() == [700.0, 100, 740, 140]
+    assert look.presence == pytest.approx(0.801 / 1.801, rel=1e-4)
+
+
+def test_thresholds_of_places_are_saved_with_the_evidence(tmp_path):
     torch.manual_seed(0)
-    model = GlimpseEvidence(3, verification=Verification(thresholds=AT))
+    model = GlimpseEvidence(3, places=AT)
     model.save(tmp_path / "own.safetensors")
-    again = GlimpseEvidence.from_pretrained(tmp_path / "own.safetensors")
-    assert again.verification.thresholds == AT
-    assert torch.equal(again.verification.linear.weight, model.verification.linear.weight)
+    assert GlimpseEvidence.from_pretrained(tmp_path / "own.safetensors").places == AT
+    other = GlimpseEvidence(3)
+    other.load_state_dict(model.state_dict())
+    assert other.places == AT
     tensors, record = read(tmp_path / "own.safetensors", "glimpse-evidence")
-    # Evidence without a verification has neither tensors nor record of one.
-    old = {name: tensor for name, tensor in tensors.items() if not name.startswith("verification")}
-    write_file(
-        tmp_path / "old.safetensors", old, {name: each for name, each in record.items() if name != "verification"}
-    )
-    assert GlimpseEvidence.from_pretrained(tmp_path / "old.safetensors").verification is None
-    for parts in ((old, record), (tensors, json.loads(json.dumps(record)) | {"verification": None})):
-        write_file(tmp_path / "half.safetensors", *parts)
-        unusable("not a complete model of evidence", GlimpseEvidence.from_pretrained, tmp_path / "half.safetensors")
+    without = {name: each for name, each in record.items() if name != "places"}
+    write_file(tmp_path / "without.safetensors", tensors, without)
+    assert GlimpseEvidence.from_pretrained(tmp_path / "without.safetensors").places is None
+    old = tensors | {"verification.linear.weight": torch.zeros(2, 7), "verification.linear.bias": torch.zeros(2)}
+    write_file(tmp_path / "old.safetensors", old, record)
+    unusable("not a complete model of evidence", GlimpseEvidence.from_pretrained, tmp_path / "old.safetensors")
 
 
 SIZE = (192, 144)
@@ -458,7 +520,7 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
         looked.append(box.tolist())
         return closely
 
-    judge = Verifier(Alike(), PhotographPlaces(1, OVER, Forgetting(rate)), AT, most=9)
+    judge = Verifier(Alike(), PhotographPlaces(1, OVER, Forgetting(rate)), AT, most=4 - passes)
     judge.see(TargetFacts(Detections(boxes, scores, torch.ones(1, 3).bool()), 1, 0.9, 0.5, 0.0))
     judge.examine(close_up(judge.candidate.box))
     # The second place is due in the same frame, and needs no pass; in a later one of a scene that changes it does.
@@ -466,7 +528,7 @@ def test_two_places_in_one_window_are_examined_in_one_look(rate, passes):
     judge.wait()
     assert (judge.shown is None) == (rate > 0)
     due = judge.candidate
-    assert len(judge.look_closely(close_up, 1)) == 1
+    assert len(judge.look_closely(close_up)) == 1
     assert looked[0] == boxes[0, 0].tolist()
     assert looked[1] == boxes[0, 3 - passes].tolist()
     second = judge.looks[1]
@@ -625,8 +687,8 @@ def test_thresholds_are_compared_with_the_probability_for_the_prior(detector, ph
     assert (rare.passes, rare.decision.outcome) == (1, "absent")
 
 
-def test_a_prior_in_a_large_picture_is_compared_with_one_half(detector, picture):
-    agent = ZoomAgent(WindowEye(detector), evidence(0.4))
+def test_a_prior_in_a_large_picture_is_compared_with_one_half(picture):
+    agent = ZoomAgent(WindowEye(Sized().eval()), evidence())
     usual, fitted, rare = (
         agent.search(picture, "red", SearchSettings(passes=1, closer=0, prior=prior)).decision
         for prior in (None, "fit", 0.1)
@@ -701,7 +763,7 @@ def pan():
     """Moments, each with the left edge of its frame; a red square is at x from 640 to 703, y from 320 to 383."""
     ground = 0.03 * torch.rand(3, 768, 1280, generator=torch.Generator().manual_seed(0))  # not blank
     ground[:, 320:384, 640:704] = torch.tensor([1.0, 0, 0])[:, None, None]
-    live = ZoomAgent(WindowEye(Squares()), evidence()).stream(1, (), StreamSettings(rate=0.25))
+    live = ZoomAgent(WindowEye(Sized()), evidence()).stream(1, (), StreamSettings(rate=0.25))
     frames = panned(ground, LEFTS)
     return [(live.step(frame, pose=pose), left) for (frame, pose), left in zip(frames, LEFTS, strict=True)]
 
@@ -745,7 +807,7 @@ def test_a_moment_and_its_page_have_the_looks_that_the_frame_shows(pan):
 
 def test_looks_are_carried_along_in_a_frame_that_is_spent_on_a_closer_look(picture):
     """The camera goes on by 40 px in every frame; the overview shows the first frame."""
-    live = ZoomAgent(WindowEye(Squares()), evidence()).stream(1, (), StreamSettings(rate=0.25))
+    live = ZoomAgent(WindowEye(Sized()), evidence()).stream(1, (), StreamSettings(rate=0.25))
     picture[0, 320:384, 640:704] = 1
     lefts = range(0, 480, 40)
     overviews = []
@@ -759,8 +821,23 @@ def test_looks_are_carried_along_in_a_frame_that_is_spent_on_a_closer_look(pictu
     assert right == pytest.approx(expected)
 
 
-def test_with_poses_of_a_still_camera_a_search_is_the_same_to_the_bit(detector, picture, one_thread):
-    agent = ZoomAgent(WindowEye(detector), evidence())
+def test_a_closer_look_counts_where_the_camera_has_moved_to():
+    """Green squares look red from afar; after the closer look the picture is not taken to hold red in later frames."""
+    ground = 0.03 * torch.rand(3, 768, 1280, generator=torch.Generator().manual_seed(0))
+    ground[:, 320:344, 640:664] = torch.tensor([0.0, 1, 0])[:, None, None]
+    live = ZoomAgent(WindowEye(Fickle().eval()), evidence()).stream(1, (), StreamSettings(rate=0.05))
+    presence = []
+    for frame, pose in panned(ground, [200] * 6 + [210, 220, 230, 240], 800):
+        moment = live.step(frame, pose=pose)
+        presence.append((live._session.decisions._facts.presence(), len(moment.closer)))
+    before = [p for p, closer in presence if not closer]
+    after = [p for p, closer in presence if closer]
+    assert presence[-4][1] == 1
+    assert max(after) < 0.1 < max(before)
+
+
+def test_with_poses_of_a_still_camera_a_search_is_the_same_to_the_bit(picture, one_thread):
+    agent = ZoomAgent(WindowEye(Sized().eval()), evidence())
     still = agent.stream(1, (), StreamSettings(rate=0.75), follows=False)
     posed = agent.stream(1, (), StreamSettings(rate=0.75))
     for _ in range(8):
@@ -776,9 +853,12 @@ def test_an_object_that_fills_a_large_picture_needs_no_closer_look():
     boxes = torch.tensor([[[10.0, 10, 1000, 750], [60.0, 60, 90, 90]]])
     whole = Detections(boxes, torch.tensor([[[0, 0.9, 0], [0, 0.89, 0]]]), torch.ones(1, 2).bool())
 
+    facts = SearchFacts(ZoomBelief(LATTICE, evidence(by("score")), 1))
+    facts.add(replace(seen(boxes[0].tolist(), [0.9, 0.89]), window=Window.overview(LATTICE)))
+
     def search(rate):
         places = CandidateBoxes(1, 0.6, LATTICE, Forgetting(rate))
-        judge = Verifier(Alike(), places, Thresholds(0.999, 1e-4), most=9)
+        judge = ObjectVerifier(facts, places, Thresholds(0.999, 1e-4), most=9)
         places.keep_whole(0, whole)
         judge.see(TargetFacts(whole, 3, 0.8, 0.9, 0.3))
         return judge, places
@@ -786,7 +866,8 @@ def test_an_object_that_fills_a_large_picture_needs_no_closer_look():
     judge, places = search(0.0)
     assert judge.shown is whole
     look = judge.examine(judge.shown)
-    assert (look.index, look.presence) == (0, 0.8)
+    assert (look.index, look.place) == (0, pytest.approx(0.9))
+    assert facts.presence() < look.presence == look.place
     # A small place takes a pass.
     assert judge.candidate.box.tolist() == boxes[0, 1].tolist()
     assert judge.shown is None
