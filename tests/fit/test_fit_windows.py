@@ -12,18 +12,15 @@ from semfov import ActivePerception, EmbeddedScenes
 from semfov.agents import ZoomAgent
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import WindowEpisode, WindowTask
-from semfov.belief.verification import Verification
 from semfov.data import Annotation, Scene
 from semfov.data.mosaics import Mosaics
 from semfov.decision import MOST_CLOSER
 from semfov.errors import DataError
-from semfov.fit import windows_decisions
 from semfov.fit.folder import FolderFit
 from semfov.fit.photographs import _explored, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
-from semfov.fit.verification import verify
 from semfov.fit.windows import MosaicFit
-from semfov.fit.windows_decisions import fit_closer_looks, search_pictures
+from semfov.fit.windows_decisions import choose_places, search_pictures
 from semfov.fit.windows_evidence import ZoomExample
 from semfov.fit.windows_part import _RECALL_PASSES, WindowsFit, _photograph_recalls
 from semfov.fit.windows_settings import FitMosaicsConfig
@@ -195,7 +192,7 @@ class Drawn:
 
 
 @pytest.mark.slow
-def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
+def test_the_threshold_of_places_is_chosen_on_searches_that_end_as_those_of_the_agent():
     eye, scenes = WindowEye(Coloured(("red", "green", "blue"), (64, 64), fill=0.0)), Drawn()
     opened = [StoredWindowLooks(eye, scenes, n, None) for n in range(len(scenes))]
     torch.manual_seed(0)
@@ -208,24 +205,23 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
         # The looks are those of the agent, as far as it goes without closer looks, and so is the probability.
         task = WindowTask(Goal.of(names, sought.target), model)
         path = WindowEpisode(task, sought.source, EpisodeLimits(8)).run()
-        assert [after.look.window for after in sought.known[: path.passes]] == [
-            each.window for each in path.window_looks
-        ]
-        presence = sought.look(path.passes - 1, path.passes).presence
-        assert presence == pytest.approx(path.decision.probability, abs=1e-6)
+        after = sought.known[path.passes - 1]
+        presence = model.presence(torch.tensor(after.best), torch.tensor(after.expected)).sigmoid()
+        assert float(presence) == pytest.approx(path.decision.probability, abs=1e-6)
         if path.decision.outcome == "found":
             boxes = scenes.annotation(sought.picture).boxes[scenes.annotation(sought.picture).labels == sought.target]
             right = any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
             assert sought.right(path.decision.box) == right
-    text = fit_closer_looks(model, searches, searches, config)
-    fitted = model.verification.thresholds
+    text = "\n".join(choose_places(model, searches, config))
+    fitted = model.places
     assert (fitted.place, fitted.stop_below) == (0.1, 0.01)
     assert f"| {fitted.confirm:.2f} (chosen)" in text
-    # The searches from which the threshold was chosen end as those of the agent.
+    # A search with all its closer looks tells how one with the chosen threshold ends.
     ends = []
-    limits = Thresholds(1.0, model.thresholds.stop_below, config.place)
-    again = verify(searches, [model.verification], limits)
-    for sought, each in zip(searches, again, strict=True):
+    model.places = replace(fitted, confirm=1.0)
+    verified = [sought.verified() for sought in searches]
+    model.places = fitted
+    for sought, each in zip(searches, verified, strict=True):
         task = WindowTask(Goal.of(names, sought.target), model, DecisionSettings(closer=MOST_CLOSER))
         path = WindowEpisode(task, sought.source, EpisodeLimits(8)).run()
         right, count = each.found(fitted.confirm)
@@ -235,23 +231,6 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     assert len({right for right, _ in ends}) > 1
     absent = [right for right, present in ends if not present]
     assert sum(right is not None for right in absent) <= 0.5 * len(absent)
-
-
-def test_without_right_and_wrong_places_there_is_no_verification():
-    model = GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.01), verification=Verification()).eval()
-    text = fit_closer_looks(model, [], [], FitZoomConfig(passes=8))
-    assert text.startswith("None, since there are no places")
-    assert model.verification is None
-
-
-def test_a_picture_that_cannot_be_read_ends_the_fit_of_closer_looks(monkeypatch):
-    def damaged(searches):
-        raise DataError("photograph.jpg: truncated")
-
-    monkeypatch.setattr(windows_decisions, "examine", damaged)
-    model = GlimpseEvidence(3, thresholds=Thresholds(0.3, 0.01)).eval()
-    with pytest.raises(DataError, match="truncated"):
-        fit_closer_looks(model, [], [], FitZoomConfig(passes=8))
 
 
 @pytest.fixture(scope="module")
