@@ -317,9 +317,9 @@ class WindowSession:
 class WindowEpisode(PictureEpisode[ZoomPath]):
     """Looks at windows of a picture.
 
-    A search decides by closer looks (`semfov.decision.Verifier`), or without them by the probability of the picture and
-    a detection that shows the target (`semfov.decision.settle`). Without evidence slices are looked at in the order of
-    the overview's scores, and nothing is `absent`.
+    A search decides by closer looks (`semfov.decision.PlaceVerifier`), or without them by the probability of the
+    picture and a detection that shows the target (`semfov.decision.settle`). Without evidence slices are looked at in
+    the order of the overview's scores, and nothing is `absent`.
 
     Args:
         task: what is looked for.

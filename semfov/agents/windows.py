@@ -119,8 +119,8 @@ class ZoomAgent(nn.Module):
         """Search for one object of a class and decide whether the picture holds one.
 
         The recommended agent looks closely at places that seem to hold the class before it says `found`
-        (`semfov.zoom.closer`); with evidence that has no fitted verification it does not. Without evidence the class is
-        found at a detection with a score of at least `confirm` (None: 0.5).
+        (`semfov.zoom.closer`); with evidence that has no thresholds of places it does not. Without evidence the class
+        is found at a detection with a score of at least `confirm` (None: 0.5).
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.

@@ -10,7 +10,7 @@ Where the `prior` of a search changes its probabilities, and where the share of 
     windows              `semfov.zoom.decision.decisions_of`                   of a photograph
                                                                                `PhotographEvidence.shares`, by class;
                                                                                of a large picture one half
-    closer looks         `semfov.decision.Verifier`, by `CandidatePlaces`,     that of the kind of look
+    closer looks         `semfov.decision.PlaceVerifier` by its places,        that of the kind of look
                          which have the prior of their search
 
 The record keeps what was given (`prior`) and what is assumed (`assumed`), and changes its own decision

@@ -8,11 +8,11 @@ The numbers of a search, with one name each everywhere:
                  for a class                                                it decides
     presence     probability that the picture  `Belief.presence`, after     with: calibrated; without: a fovea has
                  holds the target              closer looks                 that of its most probable cell by raw
-                                               `Verifier.presence`; by      scores, windows have none; a head has
-                                               windows `SearchFacts`        that of its most probable cell in both
-    place        probability that the target   `CloseUp.place`              with: by the verification; without:
-                 is at one place, after a                                   there are no closer looks
-                 closer look at it
+                                               `PlaceVerifier.presence`;    scores, windows have none; a head has
+                                               by windows `SearchFacts`     that of its most probable cell in both
+    place        probability that the target   `CloseUp.place`              with: by the verification, in a large
+                 is at one place, after a                                   picture by the certainty of the object
+                 closer look at it                                          there; without: no closer looks
     hit_chance   chance that the best          `Belief.chance`; by windows  with: calibrated; without: it is not
                  remaining look shows the      `WindowStep.next_value`      asked for
                  target, if no look so far has
@@ -33,8 +33,8 @@ A `Decision` has two of them:
                             look                       the cell; windows: None    cell; windows: None
                  otherwise  None                       None                       None
 
-What is compared with what, by the kind of look. With closer looks (`Verifier`) places decide, without them presence
-does (`settle`):
+What is compared with what, by the kind of look. With closer looks (`PlaceVerifier`) places decide, without them
+presence does (`settle`):
 
     what                     fovea                       large picture               photograph by windows
     -----------------------  --------------------------  --------------------------  ---------------------------
@@ -51,6 +51,10 @@ does (`settle`):
                              fixated cell is nearly the  last look from
                              most probable one, or at    Thresholds.place on
                              the last look
+    a closer look            tells of its place and of   is one more look: place     as a fovea, by windows
+                             the picture (`Verifier`)    and presence are those of   (`Verifier`)
+                                                         all looks that count
+                                                         (`ObjectVerifier`)
     a place ends the search  if it is sure: from half-   as a fovea                  never: the next place may
     at once                  way between confirm and 1                               be surer
                              on, after MOST_CLOSER
@@ -60,8 +64,8 @@ does (`settle`):
     at a limit               closer looks that are due   it ends as it is            as a large picture
                              are made with the passes
                              that remain; it is over
-    compared by, with        `Verifier.outcome` of       `Verifier.outcome` of       `Verifier.outcome` of
-    closer looks             `CandidateCells`            `CandidateBoxes`            `PhotographPlaces`
+    compared by, with        `Verifier.outcome` of       `ObjectVerifier.outcome`    `Verifier.outcome` of
+    closer looks             `CandidateCells`            of `CandidateBoxes`         `PhotographPlaces`
     compared by, without     `decide`                    `settle`, called by         as a large picture
     closer looks                                         `DecisionsByPresence`
     outcome, if over         found with a place, or presence, from confirm on; else absent if presence < 1/2, else
@@ -70,7 +74,7 @@ does (`settle`):
     ending of the record     "decision" if it is over or found; else the limit, or "cells" / "shifts" of a fovea and
                              "windows" where none is left
 
-Candidate boxes and places are in `semfov.zoom.closer`, decisions by presence in `semfov.zoom.decision`.
+Candidate boxes and places are in `semfov.zoom.closer`, decisions by presence and by objects in `semfov.zoom.decision`.
 
 Without fitted models no probability decides: a detection whose score is at least `confirm` is `found`
 (ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.

@@ -34,7 +34,7 @@ def searching():
 
 
 def glimpses():
-    return GlimpseEvidence(3, foresight=0.25)
+    return GlimpseEvidence(3, foresight=0.25, places=Thresholds(0.7, 0.3, 0.2))
 
 
 def verification():
@@ -168,7 +168,7 @@ def test_invalid_values_in_records_are_refused_and_valid_ones_are_loaded(name, t
             continue
         del record[key]
         missing = loaded_or_none(name, tmp_path, tensors, record)
-        assert missing is None or key in ("thresholds", "verification", "certainty", "photograph")
+        assert missing is None or key in ("thresholds", "places", "certainty", "photograph")
         for junk in JUNK:
             tensors, record = parts(MODELS[name]())
             loaded = loaded_or_none(name, tmp_path, tensors, {**record, key: junk})
