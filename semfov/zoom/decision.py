@@ -122,6 +122,7 @@ class SearchFacts:
             self._objects = objects, self._certainty.probability(facts)
         return self._objects
 
+    @torch.no_grad()
     def expected(self) -> float:
         """Estimate how many objects of the target there are: those that looks show, and those that looks would find."""
         _, chances = self.objects()
