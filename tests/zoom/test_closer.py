@@ -45,13 +45,14 @@ class FromScore(Verification):
 
 
 class Sized(Coloured):
-    """One box around all pixels of a colour, whose score grows with its size up to 16 pixels."""
+    """One box around all pixels of a pure colour, whose score grows with its size up to 16 pixels."""
 
     def __init__(self):
         super().__init__(("red", "green", "blue"), (128, 128), fill=0.0)
 
     def propose(self, canvas):
-        found = super().propose(canvas)
+        pure = (2 * canvas - canvas.sum(1, keepdim=True)).clamp(0, 1)
+        found = super().propose(pure.where(pure > 0.4, torch.zeros(())))
         sides = (found.boxes[..., 2:] - found.boxes[..., :2]).amax(-1)
         return replace(found, classes=found.classes * (sides / 16).clamp(max=1)[..., None])
 

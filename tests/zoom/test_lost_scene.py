@@ -7,8 +7,7 @@ import pytest
 from semfov import WindowEye, ZoomAgent
 from semfov.settings import StreamSettings
 from tests.motion.test_camera import scene
-from tests.zoom.conftest import Squares
-from tests.zoom.test_closer import evidence
+from tests.zoom.test_closer import Sized, evidence
 
 DARK = np.zeros((768, 1024, 3), np.uint8)
 PLACE = 600, 400  # the low corner of a red square of 64 px on the ground
@@ -16,7 +15,7 @@ PLACE = 600, 400  # the low corner of a red square of 64 px on the ground
 
 @pytest.fixture
 def live():
-    return ZoomAgent(WindowEye(Squares()), evidence()).stream(1, (), StreamSettings(rate=0.25))
+    return ZoomAgent(WindowEye(Sized()), evidence()).stream(1, (), StreamSettings(rate=0.25))
 
 
 @pytest.fixture(scope="module")

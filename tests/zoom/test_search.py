@@ -20,7 +20,7 @@ from semfov.zoom import GlimpseEvidence, Lattice, merge
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from tests.refusals import refused
 from tests.small import agent as foveal_agent
-from tests.zoom.test_closer import Fickle, evidence
+from tests.zoom.test_closer import Fickle, Sized, evidence
 
 
 def test_search_finds_a_target_in_the_picture_and_ends_without_one(agent, picture):
@@ -262,10 +262,10 @@ def test_a_still_picture_at_rate_zero_gives_the_looks_of_an_exploration(agent, p
 
 
 @pytest.mark.parametrize("kind", ["closely", "plain", "slices"])
-def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(detector, picture, kind, one_thread):
+def test_a_still_picture_at_rate_zero_gives_the_looks_of_a_search(picture, kind, one_thread):
     """With closer looks, each of which takes a frame, without them, and without fitted models."""
     model = {"closely": evidence(), "plain": GlimpseEvidence(3), "slices": None}[kind]
-    agent = ZoomAgent(WindowEye(detector), model).eval()
+    agent = ZoomAgent(WindowEye(Sized()), model).eval()
     path = agent.search(picture, "red")
     live = agent.stream(1, (), StreamSettings(rate=0), follows=False)
     moments = [live.step(picture) for _ in path.window_looks]
@@ -284,7 +284,7 @@ def test_the_looks_at_what_is_refuted_closely_are_those_of_a_search(picture, one
     image = torch.zeros_like(picture)
     image[1, 320:344, 640:664] = 1
     image[:, [0, 0, -1, -1], [0, -1, 0, -1]] = 0.02  # no blank ground
-    agent = ZoomAgent(WindowEye(Fickle().eval()), evidence(presence=0.3))
+    agent = ZoomAgent(WindowEye(Fickle().eval()), evidence())
     path = agent.search(image, "red", SearchSettings(closer=1))
     live = agent.stream(1, (), StreamSettings(rate=0, closer=1), follows=False)
     moments = [live.step(image) for _ in path.window_looks]
@@ -330,8 +330,8 @@ def test_objects_that_move_or_leave_are_forgotten(agent):
     assert (old.objects.boxes[:, 0] < 500).any(), "at rate 0 nothing is forgotten"
 
 
-def test_a_found_target_is_lost_when_it_leaves(detector, picture):
-    agent = ZoomAgent(WindowEye(detector), evidence())
+def test_a_found_target_is_lost_when_it_leaves(picture):
+    agent = ZoomAgent(WindowEye(Sized()), evidence())
     live = agent.stream(1, (), StreamSettings(rate=2.5), follows=False)
     found = [live.step(picture).decision.outcome for _ in range(12)]
     gone = [live.step(torch.zeros_like(picture)).decision for _ in range(20)]
