@@ -34,19 +34,10 @@ class GreyFrame:
 
     def __init__(self, cv2: ModuleType, frame: NDArray[np.uint8]) -> None:
         self._cv2 = cv2
-        height, width = frame.shape[:2]
-        # Means of whole pixels take a fifth of the time of others; a rest at the right and below is left out.
-        factor = _factor(width, height, _LONGER)
-        size = max(1, width // factor), max(1, height // factor)
-        shown = frame[: size[1] * factor, : size[0] * factor]
-        self.ratio = shown.shape[1] / size[0], shown.shape[0] / size[1]
         # A third of the values is left to average where the frame is grey first.
-        full = cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY)
-        self.grey = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
-        fine_factor = _factor(width, height, _FINE_LONGER)
-        fine_size = max(1, full.shape[1] // fine_factor), max(1, full.shape[0] // fine_factor)
-        self.fine: NDArray[np.uint8] = cv2.resize(full, fine_size, interpolation=cv2.INTER_AREA)
-        self.fine_ratio = full.shape[1] / fine_size[0], full.shape[0] / fine_size[1]
+        full = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
+        self.grey, self.ratio = _reduced(cv2, full, _LONGER)
+        self.fine, self.fine_ratio = _reduced(cv2, full, _FINE_LONGER)
 
     @cached_property
     def corners(self) -> NDArray[np.float32]:
@@ -107,6 +98,21 @@ class GreyFrame:
         return [np.array([across[beyond][n], down[beyond][n]], np.float64) for n in order]
 
 
-def _factor(width: int, height: int, longer: int) -> int:
-    """Choose by how many whole pixels a frame is reduced, so that its longer side has no more than some."""
-    return max(1, math.ceil(max(width, height) / longer))
+def _reduced(cv2: ModuleType, full: NDArray[np.uint8], longer: int) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """Reduce a frame by whole pixels.
+
+    Args:
+        cv2: OpenCV.
+        full: `(h, w)` bytes.
+        longer: most pixels of the longer side of the copy.
+
+    Returns:
+        The copy, and `(x, y)`, pixels of the frame for one of it.
+    """
+    height, width = full.shape
+    factor = max(1, math.ceil(max(width, height) / longer))
+    size = max(1, width // factor), max(1, height // factor)
+    # Means of whole pixels take a fifth of the time of others; a rest at the right and below is left out.
+    shown = full[: size[1] * factor, : size[0] * factor]
+    ratio = shown.shape[1] / size[0], shown.shape[0] / size[1]
+    return cv2.resize(shown, size, interpolation=cv2.INTER_AREA), ratio

@@ -262,6 +262,19 @@ def test_frames_of_some_pixels_across_have_no_slopes_that_tell(size):
     assert whole_shift(cv2, frame, frame) == 0
 
 
+@pytest.mark.parametrize(("size", "grey", "fine"), [((1080, 1920), 4, 2), ((700, 1000), 3, 2), ((40, 3000), 7, 4)])
+def test_reduced_frames_are_means_of_whole_pixels(size, grey, fine):
+    """A rest at the right and below is left out, so that a pixel of the copy is as many of the frame everywhere."""
+    pixels = np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8)
+    frame = GreyFrame(cv2, pixels)
+    whole = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float64)
+    for copy, ratio, factor in ((frame.grey, frame.ratio, grey), (frame.fine, frame.fine_ratio, fine)):
+        rows, columns = (side // factor for side in size)
+        assert ratio == (factor, factor)
+        blocks = whole[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
+        assert np.abs(copy - blocks.mean((1, 3))).max() <= 1
+
+
 def test_blocks_that_move_otherwise_are_counted():
     """The lower three quarters of a view of 480 × 360 px moved by 4 px, and the two upper rows of blocks by none."""
     picture = scene()
