@@ -20,6 +20,7 @@ _Floats = NDArray[np.float64]
 _Points = NDArray[np.float32]
 
 _TILE = 32  # side of a tile in its own pixels
+_AT_ONCE = 512  # most tiles one below the other: OpenCV resamples to less than 32,767 rows
 _SURROUNDINGS = 2  # sides of a tile in those of its box
 _MIDDLE = slice(_TILE // 4, 3 * _TILE // 4)  # rows or columns of a tile that its box fills
 _WINDOW = (15, 15)  # window of the flow in pixels of a tile: nearly all of the box
@@ -98,9 +99,11 @@ class PatchFlow:
         size = np.array(self._present.shape[::-1])
         is_whole = _lie_inside(centres, sides, size) & _lie_inside(guesses, sides, size)
         rows = np.flatnonzero(is_whole & (sides >= _SMALLEST).all(-1))
-        if len(rows):
-            ends, are_followed[rows] = self._flow(centres[rows], sides[rows], guesses[rows])
-            places[are_followed] = (ends * self._ratio)[are_followed[rows]]
+        for start in range(0, len(rows), _AT_ONCE):
+            part = rows[start : start + _AT_ONCE]
+            ends, is_followed = self._flow(centres[part], sides[part], guesses[part])
+            are_followed[part] = is_followed
+            places[part[is_followed]] = (ends * self._ratio)[is_followed]
         return FollowedPatches(places, are_followed)
 
     def _flow(self, centres: _Floats, sides: _Floats, guesses: _Floats) -> tuple[_Floats, NDArray[np.bool_]]:

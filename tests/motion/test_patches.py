@@ -62,6 +62,14 @@ def test_places_are_those_of_the_frame_where_a_reduced_copy_is_followed():
     assert errors[found.are_followed].max() < 1
 
 
+def test_any_number_of_patches_is_followed():
+    pair = frames(SHIFTS)
+    one = followed(pair)
+    many = followed(pair, np.tile(BOXES, (200, 1)), np.tile(CENTRES + GROUND_SHIFT, (200, 1)))
+    assert many.are_followed.all()
+    np.testing.assert_allclose(many.places, np.tile(one.places, (200, 1)), atol=0.1)
+
+
 def test_a_patch_without_texture_is_left_out():
     found = followed(frames(SHIFTS, patches=[np.full((HIGH, WIDE), 120, np.uint8)] * len(PLACES)))
     assert not found.are_followed.any()
