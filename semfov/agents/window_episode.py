@@ -6,7 +6,6 @@ Three short drivers stand on it: `WindowEpisode` looks at a picture, whose recor
 the looks that count at the present frame, a `WindowMoment`; and `GivenWindows` looks where it is asked to.
 """
 
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from semfov.agents.episode import EpisodeLimits, Goal, PictureEpisode, StreamEpisode
+from semfov.agents.stream_camera import StreamCamera
 from semfov.agents.window_objects import MergedLooks, seen_by
 from semfov.belief.prior import Prior
 from semfov.data.inputs import Color, ImageLike
@@ -25,8 +25,7 @@ from semfov.data.windowed import LargePicture
 from semfov.decision import CandidatePlace, CloseUp, Decision
 from semfov.detection import SCORE_THRESHOLD, Objects
 from semfov.episode import Forgetting
-from semfov.errors import InputError, check
-from semfov.motion import CameraMotion, CameraStep, KnownPoses, LostScene, Motion, PatchFlow
+from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import inside_frame
 from semfov.paths import Ending, WindowMoment, ZoomPath
 from semfov.paths.conversion import Values
@@ -470,7 +469,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
         self.eye = eye
         self.color = color
         self._limits = EpisodeLimits()
-        self._camera = _Camera(follows=follows)
+        self._camera = StreamCamera(follows=follows)
         self._session: WindowSession | None = None  # from the first frame on
         self._frames = 0  # number of frames so far
         self._is_lost = False  # whether what was known of an earlier scene is set aside
@@ -534,54 +533,6 @@ class WindowStream(StreamEpisode[WindowMoment]):
             tracks=session.tracks,
             next_window=session.next_window,
         )
-
-
-class _Camera:
-    """How the camera moves between frames: by the poses that are given, or estimated from the frames.
-
-    The first frame decides: with a pose `_poses` is made, and without one `_estimate`, where the camera is followed.
-    """
-
-    def __init__(self, *, follows: bool) -> None:
-        self._follows = follows
-        self._estimate: CameraMotion | None = None
-        self._poses: KnownPoses | None = None
-        self._is_first = True  # whether no frame was seen
-
-    @property
-    def is_followed(self) -> bool:
-        """Whether its motion is known at all, from the first frame on."""
-        return self._estimate is not None or self._poses is not None
-
-    @property
-    def flow(self) -> PatchFlow | None:
-        """What follows objects that move on their own; None where the camera's motion is not estimated."""
-        return None if self._estimate is None else self._estimate.flow
-
-    def step(self, view: WindowView, pose: Motion | ArrayLike | None) -> CameraStep | None:
-        """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
-        is_pose_expected = self._is_first or (self._poses is None) == (pose is None)
-        check(is_pose_expected, "pose", "a pose of each frame, or of none", pose)
-        # Without OpenCV a warning is given, which does not concern a camera whose poses are known.
-        if self._is_first and pose is None and self._follows:
-            self._estimate = _camera_motion()
-        self._is_first = False
-        if pose is not None:
-            self._poses = self._poses or KnownPoses()
-            return self._poses.step(pose)
-        if self._estimate is None:
-            return None
-        width, height = view.picture.size
-        return self._estimate.step(view.picture.pixels((0, 0, width, height)))
-
-
-def _camera_motion() -> CameraMotion | None:
-    """Make what follows a camera that moves; without OpenCV a warning, and the camera is taken to stand still."""
-    try:
-        return CameraMotion()
-    except InputError as error:
-        warnings.warn(f"the camera is taken to stand still, unless poses are given: {error}", stacklevel=2)
-        return None
 
 
 def _objects_in_frame(tracks: Tracks, places: Mapping[int, int], size: tuple[int, int]) -> Objects:
