@@ -41,10 +41,12 @@ class FollowedPatches(NamedTuple):
         places: `(N, 2)`, the centres of their boxes in pixels; those that were not followed are where they were
             expected.
         are_followed: `(N,)` boolean, those that were followed.
+        changes: `(N,)`, how much those have changed, as a share of their contrast; infinite for the others.
     """
 
     places: _Floats
     are_followed: NDArray[np.bool_]
+    changes: _Floats
 
 
 class PatchFlow:
@@ -90,9 +92,9 @@ class PatchFlow:
             Where they are.
         """
         places = expected.copy()
-        are_followed = np.zeros(len(boxes), bool)
+        changes = np.full(len(boxes), np.inf)
         if self._before is None or self._present is None or self._before.shape != self._present.shape:
-            return FollowedPatches(places, are_followed)
+            return FollowedPatches(places, np.isfinite(changes), changes)
         centres = (boxes[:, :2] + boxes[:, 2:]) / 2 / self._ratio
         sides = (boxes[:, 2:] - boxes[:, :2]) / self._ratio
         guesses = expected / self._ratio
@@ -101,13 +103,13 @@ class PatchFlow:
         rows = np.flatnonzero(is_whole & (sides >= _SMALLEST).all(-1))
         for start in range(0, len(rows), _AT_ONCE):
             part = rows[start : start + _AT_ONCE]
-            ends, is_followed = self._flow(centres[part], sides[part], guesses[part])
-            are_followed[part] = is_followed
+            ends, changes[part] = self._flow(centres[part], sides[part], guesses[part])
+            is_followed = np.isfinite(changes[part])
             places[part[is_followed]] = (ends * self._ratio)[is_followed]
-        return FollowedPatches(places, are_followed)
+        return FollowedPatches(places, np.isfinite(changes), changes)
 
-    def _flow(self, centres: _Floats, sides: _Floats, guesses: _Floats) -> tuple[_Floats, NDArray[np.bool_]]:
-        """Follow boxes that both frames show, in their pixels; returns their centres, and which were followed."""
+    def _flow(self, centres: _Floats, sides: _Floats, guesses: _Floats) -> tuple[_Floats, _Floats]:
+        """Follow boxes that both frames show, in their pixels; returns their centres and changes, infinite for none."""
         steps = sides * (_SURROUNDINGS / _TILE)  # pixels of the frame for one of a tile
         first = self._tiles(self._before, centres, steps)
         second = self._tiles(self._present, guesses, steps)
@@ -119,9 +121,10 @@ class PatchFlow:
         shifts = ends - middles
         contrast = _contrast(first)
         is_near = np.abs(shifts).max(-1) < _FARTHEST
-        is_same = (np.linalg.norm(back - middles, axis=-1) < _BACK) & (change < _OFF * contrast)
+        share = change / np.maximum(contrast, _LEAST_CONTRAST)
+        is_same = (np.linalg.norm(back - middles, axis=-1) < _BACK) & (share < _OFF)
         are_followed = is_found & is_found_back & is_near & is_same & (contrast >= _LEAST_CONTRAST)
-        return guesses + shifts * steps, are_followed
+        return guesses + shifts * steps, np.where(are_followed, share, np.inf)
 
     def _tiles(self, frame: _Bytes | None, centres: _Floats, steps: _Floats) -> _Bytes:
         """Resample parts of a frame, with some of its pixels for one of a tile `(N, 2)`, to tiles, `(32 N, 32)`."""

@@ -26,7 +26,9 @@ from semfov.tracking.tracks import Tracks, no_trail
 
 _FOLLOWED = 32  # most objects that are followed from frame to frame
 _CLEAR_WAY = 1.0  # pixels between two frames from which on a motion is no noise
+_SAME = 0.1  # share of its contrast by which the patch of an object that has stopped changes at most
 _AS_CLOSE = 0.9  # of the magnification of a look, from which on another one is as close
+_NO_NUMBERS = np.zeros(0, np.int64)
 _ONE_OF_CLASS = Selection(iou=0.5, limit=10**9, per_class=True)  # two objects that overlap by more than half are one
 
 
@@ -90,7 +92,7 @@ class Tracker:
 
     Private attributes: `_lost` has the objects of a scene that the camera has lost and may find again, where they were
     in its last frame. `_last` is the last number that was given, and `_is_marked` tells whether the trails have a place
-    in the present frame.
+    in the present frame. `_followed` has the numbers of the objects that were followed into it.
 
     Invariant: `tracks` are in the order of their numbers, none of which is given twice; those of `_lost` are lower than
     those that began after it.
@@ -111,6 +113,7 @@ class Tracker:
         self._lost: LostScene[_Known] = LostScene()
         self._last = 0
         self._is_marked = False
+        self._followed = _NO_NUMBERS
 
     def follow(self, seconds: float, camera: CameraStep | None = None, flow: PatchFlow | None = None) -> None:
         """Predict the objects at the next frame.
@@ -122,15 +125,26 @@ class Tracker:
         """
         step = camera or CameraStep(Motion.still())
         if flow is not None and step.motion is not None and seconds > 0:
-            self._see_motion(seconds, step.motion, flow)
+            self._followed = self._see_motion(seconds, step.motion, flow)
+        else:
+            self._followed = _NO_NUMBERS
         known = _Known(self.tracks, self._now)
         self._now += seconds
         self._is_marked = False
         scenes = self._lost.follow([known], step, self._at_present)
         self.tracks = reduce(Tracks.joined, (scene.tracks for scene in scenes)) if scenes else Tracks.none()
 
-    def _see_motion(self, seconds: float, motion: Motion, flow: PatchFlow) -> None:
-        """Update the velocities of the most probable objects by how they have moved since the last frame."""
+    def _see_motion(self, seconds: float, motion: Motion, flow: PatchFlow) -> NDArray[np.int64]:
+        """Update the velocities of the most probable objects by how they have moved since the last frame.
+
+        Args:
+            seconds: time since the last frame.
+            motion: of the camera since then.
+            flow: follows the boxes of objects.
+
+        Returns:
+            Numbers of the objects that were followed, `(M,)`.
+        """
         rows = np.argsort(-self.tracks.log_odds, kind="stable")[:_FOLLOWED]
         tracks = self.tracks[rows]
         places = tracks.place
@@ -140,14 +154,17 @@ class Tracker:
         # Beside the scene, in pixels of the last frame: what the camera's motion does not explain.
         origins = motion.inverse().points(torch.from_numpy(found.places)).numpy()
         shifts = origins - places
-        # No object stops from one frame to the next: what stays behind is the ground, or what hides it.
+        # What stays behind is the ground, or what hides an object, unless the last frame showed just the same of it.
         far = np.linalg.norm(way, axis=-1)
         stays_behind = (far > _CLEAR_WAY) & (np.linalg.norm(shifts, axis=-1) < far / 2)
+        was_shown = (tracks.unseen == 0) | np.isin(tracks.track_ids, self._followed)
+        has_stopped = was_shown & (found.changes < _SAME)
+        followed = found.are_followed & (has_stopped | ~stays_behind)
         variance = (self.model.flow * tracks.sides) ** 2 + self.model.unsteady**2
         moved = tracks.kinematics.moved(shifts / seconds, variance / seconds**2)
-        followed = found.are_followed & ~stays_behind
         kinematics = self.tracks.kinematics.with_rows(rows[followed], moved[followed])
         self.tracks = replace(self.tracks, kinematics=kinematics)
+        return tracks.track_ids[followed]
 
     def _at_present(self, scenes: list["_Known"], motion: Motion) -> list["_Known"]:
         """Predict objects at the present frame, to which the camera moved."""

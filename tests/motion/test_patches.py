@@ -62,6 +62,13 @@ def test_places_are_those_of_the_frame_where_a_reduced_copy_is_followed():
     assert errors[found.are_followed].max() < 1
 
 
+def test_a_patch_that_stays_has_not_changed():
+    stays = followed(frames(np.zeros_like(SHIFTS)))
+    assert stays.changes.max() < 0.1
+    hidden = followed(frames(SHIFTS, patches=[np.full((HIGH, WIDE), 120, np.uint8)] * len(PLACES)))
+    assert np.isinf(hidden.changes).all()
+
+
 def test_any_number_of_patches_is_followed():
     pair = frames(SHIFTS)
     one = followed(pair)

@@ -120,21 +120,53 @@ def test_an_object_that_is_seen_to_move_is_more_probable():
     assert moving.log_odds[0] == pytest.approx(moving.shown_odds[0] + 1.5, abs=0.01)
 
 
-def test_an_object_that_is_hidden_goes_on():
-    """It moves over a ground that stands, is followed for ten frames, and is not in the next ten."""
+def passed(places, walls=()):
+    """Track a textured box at the places `x` of frames, behind walls `(x1, x2)`; it is looked at in the first frame."""
     tracker, flow = Tracker(), PatchFlow()
-    ground = cv2.cvtColor(scene(0, side=700), cv2.COLOR_RGB2GRAY)
-    for number in range(20):
-        frame = ground[:400, :600].copy()
-        place = np.array([120 + 6 * number, 120])
-        if number < 10:
-            paste(frame, textured(1), *place)
+    ground = cv2.cvtColor(scene(0, side=700), cv2.COLOR_RGB2GRAY)[:400, :600]
+    for number, x in enumerate(places):
+        frame = ground.copy()
+        paste_between_pixels(frame, textured(1), x, 120)
+        for x1, x2 in walls:
+            frame[:, x1:x2] = ground[:, x1:x2]
         flow.step(frame)
         if number:
             tracker.follow(FRAME, flow=flow)
         else:
-            tracker.see(look(box_at(*place, WIDE, HIGH)))
-    assert tracker.tracks.boxes[0, :2].tolist() == pytest.approx(place.tolist(), abs=5)
+            tracker.see(look(box_at(x, 120, WIDE, HIGH)))
+    return tracker.tracks.boxes[0, :2].tolist()
+
+
+def paste_between_pixels(frame, patch, x, y):
+    """Paste a patch at a place that need not be a whole pixel."""
+    to_place = np.array([[1.0, 0, x], [0, 1, y]])
+    size = frame.shape[::-1]
+    moved = cv2.warpAffine(patch, to_place, size)
+    covers = cv2.warpAffine(np.full_like(patch, 255), to_place, size) > 127
+    frame[covers] = moved[covers]
+
+
+def test_an_object_that_is_hidden_goes_on():
+    """It moves over a ground that stands, is followed for ten frames, and is not in the next ten."""
+    places = 120 + 6 * np.arange(20)
+    assert passed(np.where(np.arange(20) < 10, places, -100))[0] == pytest.approx(places[-1], abs=5)
+
+
+@pytest.mark.parametrize("speed", [3, 6])
+def test_an_object_that_goes_behind_a_wall_bit_by_bit_goes_on(speed):
+    places = 120 + speed * np.arange(40)
+    edge = int(places[15]) + WIDE
+    end, _ = passed(places, walls=[(edge, edge + 90)])
+    assert end == pytest.approx(places[-1], abs=WIDE)
+    assert end > edge
+
+
+@pytest.mark.parametrize(("speed", "slower"), [(1.5, 1), (2, 1), (3, 1), (6, 1), (2, 12), (3, 12)])
+def test_an_object_that_stops_is_not_left_behind(speed, slower):
+    """It moves for fifteen frames, stops at once or within half a second, and stands to the end."""
+    speeds = speed * (1 - (np.arange(60) - 15) / slower).clip(0, 1)
+    places = 120 + np.cumsum(speeds)
+    assert passed(places) == pytest.approx([places[-1], 120], abs=5)
 
 
 def test_a_part_of_an_object_that_moves_is_not_more_probable():
