@@ -16,8 +16,11 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
     return {word: ours for ours, others in rows.items() for word in others.split()}
 
 
-_VERBS = ("draw", "export", "hide", "plot", "print", "save", "show", "to", "write")
+_VERBS = ("draw", "exclude", "export", "hide", "ignore", "plot", "print", "save", "show", "to", "write")
 """Verbs with which others' words begin."""
+
+_NEGATIONS = ("disable", "no", "not", "without")
+"""Beginnings of words that ask for the opposite of what follows."""
 
 
 def parts_of(word: str) -> list[str]:
@@ -30,9 +33,11 @@ def parts_of(word: str) -> list[str]:
         word: the word, with underscores between its parts.
 
     Returns:
-        The parts of three letters or more; none of a word of one part.
+        The parts of three letters or more; none of a word of one part, or of one that asks for the opposite.
     """
     words = word.split("_")
+    if words[0] in _NEGATIONS:
+        return []
     ends = ["_".join(words[first:]) for first in range(1, len(words))]
     beginnings = ["_".join(words[:count]) for count in range(len(words) - 1, 0, -1)]
     parts = beginnings + ends if words[0] in _VERBS else ends + beginnings

@@ -251,13 +251,14 @@ def _without_dashes(command: str, words: Sequence[str]) -> str | None:
     """Say how an option is written that stands as NAME=VALUE, as in other programs; None if there is none."""
     known = _option_names(command) if any("=" in word for word in words) else []
     for before, word in pairwise(["", *words]):
-        option, equals, value = word.partition("=")
-        # The value of an option may have this form, too, and so may the name of a file.
-        if before.startswith("-") or not equals or Path(word).exists():
+        name, equals, value = word.partition("=")
+        # The value of an option may have this form, too, and so may the name of a file, which may be too long for one.
+        if before.startswith("-") or word.startswith("-") or not equals or os.path.exists(word):
             continue
+        option = name.replace("-", "_")
         if option in known:
             return f"expected --{dashed(option)} {value}, got {word}"
-        if option in OPTIONS or option == SUBCOMMANDS[command].positional:
+        if option == SUBCOMMANDS[command].positional or not OPTIONS.keys().isdisjoint((option, *parts_of(option))):
             return _refusal(command, option) or f"expected options with two dashes, --NAME VALUE, got {word}"
     return None
 

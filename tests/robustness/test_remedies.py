@@ -162,6 +162,8 @@ def test_options_of_others_are_answered_with_ours(method, option, remedy, things
         ("confidence_threshold", ["threshold", "confidence"]),
         ("save_paths", ["save", "paths"]),
         ("n_max_fixations", ["max_fixations", "fixations", "n_max"]),
+        ("ignore_classes", ["ignore", "classes"]),
+        ("no_save", []),
     ],
 )
 def test_the_head_of_a_word_of_several_parts_comes_first(word, parts):
