@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.fixations import Fixations, by_picture
+from semfov.data.large import picture_size
 from semfov.data.pictures import Pictures
 from semfov.detection import Detections, Detector, FeatureMaps, Placement
 from semfov.errors import check
@@ -222,9 +223,9 @@ def look(data: ViewingData, source: MapSource) -> list[Viewed]:
     for number, root in enumerate(data.pictures):
         people = data.people(number)
         scenes = Pictures(root, people, ())
-        if number >= len(data.sizes) and len(scenes):
-            size = scenes.annotation(0).size
-            check_usual_frame(data.fixations[number], f"{data.within}sizes", size, "{width}x{height}")
+        if number >= len(data.sizes):
+            sizes = (picture_size(Path(root) / name) for name in scenes.ids)
+            check_usual_frame(data.fixations[number], f"{data.within}sizes", sizes, "{width}x{height}")
         groups += _grouped(_looks(store, scenes, people), data.seconds_of(number), number)
     return groups
 

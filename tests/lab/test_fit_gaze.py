@@ -323,13 +323,22 @@ def test_pictures_are_looked_at_once(tmp_path):
 def test_a_frame_that_a_file_lacks_is_asked_for_where_pictures_are_not_those_of_osie(tmp_path):
     image, place = picture(3)
     Image.fromarray((image * 255).byte().permute(1, 2, 0).numpy()).save(tmp_path / "3.png")
-    write_osie(tmp_path / "people.json", [replace(one, durations=np.ones(len(one))) for one in people(3, place, 2)])
+    viewed = [replace(one, durations=np.ones(len(one))) for one in people(3, place, 2)]
+    write_osie(tmp_path / "people.json", viewed)
     source = MapSource(("red",), lambda image: covering({"red": image[:, :1]}, SIZE), {})
     given = {"fixations": (tmp_path / "people.json",), "pictures": (tmp_path,), "cache": tmp_path}
-    with pytest.raises(InputError, match=r"^gaze\.sizes: .* pictures of 80 × 60: 80x60 if .* 800x600 if"):
+    told = r"^gaze\.sizes: .* pictures of 80 × 60: 80x60 if .* 800x600 if"
+    with pytest.raises(InputError, match=told):
         look(GazeModelFit(**given), source)
     (group,) = look(GazeModelFit(**given, sizes=("80x60",)), source)
     assert group.size == SIZE
+    # One of OSIE's size before it tells nothing of the others.
+    Image.new("RGB", (800, 600)).save(tmp_path / "0.png")
+    points = np.random.default_rng(0).uniform(0, [800, 600], (80, 2))
+    many = Fixations("0.png", "1", points, (800, 600), durations=np.ones(80))
+    write_osie(tmp_path / "people.json", [many, *(replace(one, size=(800, 600)) for one in viewed)])
+    with pytest.raises(InputError, match=told):
+        look(GazeModelFit(**given), source)
 
 
 def test_settings_of_gaze_without_their_fixations_are_refused():

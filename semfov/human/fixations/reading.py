@@ -1,7 +1,7 @@
 """Reading of fixations from a file of any format of this folder, which its content tells."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from inspect import signature
 from os import PathLike
 from pathlib import Path
@@ -135,7 +135,7 @@ def _is_eyelink(source: str | PathLike[str]) -> bool:
     return read_text(source, WINDOWS).lstrip().startswith(("** CONVERTED FROM", "MSG\t"))
 
 
-def check_usual_frame(path: str | PathLike[str], argument: str, size: tuple[int, int], how: str) -> None:
+def check_usual_frame(path: str | PathLike[str], argument: str, sizes: Iterable[tuple[int, int]], how: str) -> None:
     """Refuse a file of OSIE's form for pictures of another size than those of OSIE, unless a frame is given.
 
     Such a file does not tell its frame. In OSIE's, points of smaller pictures with the same proportions would lie too
@@ -144,13 +144,14 @@ def check_usual_frame(path: str | PathLike[str], argument: str, size: tuple[int,
     Args:
         path: the file, read without a frame.
         argument: name of the argument, for the message.
-        size: `(width, height)` of a picture of the file.
+        sizes: `(width, height)` of the pictures of the file.
         how: how a frame is given, with `{width}` and `{height}` in it.
 
     Raises:
         InputError: with how to give the frame.
     """
-    if reader_of(path) is not read_osie or tuple(size) == OSIE_FRAME:
+    size = next((size for size in sizes if tuple(size) != OSIE_FRAME), None)
+    if size is None or reader_of(path) is not read_osie:
         return
     of_pictures, of_osie = (how.format(width=width, height=height) for width, height in (size, OSIE_FRAME))
     got = f"pictures of {size[0]} × {size[1]}"

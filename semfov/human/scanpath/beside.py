@@ -171,7 +171,7 @@ def _fixations_in_file(path: str | PathLike[str], picture: str | None, size: tup
         picture: name of the picture; None for one without a name.
         size: `(width, height)` of the picture.
     """
-    check_usual_frame(path, "people", size, "read_fixations(file, size=({width}, {height}))")
+    check_usual_frame(path, "people", [size], "read_fixations(file, size=({width}, {height}))")
     table = read_fixations(path)
     if picture is None:
         return [*table]
