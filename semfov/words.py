@@ -451,9 +451,7 @@ METRICS = _by_word(
             "scanmatch sequence_score sim similarity"
         ),
         "semfov.metrics.calibration": "Calibration ECE calibration_error ece reliability",
-        "semfov.metrics.average_precision": (
-            "AP AveragePrecision MeanAveragePrecision ap ap50 average_precision mAP map map50"
-        ),
+        "semfov.metrics.average_precision": ("AP AveragePrecision MeanAveragePrecision ap ap50 mAP map map50"),
         "semfov.metrics.episodes": "area_under_roc cumulative_performance roc_auc standard_error",
     }
 )
