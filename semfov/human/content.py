@@ -211,8 +211,9 @@ def content_suspicions(
     reading = _better_reading(evidence)
     # A shift and another size of the frame look alike where few fixations lie at the borders.
     best = max(filter(None, (shift, reading)), key=lambda finding: finding.fit, default=None)
-    if best is None:
-        best = _place_on_frame(evidence)
+    if best is None or best is shift:
+        # Of pictures at a place that no reading comes close to, some fixations fit by a shift, too.
+        best = _place_on_frame(evidence, 0.0 if best is None else best.fit) or best
     if best is not None:
         return [best.line]
     # A drift may be so large that the later fixations do not fit their pictures.
@@ -421,16 +422,26 @@ def _line_of(reading: _Reading, evidence: _Evidence) -> str:
     )
 
 
-def _place_on_frame(evidence: _Evidence) -> _Finding | None:
-    """Find another place of the pictures on the frame, which none of the readings that are tried comes close to."""
-    coarse = max((*_NAMED_PLACES, *_PARTS_OF_FRAME, *_OTHER_FRAMES), key=evidence.fit)
+def _place_on_frame(evidence: _Evidence, fit_of_shift: float) -> _Finding | None:
+    """Find another place of the pictures on the frame, which none of the readings that are tried comes close to.
+
+    Args:
+        evidence: the densities of the pictures.
+        fit_of_shift: mean fit in bits without a shift that looks like it; 0 where none does.
+
+    Returns:
+        The finding; None where no place fits clearly better than the present one and than the shift.
+    """
+    shift = evidence.best_shift(evidence.records).shift
+    moved = _Reading(lambda points, frame, picture: _shares_as_read(points, frame, picture) + shift)
+    coarse = max((moved, *_NAMED_PLACES, *_PARTS_OF_FRAME, *_OTHER_FRAMES), key=evidence.fit)
     place = evidence.place_near(coarse)
     if place is None:
         return None
     exact = _at(place)
     fits = evidence.fits(exact)
     is_clear = _is_clear(fits - evidence.fits(_PRESENT_READING), _LEAST_GAIN_OF_PLACE)
-    if not (is_clear and _is_clear(fits, _LEAST_GAIN_OF_PLACE)):
+    if not (is_clear and _is_clear(fits, fit_of_shift + _LEAST_GAIN_OF_PLACE)):
         return None
     return _Finding(_line_of(exact, evidence), float(fits.mean()))
 
@@ -467,7 +478,7 @@ def _at(place: PicturePlace) -> _Reading:
     width, height = place.sides.round().astype(int).tolist()
     return _Reading(
         lambda points, frame, picture: place.shares(points),
-        f"the pictures covered {width} × {height} px of the frame",
+        f"the pictures covered {width} × {height} px of the screen",
         f"use in_picture(size, place=({x}, {y}, {width}, {height})), which may be some pixels off",
     )
 

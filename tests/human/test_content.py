@@ -79,6 +79,8 @@ def test_a_fault_is_named(fault, seed):
 PLACES = {
     "own size in a frame that a part would fit, too": (240, 212, 800, 600, (1280, 1024)),
     "stretched, off the middle": (300, 60, 700, 800, (1280, 1024)),
+    "own size, in a corner": (480, 424, 800, 600, (1280, 1024)),
+    "own size, in another corner": (0, 424, 800, 600, (1280, 1024)),
     "own size in a screen that the file does not tell": (240, 212, 800, 600, FRAME),
     "enlarged in a screen that the file does not tell": (240, 0, 1440, 1080, FRAME),
 }
