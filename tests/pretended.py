@@ -27,6 +27,7 @@ _BY_INDEX = (_aten.index.Tensor, _aten.index_put.default, _aten.index_put_.defau
 _WAITING = (
     _aten._local_scalar_dense.default,
     _aten.is_nonzero.default,
+    _aten.equal.default,
     _aten.nonzero.default,
     _aten.bincount.default,
     _aten.masked_select.default,

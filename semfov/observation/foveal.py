@@ -484,17 +484,18 @@ class FovealObservationModel(Pretrained):
     def _linear(self) -> tuple[Tensor, Tensor]:
         """Compute weights and constants of the log likelihoods (`linear_map`).
 
-        They are kept in `eval` mode and without gradients.
+        They are kept in `eval` mode and without gradients, on the CPU: a GPU would be waited for to compare parameters.
         """
         parameter = self.log_alpha
         is_recorded = torch.is_grad_enabled() and parameter.requires_grad
-        if self.training or is_recorded or torch.compiler.is_exporting():
+        is_here = parameter.device.type == "cpu"
+        if self.training or is_recorded or torch.compiler.is_exporting() or not is_here:
             return linear_map(self.alpha)
-        if torch.compiler.is_compiling() and parameter.device.type == "cpu":
+        if torch.compiler.is_compiling():
             # A graph would compute the gamma functions at each call, so that it takes ten times as long.
             weight, constant = torch.ops.semfov.linear_map(parameter)
             return weight, constant
-        # Values that are not known cannot be compared: those of a graph, and of a model in `torch.func`.
+        # Values that are not known cannot be compared: those of a model in `torch.func`.
         return kept_map(parameter) if values_known(parameter) else linear_map(self.alpha)
 
 

@@ -15,6 +15,7 @@ import torch
 from semfov import DirichletStatistics, FovealObservationModel, InputError, dirichlet
 from semfov.io.compatibility import NETWORKS, check_same_detector
 from semfov.observation.fitting import _estimate_prior, fit_tables
+from tests.pretended import GPU, a_gpu, waits
 from tests.refusals import refused
 
 CLASSES = ["cup", "cat", "dog"]
@@ -412,6 +413,20 @@ def test_likelihoods_are_those_of_the_present_parameters(change):
         fresh = FovealObservationModel(model.alpha, EDGES, CLASSES)(scores, distance)
     torch.testing.assert_close(after, fresh)
     assert not torch.allclose(after, before)
+
+
+def test_likelihoods_wait_for_a_gpu_no_more_often_in_evaluation_than_in_training():
+    scores, distance = looks(dtype=torch.float32)
+    found = []
+    with torch.no_grad(), a_gpu():
+        model = FovealObservationModel(table(torch.float32), EDGES, CLASSES).to(GPU)
+        given = scores.to(GPU), distance.to(GPU)
+        for is_training in (True, False):
+            model.train(is_training)(*given)
+            with waits() as operations:
+                model(*given)
+            found.append(operations)
+    assert found[0] == found[1]
 
 
 def test_models_side_by_side_equal_each_alone():
