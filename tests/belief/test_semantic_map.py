@@ -1,6 +1,7 @@
 """The semantic map: loops over cells, the closest look, cells without detections, gradients, its fit."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -42,6 +43,19 @@ def watch(observer, looks, order=(0, 1, 2)):
 def covers(box, cell):
     left, top = cell % 5 * 20, cell // 5 * 20
     return box[0] < left + 20 and box[2] > left and box[1] < top + 20 and box[3] > top
+
+
+@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
+def test_ratios_beyond_half_precision_are_kept_by_automatic_mixed_precision(looks, precision):
+    """The largest number of float16 is 65,504, and a detection may be a million times as likely as background."""
+    exact = looks.scores.float().clone()
+    exact[..., 0] = 1e-6
+    seen = replace(looks, scores=exact / exact.sum(-1, keepdim=True))
+    observer = SemanticMap(FovealObservationModel.identity(["cup", "cat", "dog"], [0.2]).requires_grad_(False))
+    expected = observer.weigh(seen, FIXATIONS, GRID).ratio
+    assert expected.max() > 1e5
+    with torch.autocast("cpu", precision):
+        assert torch.equal(observer.weigh(seen, FIXATIONS, GRID).ratio, expected)
 
 
 def test_a_cell_takes_the_likelihood_of_its_closest_look(looks):
