@@ -26,7 +26,8 @@ class Policy(nn.Module):
         model: model that the function is made from; one that needs none leaves it out.
         samples: number of looks that are drawn for each class and level, over which a function that predicts looks
             takes the expectation; the model's Dirichlets must be densities of the scores. None takes the look with the
-            expected scores, as published. They are drawn anew when the model has changed.
+            expected scores, as published. They are drawn anew when the model has changed, except in a compiled graph
+            and in `torch.func`.
         calibrated: whether the scores of a drawn look are calibrated before they update the belief.
         settings: further arguments of the acquisition function, None included; parameters and modules among them are
             those of the policy. Their names are others than those of arguments and attributes of `Policy`.
@@ -62,8 +63,7 @@ class Policy(nn.Module):
             predicts = "likelihoods" in self.function.takes
             check(predicts, "samples", f"None for policy {self.name!r}, which predicts no look", samples)
             assert isinstance(model, FovealObservationModel)
-            self.drawn_looks = DrawnLooks(samples, calibrated=calibrated)
-            self.drawn_looks(model)  # which raises an error now if it cannot
+            self.drawn_looks = DrawnLooks(model, samples, calibrated=calibrated)
         self._settings = list(settings)
         for name, value in settings.items():
             if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):

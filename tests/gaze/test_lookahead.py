@@ -357,6 +357,27 @@ def test_a_policy_draws_looks_from_the_model_as_it_is_now():
     assert torch.equal(policy(None, ROW).likelihoods, sampled_likelihoods(model, 4))
 
 
+def values_by(policy, beta):
+    return policy(None, ROW)(DirichletBelief(beta), UNSEEN)
+
+
+def test_a_policy_with_drawn_looks_is_one_graph_and_a_function_of_torch():
+    """There the values of a model cannot be compared, and the looks are those drawn last."""
+    policy = Policy("kl", four_classes(), samples=4)
+    beta = 0.05 + draw(len(ROW), 4, dtype=torch.float32)
+    expected = values_by(policy, beta)
+    compiled = torch.compile(values_by, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(policy, beta), expected)
+    state = {f"model.{name}": torch.stack([value, value]) for name, value in policy.model.named_parameters()}
+
+    def drawn(state):
+        return torch.func.functional_call(policy, state, (None, ROW)).likelihoods
+
+    looks = policy(None, ROW).likelihoods
+    together = torch.func.vmap(drawn, out_dims=None)(state)
+    assert torch.equal(together, looks)
+
+
 ACQUISITIONS = {
     "kl": KLDivergence,
     "surprise": BayesianSurprise,

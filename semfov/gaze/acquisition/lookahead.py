@@ -198,22 +198,29 @@ class DrawnLooks(nn.Module):
     """Likelihoods of looks that are drawn from an observation model (`sampled_likelihoods`), kept until it changes.
 
     Args:
+        model: the observation model, which is no part of this module.
         samples: M, number of looks for each class and level.
         calibrated: calibrate the scores.
+
+    Raises:
+        InputError: as for `sampled_likelihoods`.
     """
 
     likelihoods: Tensor
     state: Tensor
 
-    def __init__(self, samples: int, *, calibrated: bool = True) -> None:
+    def __init__(self, model: FovealObservationModel, samples: int, *, calibrated: bool = True) -> None:
         super().__init__()
         self.samples = samples
         self.calibrated = calibrated
-        self.register_buffer("likelihoods", torch.empty(0), persistent=False)
-        self.register_buffer("state", torch.empty(0), persistent=False)  # of the model that these looks are of
+        likelihoods = sampled_likelihoods(model, samples, calibrated=calibrated)
+        self.register_buffer("likelihoods", likelihoods, persistent=False)
+        self.register_buffer("state", torch.cat(_values_of(model)), persistent=False)  # that these looks are of
 
     def forward(self, model: FovealObservationModel) -> Tensor:
-        """Draw looks from a model, or take those that were drawn from it before.
+        """Take the looks that were drawn from a model before, or draw them anew if it has changed since.
+
+        In a graph, and for a model in `torch.func`, values cannot be compared, and the looks are those drawn last.
 
         Args:
             model: the observation model.
@@ -221,13 +228,20 @@ class DrawnLooks(nn.Module):
         Returns:
             `(K+1, N, M, K+1)`, as from `sampled_likelihoods`.
         """
-        values = [value.detach().flatten() for value in (*model.parameters(), *model.buffers())]
+        values = _values_of(model)
+        if not values_known(*values):
+            return self.likelihoods
         state = torch.cat(values)
         is_alike = self.state.device == state.device and self.state.dtype == state.dtype
         if not is_alike or not torch.equal(self.state, state):
             self.likelihoods = sampled_likelihoods(model, self.samples, calibrated=self.calibrated)
             self.state = state
         return self.likelihoods
+
+
+def _values_of(model: FovealObservationModel) -> list[Tensor]:
+    """List the parameters and buffers of a model, each of them as a row of numbers."""
+    return [value.detach().flatten() for value in (*model.parameters(), *model.buffers())]
 
 
 class Lookahead(AcquisitionFunction):
