@@ -20,7 +20,7 @@ from semfov.sensor.base import fixations
 from semfov.sensor.constants import constant
 from semfov.sensor.pyramid import Convention
 
-Width = float | tuple[float, float] | Tensor
+Width = float | tuple[float | Tensor, float | Tensor] | Tensor
 """Width of a fovea: a number, a pair of numbers along x and y, or a tensor `()`, `(B,)` or `(B, 2)`."""
 
 
@@ -70,7 +70,7 @@ class Fovea:
             InputError: a shape does not fit, the gaze is not finite, or σ or growth is not positive.
         """
         fixation = fixations(gaze, images)
-        width = _number_or_tensor(sigma)
+        width = _number_or_tensor(sigma, images)
         _check_positive(width, "sigma")
         _check_positive(growth, "growth")
         return cls(fixation, _widths(width, images), growth)
@@ -188,14 +188,18 @@ def _check_positive(value: float | Tensor, name: str) -> None:
         raise InputError(f"{name}: expected a positive number, got {got}")
 
 
-def _number_or_tensor(sigma: Width) -> float | Tensor:
+def _number_or_tensor(sigma: Width, images: Tensor) -> float | Tensor:
     """Bring a pair of widths, along x and y of all images, to a tensor `(1, 2)`; others stay as they are."""
     if not isinstance(sigma, tuple | list):
         return sigma
-    if not all(isinstance(width, Real) for width in sigma):
+    if not all(isinstance(width, Real) or (isinstance(width, Tensor) and width.ndim == 0) for width in sigma):
         return torch.as_tensor(sigma)
     check(len(sigma) == 2, "sigma", "a number, a pair (x, y) of numbers, or a tensor", sigma)
-    return torch.tensor([sigma], dtype=torch.float64)
+    if all(isinstance(width, Real) for width in sigma):
+        return torch.tensor([sigma], dtype=torch.float64)
+    # Gradients flow through the tensors of a pair.
+    numbers = [width if isinstance(width, Tensor) else torch.tensor(width, dtype=torch.float64) for width in sigma]
+    return torch.stack([as_positions(number, images) for number in numbers])[None]
 
 
 def _widths(sigma: float | Tensor, images: Tensor) -> Tensor:

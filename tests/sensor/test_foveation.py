@@ -167,9 +167,12 @@ def test_pair_of_numbers_is_along_x_and_y_for_any_number_of_images(count):
     """As a tensor, two numbers are the widths of two images."""
     image, gaze = draw(count, 3, 21, 27), torch.tensor([9.0, 8.0])
     expected = foveate(image, gaze, sigma=torch.tensor([[4.0, 9.0]] * count))
-    for pair in ((4.0, 9.0), [4, 9]):
+    for pair in ((4.0, 9.0), [4, 9], (torch.tensor(4.0), torch.tensor(9.0)), (4.0, torch.tensor(9.0))):
         close(foveate(image, gaze, sigma=pair), expected)
     close(foveate(image[0], gaze, sigma=(4.0, 9.0)), expected[0])
+    width = torch.tensor(9.0, requires_grad=True)
+    foveate(image, gaze, sigma=(4.0, width)).square().sum().backward()
+    assert width.grad.abs() > 0
 
 
 def test_learnable_sigma():
