@@ -5,7 +5,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.data.inputs import ImageLike, PointLike, as_batch, as_points, as_positions
-from semfov.errors import check, check_whole
+from semfov.errors import check, check_shape, check_whole
 from semfov.io.compatibility import Settings
 from semfov.sensor.base import Sensor, fixations, is_single_picture, of_one_picture
 from semfov.sensor.glimpse import windows_at
@@ -99,6 +99,8 @@ class MultiScaleFovea(Sensor):
         if is_single_picture(image):
             return self(self.means(image), of_one_picture(points))[0]
         means = image if isinstance(image, tuple) else self.means(image)
+        check(len(means) == self.scales, "image", f"planes of {self.scales} scales", len(means))
+        check_shape(means[0], "image", None, None, None, None)  # no tuple of pictures
         fixation = fixations(points, means[0])
         crops = torch.stack([self._crop(plane, fixation, scale) for scale, plane in enumerate(means)], 2)
         return crops if points.ndim == 3 else crops[:, 0]

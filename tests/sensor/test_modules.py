@@ -111,6 +111,7 @@ def test_bad_input(sensor, prepare):
         ((image[0, 0, 0], gaze), "image: expected"),
         ((image[:, :, :0], gaze), "image: expected at least one pixel"),
         ((image[None], gaze), "image: expected a picture of shape"),
+        ((tuple(image), gaze), "image: expected"),
     ):
         refused(message, sensor, *arguments)
 
