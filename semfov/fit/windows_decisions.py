@@ -172,8 +172,10 @@ def fit_presence(model: GlimpseEvidence, searches: WindowSearches) -> None:
 
     Args:
         model: evidence by magnification, whose `whole` is fitted.
-        searches: E searches of n looks.
+        searches: E searches of n looks. Those of one kind tell nothing, and leave the model as it is.
     """
+    if searches.there.all() or not searches.there.any():
+        return
     # Every look of a search has the answer of its picture.
     there = searches.there[:, None].expand_as(searches.best).flatten()
     facts = model.presence_facts(searches.best, searches.expected).flatten(0, 1)

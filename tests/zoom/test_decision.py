@@ -189,6 +189,17 @@ def test_a_fitted_probability_is_calibrated():
     assert sure[~new.there].double().mean() <= 0.05
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_searches_of_one_kind_leave_the_highest_score_as_the_probability(there):
+    """Where every picture holds each class, they would make it sure of what no look shows."""
+    model = GlimpseEvidence(3)
+    known, _ = synthetic(50, 1)
+    fit_presence(model, known._replace(there=torch.full((50,), there)))
+    with torch.no_grad():
+        log_odds = model.presence(torch.tensor([0.1, 0.9]), torch.tensor([0.0, 3.0]))
+    assert log_odds.tolist() == pytest.approx([logit(0.1), logit(0.9)])
+
+
 SCALES = torch.tensor([0.25, 0.5, 1.0, 0.5])
 WINDOWS = torch.tensor([[0.0, 0, 400, 300], [0, 0, 200, 200], [50, 50, 150, 150], [100, 100, 300, 300]])
 SIZE = (400, 300)
