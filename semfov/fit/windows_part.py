@@ -114,7 +114,7 @@ def _tasks(config: FitMosaicsConfig) -> dict[str, float]:
         "learning the expected number of objects": 0.2 * config.steps,
         "learning the survey": 0.4 * config.survey_steps,
         **{f"searching, {kind}": 4 * count for kind, count in searched.items()},
-        "looking closely": 4 * (config.searched + config.judged),
+        "looking closely": 4 * config.judged,
         "looking at photographs": 25 * _LOOK * config.photographs,
         **{f"exploring, {kind}": 2 * count for kind, count in explored.items()},
     }
