@@ -226,14 +226,9 @@ class PlaceVerifier(ABC, Generic[LookType]):
         return self._decision(is_over=True)
 
     @property
+    @abstractmethod
     def presence(self) -> float:
         """Probability that the picture holds the target: after the closer looks, or that without them."""
-        without = self.places.presence
-        telling = self._recent
-        if self.places.exhaustive:  # the best place alone tells
-            telling = sorted(telling, key=_probability)[-1:]
-        faded = (self._faded(judged.verdict.look.presence, without, judged.verdict.age) for judged in telling)
-        return max(faded, default=without)
 
     @property
     def best(self) -> CloseUp:
@@ -343,6 +338,15 @@ class Verifier(PlaceVerifier[LookType]):
         assert thresholds is not None
         super().__init__(places, thresholds, most)
         self.model = model
+
+    @property
+    def presence(self) -> float:
+        without = self.places.presence
+        telling = self._recent
+        if self.places.exhaustive:  # the best place alone tells
+            telling = sorted(telling, key=_probability)[-1:]
+        faded = (self._faded(judged.verdict.look.presence, without, judged.verdict.age) for judged in telling)
+        return max(faded, default=without)
 
     @torch.no_grad()
     def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:

@@ -160,10 +160,17 @@ class ObjectVerifier(PlaceVerifier[TargetFacts]):
     def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:
         self.places.telling(candidate, detections)
         place, box = self._object_at(candidate.box)
-        presence = max(self.facts.presence(), place)
+        presence = self.facts.presence()
         self.places.dismiss(candidate, box)
         prior = self.places.prior
-        return Judgement(prior.at_place(place, presence), prior(presence), box)
+        self.places.presence = prior(presence)
+        at_least = max(presence, place)
+        return Judgement(prior.at_place(place, at_least), prior(at_least), box)
+
+    @property
+    def presence(self) -> float:
+        """Probability that the picture holds the target: that after all looks, closer ones too, or the surest place."""
+        return max([self.places.presence, *(judged.probability for judged in self._judged_places)])
 
     def _object_at(self, box: Tensor) -> tuple[float, Tensor]:
         """Find the surest object at a box `(4,)`: its probability and its box; `_NOTHING` and the same box for none."""

@@ -332,6 +332,25 @@ def test_where_no_look_shows_the_target_it_hardly_is():
     assert look.presence == pytest.approx(0.801 / 1.801, rel=1e-4)
 
 
+def test_the_picture_is_as_probable_as_after_all_closer_looks():
+    """A closer look that has told more of it is contradicted by the one after it."""
+    boxes = [ONE, OTHER, [700.0, 100, 740, 140]]
+    whole = replace(seen(boxes, [0.5, 0.49, 0.5]), window=Window.overview(LATTICE))
+    facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1))
+    facts.add(whole)
+    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE), replace(AT, place=0.0), 2)
+    judge.see(TargetFacts(whole.detections, 1, facts.presence(), 0.5, 0.0))
+    for score, count in ((0.3, 1.29), (0.1, 0.89)):
+        box = judge.candidate.box
+        close = replace(seen([box.tolist()], [score]), window=closer_window(LATTICE, box))
+        facts.add(close)
+        look = judge.examine(close.detections)
+        assert look.presence == pytest.approx(count / (1 + count), abs=2e-3)
+        assert judge.presence == pytest.approx(look.presence)
+    assert [look.place for look in judge.looks] == pytest.approx([0.3, 0.1], abs=1e-4)
+    assert judge.decision().outcome == "absent"
+
+
 def test_thresholds_of_places_are_saved_with_the_evidence(tmp_path):
     torch.manual_seed(0)
     model = GlimpseEvidence(3, places=AT)
