@@ -298,8 +298,12 @@ class PlaceVerifier(ABC, Generic[LookType]):
         look = verdict.look
         if self.places.forgetting.share_left(verdict.age) == 1:
             return look.place
-        faded = self._faded(look.place, self.places.probability(look), verdict.age)
+        faded = self._faded(look.place, self._believed(look), verdict.age)
         return min(look.place, faded)
+
+    def _believed(self, look: CloseUp) -> float:
+        """Present probability that the target is at the place of a closer look; that of the look fades towards it."""
+        return self.places.probability(look)
 
     def _faded(self, fresh: float, without: float, age: float) -> float:
         """Let a probability after a closer look fade towards that without closer looks.

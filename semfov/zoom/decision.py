@@ -172,6 +172,12 @@ class ObjectVerifier(PlaceVerifier[TargetFacts]):
         """Probability that the picture holds the target: that after all looks, closer ones too, or the surest place."""
         return max([self.places.presence, *(judged.probability for judged in self._judged_places)])
 
+    def _believed(self, look: CloseUp) -> float:
+        # Scores of candidates would be compared with that of the closer look itself.
+        place, _ = self._object_at(look.box)
+        prior = self.places.prior
+        return prior.at_place(place, max(prior.inverse(self.places.presence), place))
+
     def _object_at(self, box: Tensor) -> tuple[float, Tensor]:
         """Find the surest object at a box `(4,)`: its probability and its box; `_NOTHING` and the same box for none."""
         objects, chances = self.facts.objects()

@@ -351,6 +351,28 @@ def test_the_picture_is_as_probable_as_after_all_closer_looks():
     assert judge.decision().outcome == "absent"
 
 
+def test_a_place_of_a_stream_stays_as_probable_as_the_object_that_looks_show_there():
+    """The closer look counts among them until half of its evidence has faded."""
+    whole = replace(seen([ONE], [0.3]), window=Window.overview(LATTICE))
+    facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1), latest=True)
+    facts.add(whole)
+    forgetting = Forgetting(0.25)
+    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE, forgetting), AT, 9)
+    judge.see(TargetFacts(whole.detections, 1, facts.presence(), 0.3, 0.0), last=True)
+    close = replace(seen([ONE], [0.9]), window=closer_window(LATTICE, judge.candidate.box))
+    facts.add(close)
+    judge.examine(close.detections)
+    judge.wait(0.9 * forgetting.span)
+    judge.see(TargetFacts(whole.detections, 2, facts.presence(), facts.best, 0.0))
+    assert judge.decision().place == pytest.approx(0.9, abs=1e-3)
+    # Without it there is what the others show.
+    facts.see([whole])
+    judge.see(TargetFacts(whole.detections, 3, facts.presence(), facts.best, 0.0))
+    left = forgetting.share_left(0.9 * forgetting.span)
+    odds = left * math.log(9) + (1 - left) * math.log(3 / 7)
+    assert judge.decision().place == pytest.approx(1 / (1 + math.exp(-odds)), abs=1e-3)
+
+
 def test_thresholds_of_places_are_saved_with_the_evidence(tmp_path):
     torch.manual_seed(0)
     model = GlimpseEvidence(3, places=AT)
