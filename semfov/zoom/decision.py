@@ -149,6 +149,9 @@ class ObjectVerifier(PlaceVerifier[TargetFacts]):
     has the probability of the surest object whose box overlaps that of the candidate, and its box. The probability of
     the picture is that after all looks, and no smaller than that of the place.
 
+    In a stream a place fades towards the object that the looks show there now, and the picture's probability does not
+    fade.
+
     Attributes:
         facts: what the looks of the search have shown.
     """
