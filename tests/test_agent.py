@@ -384,8 +384,8 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
         (ActivePerception.recommended, {"columns": 12}, r"columns: expected an option of .*; did you mean grid=\?$"),
         (ActivePerception.from_pretrained, {"strides": 32}, r"strides: .*; did you mean stride=\?$"),
         (ActivePerception.published, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
-        (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one; known: sensor,"),
-        (ActivePerception.recommended, {"sigma": 50.0}, r"sigma: .*, got an unknown one; known: grid,"),
+        (ActivePerception.published, {"rows": 3}, r"rows: .*, got an unknown one; known: name, sensor,"),
+        (ActivePerception.recommended, {"sigma": 50.0}, r"sigma: .*, got an unknown one; known: name, grid,"),
         (ActivePerception.raw, {"treshold": 0.1}, r"treshold: .*; did you mean threshold=\?$"),
         (ZoomAgent.recommended, {"finst": 0.5}, r"finst: .*; did you mean finest="),
         (

@@ -5,7 +5,8 @@ import warnings
 from numpy.typing import ArrayLike
 
 from semfov.errors import InputError, check
-from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion, PatchFlow
+from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
+from semfov.motion.patches import PatchFlow
 from semfov.zoom.eye import WindowView
 
 

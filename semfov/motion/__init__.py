@@ -3,15 +3,5 @@
 from semfov.motion.camera import CameraMotion, CameraStep, KnownPoses
 from semfov.motion.lost_scene import LostScene
 from semfov.motion.motion import Motion, moved_boxes
-from semfov.motion.patches import FollowedPatches, PatchFlow
 
-__all__ = [
-    "CameraMotion",
-    "CameraStep",
-    "FollowedPatches",
-    "KnownPoses",
-    "LostScene",
-    "Motion",
-    "PatchFlow",
-    "moved_boxes",
-]
+__all__ = ["CameraMotion", "CameraStep", "KnownPoses", "LostScene", "Motion", "moved_boxes"]

@@ -18,7 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from semfov.detection.selection import Selection, remaining_rows
-from semfov.motion import CameraStep, LostScene, Motion, PatchFlow
+from semfov.motion import CameraStep, LostScene, Motion
+from semfov.motion.patches import PatchFlow
 from semfov.tracking.assignment import cheapest_pairs
 from semfov.tracking.kalman import Floats, Kinematics
 from semfov.tracking.model import TrackingModel

@@ -309,7 +309,7 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         super()._load_fitted_values(values)
         self.places = thresholds_of(values.get("places"))
 
-    def _record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, object]:
         return {
             "classes": self.classes,
             "foresight": self.foresight,

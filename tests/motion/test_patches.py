@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semfov.motion import PatchFlow
+from semfov.motion.patches import PatchFlow
 from tests.motion.test_camera import scene
 
 WIDE, HIGH = 30, 50

@@ -406,7 +406,10 @@ def test_belief_maps_are_counted_from_0_and_from_the_end(options, agent):
         (lambda agent: agent.find_all(PIXELS).objects.top, r"Objects has .*; use objects\[objects.scores.argsort"),
         (lambda agent: agent.explore(PIXELS).plot(cmap="hot"), "cmap: expected an option of plot_scanpath, got an"),
         (lambda agent: agent.explore(PIXELS).report("a.html", width_px=9), "width_px: .* option of report, .* width="),
-        (lambda agent: agent.track, "an agent has no attribute 'track'; use search, find_all, explore, gaze and live"),
+        (
+            lambda agent: agent.track,
+            "an agent has no attribute 'track'; use agent.live.*, whose step",
+        ),
         (
             lambda agent: agent.explore(PIXELS, target="cup"),
             "target: .* an unknown one; find_all.*, search",

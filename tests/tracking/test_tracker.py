@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.motion import CameraStep, Motion, PatchFlow
+from semfov.motion import CameraStep, Motion
+from semfov.motion.patches import PatchFlow
 from semfov.tracking import Seen, Tracker, TrackingModel
 from semfov.tracking.gain import value_of_windows
 from semfov.zoom.lattice import Lattice

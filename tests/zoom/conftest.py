@@ -22,7 +22,7 @@ def detector():
 
 @pytest.fixture
 def agent(detector):
-    torch.manual_seed(1)
+    torch.manual_seed(4)
     return ZoomAgent(WindowEye(detector), GlimpseEvidence(3)).eval()
 
 
