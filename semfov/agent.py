@@ -219,9 +219,8 @@ class ActivePerception(MovableModule):
     @classmethod
     def _of(cls, make: Callable[..., dict[str, Any]], /, *arguments: object, **options: Any) -> Self:
         """Make an agent of the parts that a function gives from the options of a constructor, ready for use."""
-        is_named = make in (recommended_arguments, published_arguments, raw_arguments)
-        known = ["name", *option_names(make)] if is_named else option_names(make)
-        check_options(options, known, "the agent or of semfov.load_detector")
+        names = ["name"] if make in (recommended_arguments, published_arguments, raw_arguments) else []
+        check_options(options, [*names, *option_names(make)], "the agent or of semfov.load_detector")
         return cls(**make(*arguments, **options)).eval().requires_grad_(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
