@@ -297,7 +297,7 @@ def tracks_at(*boxes, odds=2.0, variance=1.0):
     ("tracks", "fate", "errors"),
     [
         (tracks_at((100, 100, 140, 140), (102, 100, 142, 140)), LISTED, {"double": 1}),
-        (tracks_at((100, 100, 140, 140), odds=-1.0), "improbable", {}),
+        (tracks_at((100, 100, 140, 140), odds=-4.0), "improbable", {}),  # also as it moves
         (tracks_at((100, 100, 140, 140), variance=1e4), "place uncertain", {}),
         (tracks_at((125, 100, 165, 140)), "wrong place", {"beside an object": 1}),
         (tracks_at((300, 300, 340, 340))[1:], "forgotten", {}),
