@@ -155,17 +155,32 @@ class Tracker:
         # Beside the scene, in pixels of the last frame: what the camera's motion does not explain.
         origins = motion.inverse().points(torch.from_numpy(found.places)).numpy()
         shifts = origins - places
-        # What stays behind is the ground, or what hides an object, unless the last frame showed just the same of it.
-        far = np.linalg.norm(way, axis=-1)
-        stays_behind = (far > _CLEAR_WAY) & (np.linalg.norm(shifts, axis=-1) < far / 2)
-        was_shown = (tracks.unseen == 0) | np.isin(tracks.track_ids, self._followed)
-        has_stopped = was_shown & (found.changes < _SAME)
-        followed = found.are_followed & (has_stopped | ~stays_behind)
+        followed = found.are_followed & self._are_objects(tracks, way, shifts, found.changes)
         variance = (self.model.flow * tracks.sides) ** 2 + self.model.unsteady**2
         moved = tracks.kinematics.moved(shifts / seconds, variance / seconds**2)
         kinematics = self.tracks.kinematics.with_rows(rows[followed], moved[followed])
         self.tracks = replace(self.tracks, kinematics=kinematics)
         return tracks.track_ids[followed]
+
+    def _are_objects(self, tracks: Tracks, way: Floats, shifts: Floats, changes: Floats) -> NDArray[np.bool_]:
+        """Tell which patches are those of the objects: not the ground where they were, nor what hides them.
+
+        What stays behind is no object, unless the last frame showed just the same of it: then the object has stopped.
+
+        Args:
+            tracks: the objects.
+            way: `(N, 2)`, how far they were expected to move, in pixels.
+            shifts: `(N, 2)`, how far their patches have moved.
+            changes: `(N,)`, how much these have changed (`FollowedPatches`).
+
+        Returns:
+            `(N,)`.
+        """
+        far = np.linalg.norm(way, axis=-1)
+        stays_behind = (far > _CLEAR_WAY) & (np.linalg.norm(shifts, axis=-1) < far / 2)
+        was_shown = (tracks.unseen == 0) | np.isin(tracks.track_ids, self._followed)
+        has_stopped = was_shown & (changes < _SAME)
+        return np.asarray(has_stopped | ~stays_behind)
 
     def _at_present(self, scenes: list["_Known"], motion: Motion) -> list["_Known"]:
         """Predict objects at the present frame, to which the camera moved."""

@@ -152,6 +152,11 @@ class Tracks:
         """
         moves = (1 - self.standing / _STANDING).clip(0)
         rows = np.flatnonzero(moves > _ROUNDING)
+        moves[rows[self._are_parts(rows)]] = 0
+        return _MOVING * moves
+
+    def _are_parts(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Tell which of some tracks lie in, or around, a more probable one of these of their class, `(M,)`."""
         by_looks = (self.shown_odds + self.missed_odds)[rows]
         labels = self.labels[rows]
         boxes = self.corners[rows]
@@ -159,9 +164,7 @@ class Tracks:
         shared = np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - np.maximum(boxes[:, None, :2], boxes[:, :2])
         is_same = shared.clip(0).prod(-1) >= _PART * np.minimum(area[:, None], area)
         is_same &= labels[:, None] == labels
-        is_part = (is_same & (by_looks > by_looks[:, None])).any(1)
-        moves[rows[is_part]] = 0
-        return _MOVING * moves
+        return np.asarray((is_same & (by_looks > by_looks[:, None])).any(1))
 
     @property
     def existence(self) -> Floats:
