@@ -405,7 +405,7 @@ class FoveaStream(StreamEpisode[FoveaMoment]):
         return image
 
     def _look_closely(self, gaze: FoveaGaze, image: Tensor) -> None:
-        """Spend a frame on a closer look."""
+        """Spend a frame on a closer look; the belief stays, and fades for this time at the next fixation."""
         gaze.image = image
         look = gaze.look_closely()
         self._passes += 1

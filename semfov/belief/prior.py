@@ -2,16 +2,18 @@
 
 Where the `prior` of a search changes its probabilities, and where the share of the fit is kept:
 
-    looks by             changed by                                            share of the fit
-    -------------------  ----------------------------------------------------  -------------------------------------
-    a fovea              `Strategy.with_prior`, by the observer's              `Presence.shares`, by class
-                         `SemanticSearch.with_prior`
-    a head               `HeadAgent.search`, by the same observer              the same
-    windows              `semfov.zoom.decision.decisions_of`                   of a photograph
-                                                                               `PhotographEvidence.shares`, by class;
-                                                                               of a large picture one half
-    closer looks         `semfov.decision.PlaceVerifier` by its places,        that of the kind of look
-                         which have the prior of their search
+    looks by          changed by                                  probabilities assume    `prior="fit"` stands for
+    ----------------  ------------------------------------------  ----------------------  --------------------------
+    a fovea           `Strategy.with_prior`, by the observer's    one half                `Presence.shares`, by class
+                      `SemanticSearch.with_prior`
+    a head            `HeadAgent.search`, by the same observer    one half                the same
+    windows: a        `semfov.zoom.decision.decisions_of`         `PhotographEvidence     the same
+    photograph                                                    .shares`, by class
+    windows: a large  the same                                    one half                one half
+    picture
+    closer looks      `semfov.decision.PlaceVerifier` by its      as the looks of their search
+                      places, which have the prior of their
+                      search
 
 The record keeps what was given (`prior`) and what is assumed (`assumed`), and changes its own decision
 (`Record.probability_at`).

@@ -46,9 +46,9 @@ presence does (`settle`):
     >= confirm, without      presence, if a fixated      presence, if a detection    as a large picture
                              cell is nearly the most     shows the target
                              probable one
-    a closer look is due     at a cell from              at a box from the confirm   where the hit chance of
-                             Thresholds.place on, if a   of the presence on; at the  that place >= stop_below
-                             fixated cell is nearly the  last look from
+    a closer look is due     at a cell from              at a box from the fitted    where the hit chance of
+                             Thresholds.place on, if a   confirm of presence on;     that place >= stop_below
+                             fixated cell is nearly the  at the last look from
                              most probable one, or at    Thresholds.place on
                              the last look
     a closer look            tells of its place and of   is one more look: place     as a fovea, by windows

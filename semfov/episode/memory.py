@@ -32,6 +32,10 @@ class Forgetting:
     Objects that are tracked have a rate of their own (`TrackingModel.loss`). The default rates are `RATE` in
     `semfov.agents.fovea` and in `semfov.agents.windows`; a scene for a head has its own `rate`.
 
+    With a rate of 0 nothing is forgotten, and a stream is taken for a still picture: no object is tracked, boxes are
+    joined over all looks (`semfov.zoom.objects`), no window is looked at twice, and the episode ends where nothing is
+    left to look at.
+
     Attributes:
         rate: r per second, 0 or more; 0 forgets nothing.
         span: seconds after which half of the evidence is left, :math:`\ln 2 / r`.

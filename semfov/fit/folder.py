@@ -1,4 +1,17 @@
-"""The fits of a model folder, one part after another; what an earlier run finished is read from the folder."""
+"""The fits of a model folder, one part after another; what an earlier run finished is read from the folder.
+
+    part          builds on                              without it, or if it is no better, agents have
+    ------------  -------------------------------------  ---------------------------------------------------
+    observation   looks at cells                         raw scores
+    search        the same looks, from the observation   raw scores, and no presence
+                  model if that is used
+    verification  closer looks of the search model;      no closer looks
+                  left out without one
+    windows       its own looks at mosaics               slices, which no belief chooses
+
+A part is fitted again if its settings, the photographs, a part before it or any code of the package changed. Looks are
+made again only if what looking imports changed (`semfov.io.code`).
+"""
 
 import json
 import os

@@ -1,4 +1,16 @@
-"""Digests of code, which tell whether a stored result was computed by the present code."""
+"""Digests of code, which tell whether a stored result was computed by the present code.
+
+    stored                               digest of                             after a change of that code
+    -----------------------------------  ------------------------------------  -------------------------------------
+    looks of fits and studies            what looking imports                  they are made anew
+    (`semfov.runs.store`)                (`semfov.runs.looks.LOOK_SOURCES`)
+    results of studies, parts of a fit   the package, and classes of a user    they are computed anew
+    (`semfov.runs.scene_run`)            that run in it
+    pictures that a stopped command has  the package                           the command refuses to go on, and says
+    finished (`semfov.cli.results`)                                            which folder to remove
+
+Comments and docstrings change no digest.
+"""
 
 import hashlib
 import sys

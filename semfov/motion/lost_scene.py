@@ -1,4 +1,10 @@
-"""What is known of a scene that the camera lost: kept for some frames, and carried along if it is found again."""
+"""What is known of a scene that the camera lost: kept for some frames, and carried along if it is found again.
+
+What is kept so: looks at windows (`semfov.zoom.episode`, `semfov.agents.window_episode`), candidates and places of
+closer looks (`semfov.decision.candidates`, `semfov.decision.verifier`, `semfov.zoom.closer`), and tracked objects
+(`semfov.tracking.tracker`). A belief by windows is made anew of the looks that are left, with none from a new look at
+the whole.
+"""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar

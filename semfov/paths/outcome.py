@@ -252,7 +252,8 @@ class Outcome(ABC):
         """Expected number of objects by the name of their class; NaN, and null in files, where it is not known.
 
         It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
-        each class has its share of that sum. It is not known where scores are no probabilities, as in looks of a fovea
+        each class has its share of that sum; for several classes that were asked for, and in a search, what looks have
+        shown is all that counts. It is not known where scores are no probabilities, as in looks of a fovea
         or a head. Of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`) it is twice the sum
         (`semfov.zoom.certainty.number_of_faint`), and not known in a large picture in which no other class is clear.
         For the target of a search it is at least the probability of the decision, since a picture that holds the target

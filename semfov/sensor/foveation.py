@@ -288,7 +288,8 @@ class Foveation(Sensor):
     no scale of its own, and σ' = σ.)
 
     Args:
-        sigma: width of the fovea in image pixels; a tensor with gradients stays in the graph.
+        sigma: width of the fovea in pixels of the image that it is called with (a `semfov.Eye` brings pictures to one
+            size before, its `reference`); a tensor with gradients stays in the graph.
         levels: number of bands of the pyramid.
         growth: factor by which the window of each coarser band is wider; a tensor with gradients stays in the graph.
         convention: convention of the pyramid, `kornia` or `opencv`.

@@ -2,7 +2,7 @@
 
 tracks ── their boxes are followed, ──► predicted ── a look at a window ──► seen: place, velocity, more probable
           the camera moves, time passes                                     not seen there: less probable
-                                                                            not looked at: as they were
+                                                                            not looked at: less so with time (ℓ)
 
 `semfov.agents.window_episode.WindowSession` makes the tracker of a stream, and asks another one for the same: `follow`
 before a frame, `see` after each look, `tracks` for the list, and `model` for the value of looks
@@ -83,7 +83,8 @@ class Tracker:
     and did not (`TrackingModel`), and times one for an object that is seen to move (`Tracks.moving_odds`).
 
     Detections belong to the objects at whose predicted places they most probably lie, all of them jointly; others begin
-    objects of their own. What no look covers stays as it was, so that objects go on while they are out of view.
+    objects of their own. What no look covers goes on, also out of view: it loses ℓ a second (`TrackingModel.loss`), and
+    is dropped below `TrackingModel.least`.
 
     Args:
         model: what is assumed of objects and looks; None for the usual.

@@ -418,6 +418,15 @@ def decisions_of(
 ) -> WindowDecisions:
     """Make the decisions of a search with evidence, by the kind of picture and the settings.
 
+    Evidence for large pictures has two sets of fitted thresholds, that for photographs one:
+
+        `GlimpseEvidence.thresholds`   of presence: its `stop_below` ends searches, and a box is looked at closely from
+                                       its `confirm` on, which the setting does not change
+        `GlimpseEvidence.places`       of places after closer looks: its `confirm` finds. None for no closer looks
+
+    The setting `stop_below` replaces that of presence. The setting `confirm` replaces that of places, and where no
+    closer look is made that of presence. In files of models `stop_below` is named `give_up`.
+
     Args:
         belief: the belief of the search, before the first look.
         settings: thresholds, number of closer looks, and prior; None takes what was fitted.
@@ -439,7 +448,6 @@ def decisions_of(
         most = MOST_IN_PHOTOGRAPH
     if settings.closer is not None:
         most = settings.closer
-    # Not `confirm` yet, which is about a place where closer looks decide, else about the picture.
     thresholds = (fitted or _DEFAULTS).changed(stop_below=settings.stop_below)
     if not most or of_places is None:
         return DecisionsByPresence(facts, thresholds.changed(settings.confirm), prior)

@@ -78,7 +78,8 @@ class WindowEye(nn.Module):
     of the picture cuts no object.
 
     A window that reaches beyond the picture shows less than the canvas holds. Padding surrounds what it shows, or it
-    fills the canvas, with other proportions by a factor of 4 at most: as the detector was trained.
+    fills the canvas, with other proportions by a factor of 4 at most. Agents look as their evidence was fitted
+    (`semfov.agents.windows`), which may be with padding for a detector that was trained with stretched pictures.
 
     Args:
         detector: any detector.

@@ -1,4 +1,15 @@
-"""Objects of a large picture, merged from the detections of several windows."""
+"""Objects of a large picture, merged from the detections of several windows.
+
+    looks                      box of an object                        its score
+    -------------------------  --------------------------------------  ---------------------------------------------
+    with evidence              mean of the looks that show it whole    probability that it is there, by its facts
+    (`merge_with_facts`)                                               (`semfov.zoom.certainty`)
+    without (`merge`)          that of the sharpest look               the highest of all looks
+    at a stream that forgets,  where the tracker has it                probability that it is there still
+    with evidence              (`semfov.tracking`)
+
+Boxes of one class that overlap, or of which one is cut and lies in the other, are of one object.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
