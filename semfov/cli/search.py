@@ -278,11 +278,19 @@ def _outcomes(
     where: Where = options.workers if options.scheduler is None else options.scheduler
     may_start_processes = options.scheduler is None and options.workers != 1
     if numbers and may_start_processes:
-        # A process takes as long to start as this one has taken so far. The first picture tells whether that pays.
+        # A process takes as long to start as this one has taken so far. The first picture that can be looked at tells
+        # whether that pays: a damaged one takes no time.
         start = time.process_time()
-        first = numbers.pop(0)
-        yield first, job.outcome(first)
-        where = _worth_starting(options.workers, len(numbers), time.process_time() - start, start)
+        seconds = 0.0
+        is_looked_at = False
+        while numbers and not is_looked_at:
+            began = time.process_time()
+            first = numbers.pop(0)
+            outcome = job.outcome(first)
+            seconds = time.process_time() - began
+            is_looked_at = not isinstance(outcome, SemfovError)
+            yield first, outcome
+        where = _worth_starting(options.workers, len(numbers), seconds, start)
     yield from run_tasks(
         PictureJob.outcome,
         numbers,

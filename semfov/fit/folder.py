@@ -28,7 +28,7 @@ from semfov.fit.search_part import SearchFit
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.verification_part import VerificationFit
 from semfov.fit.windows_part import WindowsFit
-from semfov.io.files import sha256, write_text
+from semfov.io.files import disk_is_full, sha256, write_text
 from semfov.io.manifest import Manifest, Part
 from semfov.runs.config import WHERE
 from semfov.runs.looking import Looking
@@ -76,6 +76,9 @@ class FolderFit:
             try:
                 result = self.fits[name].fit()
             except (DataError, InputError) as error:
+                # What stops this fit alone is no property of the part.
+                if disk_is_full(error):
+                    raise
                 why = f"could not be fitted: {error}"
                 result = PartResult(Part(None, None, False, why), f"Could not be fitted: {error}")
             write_text(file, json.dumps({"key": key, **result._asdict(), "part": asdict(result.part)}))

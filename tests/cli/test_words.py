@@ -5,6 +5,7 @@ import re
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +15,7 @@ from semfov.cli.commands import SUBCOMMANDS
 from semfov.cli.main import _completion, _in_command_words, _options_of, main
 from semfov.cli.outcome import table_lines
 from semfov.cli.results import kind_of
-from semfov.errors import InputError
+from semfov.errors import DataError, InputError
 from semfov.fit.settings import FitDetectorConfig
 from semfov.runs.arguments import usual_form
 from semfov.runs.command import make_parser
@@ -307,6 +308,25 @@ def test_texts_of_options_are_read(tmp_path):
     wide = "\N{CJK UNIFIED IDEOGRAPH-72AC}" * 3  # two columns of a terminal each
     assert table_lines([[wide, "1"], ["cafe\u0301", "2"]]) == [f"{wide}  1", "cafe\u0301    2"]
     assert [search._worth_starting(2, tasks, 0.5, 4.0) for tasks in (7, 99)] == [1, 2]
+
+
+def test_a_damaged_picture_does_not_tell_whether_processes_pay(monkeypatch):
+    """The first picture that can be looked at does; a damaged one takes no time."""
+    clock = iter([10.0, 10.0, 10.1, 10.1, 14.1])
+    monkeypatch.setattr(search.time, "process_time", lambda: next(clock))
+    measured = []
+
+    def worth(workers, tasks, seconds, start):
+        measured.append((workers, tasks, seconds, start))
+        return 1
+
+    monkeypatch.setattr(search, "_worth_starting", worth)
+    monkeypatch.setattr(search, "run_tasks", lambda *_, **__: iter(()))
+    options = SimpleNamespace(workers=None, scheduler=None, quiet=True)
+    outcomes = [DataError("a.png: damaged"), "seen", "not asked for here", "nor this"]
+    job = SimpleNamespace(several=True, options=options, sources=range(4), outcome=lambda number: outcomes[number])
+    assert [number for number, _ in search._outcomes(job, {})] == [0, 1]
+    assert measured == [(None, 2, pytest.approx(4.0), 10.0)]
 
 
 def test_messages_name_options_as_the_command_does():

@@ -1,5 +1,6 @@
 """`semfov fit` for a detector of coloured squares, from photographs to a search."""
 
+import errno
 import itertools
 import json
 import re
@@ -392,6 +393,15 @@ def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_lef
     assert (part.file, part.used, part.why) == (None, False, "could not be fitted: data: too few")
     assert ActivePerception.from_pretrained(folder, detector=home / "colours.onnx").verification is None
     assert "Could not be fitted: data: too few" in (folder / "report.md").read_text()
+
+    def fill_the_disk(*_):
+        raise DataError("progress: cannot be written") from OSError(errno.ENOSPC, "no space left")
+
+    # The part is not blamed for what stops the command, and is fitted once there is room.
+    (folder / "progress/verification.json").unlink()
+    monkeypatch.setattr("semfov.fit.verification_part.fit_in_folds", fill_the_disk)
+    assert command(arguments(home, "--out", str(folder))) != 0
+    assert not (folder / "progress/verification.json").exists()
 
 
 def test_decisions_are_scored_by_photograph():
