@@ -5,6 +5,8 @@ STAMP := $(VENV)/.installed
 GRADIO := build/gradio
 # Of files that name all packages; bytecode is written when a module is first imported.
 INSTALL := install --quiet --no-compile --no-deps --require-hashes --requirement
+INSTALL_CPU = install --quiet --no-compile --no-deps \
+	$(if $(findstring ://,$(CPU_WHEELS)),--index-url,--no-index --find-links) $(CPU_WHEELS) --requirement
 LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes --no-annotate \
 	--custom-compile-command "make constraints"
 # The tests of a file stay together: what they share is made once.
@@ -21,6 +23,7 @@ NUMERIC := tests/belief tests/decision tests/observation tests/sensor \
 .PHONY: help setup search test numeric library lab app test-all test-quick gpu coverage mutation docs lint types constraints clean
 
 help:
+	@echo "make setup       make the environment .venv; CPU_WHEELS=ADDRESS spares CUDA (docs/install.md)"
 	@echo "make search      set up, search the embedded scenes, write tables and pictures"
 	@echo "make test        set up, then lint, types and the tests of the library"
 	@echo "make lab         the tests of studies, whole fits, benchmarks and the site"
@@ -36,12 +39,18 @@ help:
 
 setup: $(STAMP)
 
-# Three processes unpack the packages: torch, its libraries and all others are about equally large.
+# Three processes unpack the packages: torch, its libraries and all others are about equally large. PyTorch's builds for
+# the CPU have other digests than those of constraints.txt, and need no CUDA.
 $(STAMP): pyproject.toml constraints.txt
+	$(if $(CPU),$(if $(CPU_WHEELS),,$(error CPU: expected CPU_WHEELS=ADDRESS too, the one after --index-url in the command \
+		for Linux, Pip and CPU on PyTorch's install page (docs/install.md), or a folder of these wheels)))
 	$(PYTHON) -m venv $(VENV)
-	awk '/^[a-z]/ {part = /^(nvidia|cuda)/ ? "cuda" : /^(torch|triton)/ ? "torch" : "others"} \
+	awk '/^[a-z]/ {part = /^(nvidia|cuda|triton)/ ? "cuda" : /^torch(vision)?=/ ? "torch" : "others"} \
+		/^torch(vision)?=/ {print $$1 >("$(VENV)/cpu.txt")} \
 		/^[a-z ]/ {print >("$(VENV)/" part ".txt")}' constraints.txt
-	printf "$(VENV)/%s.txt\n" cuda torch others | xargs -n 1 -P 3 $(BIN)/python -m pip $(INSTALL)
+	printf "$(VENV)/%s.txt\n" $(if $(CPU_WHEELS),others,cuda torch others) | \
+		xargs -n 1 -P 3 $(BIN)/python -m pip $(INSTALL)
+	$(if $(CPU_WHEELS),$(BIN)/python -m pip $(INSTALL_CPU) $(VENV)/cpu.txt)
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	$(BIN)/python -m compileall -q semfov  # as pip does with a wheel: the first picture does not wait for it
 	@touch $@

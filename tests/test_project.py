@@ -1,8 +1,12 @@
 """Consistency of the project's setup: versions, pinned dependencies, and checks before a commit and on the server."""
 
+import os
 import re
 import runpy
+import subprocess
+import sys
 import tomllib
+import zipfile
 from dataclasses import fields
 from pathlib import Path
 
@@ -74,6 +78,70 @@ def test_what_is_installed_before_tests_and_releases_and_actions_are_pinned():
         used = re.findall(r"uses: (.*)", path.read_text(encoding="utf-8"))
         assert used
         assert [each for each in used if not re.match(r"[\w./-]+@[0-9a-f]{40} # v", each)] == []
+
+
+def set_up(folder, *settings):
+    """Run `make setup` with a Python that only writes down what it is asked for; returns the process and its calls."""
+    python, calls = folder / "python3", folder / "calls.txt"
+    python.write_text(
+        f'#!/bin/sh\necho "$@" >>{calls}\n[ "$2" != venv ] || {{ mkdir -p "$3/bin"; cp "$0" "$3/bin/python"; }}\n'
+    )
+    python.chmod(0o755)
+    call = ["make", "setup", f"PYTHON={python}", f"VENV={folder}/venv", *settings]
+    alone = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}  # also within another make
+    done = subprocess.run(call, cwd=ROOT, env=alone, capture_output=True, text=True, check=False)
+    return done, calls.read_text(encoding="utf-8").splitlines() if calls.exists() else []
+
+
+def write_wheel(folder, name, version):
+    """Write a wheel of a package that holds nothing but its name and version."""
+    about = f"{name}-{version}.dist-info"
+    with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as wheel:
+        wheel.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        wheel.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr(f"{about}/RECORD", "")
+
+
+def test_set_up_with_builds_for_the_cpu_takes_them_from_a_folder_and_no_cuda(tmp_path):
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+    names = ("torch", "torchvision")
+    for name in names:
+        write_wheel(wheels, name, f"{PINS['constraints.txt'][name]}+cpu")
+    done, calls = set_up(tmp_path, f"CPU_WHEELS={wheels}")
+    assert done.returncode == 0, done.stderr
+    _, others, builds, *_ = calls
+    pinned = PINS["constraints.txt"]
+    text = Path(others.split()[-1]).read_text(encoding="utf-8")
+    assert set(re.findall(r"^([\w.-]+)==", text, re.MULTILINE)) == {
+        name for name in pinned if not re.match("nvidia|cuda|triton", name) and name not in names
+    }
+    assert not re.search("--require-hashes", builds)
+    call = [sys.executable, *builds.split(), "--dry-run", "--ignore-installed", "--disable-pip-version-check"]
+    tried = subprocess.run([each for each in call if each != "--quiet"], capture_output=True, text=True, check=True)
+    assert f"Would install torch-{pinned['torch']}+cpu torchvision-{pinned['torchvision']}+cpu" in tried.stdout
+
+
+def test_set_up_takes_builds_for_the_cpu_from_an_address_and_asks_for_it(tmp_path):
+    done, calls = set_up(tmp_path, "CPU=1")
+    assert (done.returncode, calls) == (2, [])
+    assert "CPU: expected CPU_WHEELS=ADDRESS too" in done.stderr
+    assert "PyTorch's install page (docs/install.md)" in done.stderr
+    assert "https://pytorch.org/get-started/locally/" in (ROOT / "docs/install.md").read_text(encoding="utf-8")
+    _, calls = set_up(tmp_path, "CPU=1", "CPU_WHEELS=https://builds.example.org/cpu")
+    builds = next(call for call in calls if call.endswith("cpu.txt"))
+    assert "--index-url https://builds.example.org/cpu" in builds
+    assert "--no-index" not in builds
+
+
+def test_set_up_without_further_settings_checks_the_digest_of_each_pinned_file(tmp_path):
+    done, calls = set_up(tmp_path)
+    assert done.returncode == 0, done.stderr
+    parts = [call.split() for call in calls if ".txt" in call]
+    assert all("--require-hashes" in part for part in parts)
+    written = "".join(Path(part[-1]).read_text(encoding="utf-8") for part in parts)
+    lines = (line for line in LOCKS["constraints.txt"].splitlines() if line[0] != "#")
+    assert sorted(written.splitlines()) == sorted(lines)
 
 
 def test_the_oldest_versions_are_the_lower_bounds():
