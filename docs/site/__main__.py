@@ -1,24 +1,35 @@
 """Build the site from the repository, without a network and with warnings as errors: `python -m docs.site`.
 
 The pages are assembled in `build/pages`. Zensical renders them to HTML in `build/site`. Its configuration is
-`mkdocs.yml`, which its predecessor, Material for MkDocs, can read as well.
+`mkdocs.yml`, which its predecessor, Material for MkDocs, can read as well. With `REPOSITORY_URL` in the
+environment, each page links to it.
 """
 
 import argparse
+import os
 import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 from docs.site.llms import contents
 from docs.site.search_index import put_pages_first
 from docs.site.stage import ROOT, Stage
 from docs.site.tutorials import tutorials
+from semfov.version import __version__
 
 PAGES = ROOT / "build" / "pages"
 SITE = ROOT / "build" / "site"
 _COMPLAINT = re.compile(r"(?im)^.*(?:warning|griffe:|error).*$")
 """Matches all messages, among them complaints about docstrings, which the strict mode ignores."""
+
+
+def render(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Render the pages by the `mkdocs.yml` of a folder; the foot of each page has version and licence."""
+    call = [sys.executable, "-m", "zensical", "build", "--clean", "--strict"]
+    settings = {**os.environ, "SITE_FOOT": f"semfov {__version__}, MIT licence"}
+    return subprocess.run(call, cwd=folder, env=settings, capture_output=True, text=True, check=False)
 
 
 def build(*, run: bool) -> None:
@@ -39,8 +50,7 @@ def build(*, run: bool) -> None:
     stage.finish()
     stage.write("llms.txt", contents((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), PAGES))
     print(f"pages: {time.monotonic() - began:.0f} s")
-    call = [sys.executable, "-m", "zensical", "build", "--clean", "--strict"]
-    done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = render(ROOT)
     output = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr)
     if done.returncode or _COMPLAINT.search(output):
         raise ValueError(f"expected the site to build without warnings, got\n{output}")

@@ -26,8 +26,8 @@ def contents(configuration: str, pages: Path) -> str:
     Returns:
         The text of `llms.txt`.
     """
-    # Loaded as plain data; tags of MkDocs, if there are any, are refused.
-    settings = yaml.safe_load(configuration)
+    # Loaded as plain data, with the names of variables in place of what the environment has; other tags are refused.
+    settings = yaml.safe_load(configuration.replace("!ENV ", ""))
     lines = [f"# {settings['site_name']}", "", f"> {settings['site_description']}"]
     home = (pages / "index.md").read_text(encoding="utf-8")
     lines += ["", first_sentence(home)]

@@ -14,12 +14,14 @@ import pytest
 import docs.api
 import docs.site.formulas
 import docs.site.stage
+import semfov
 from docs.api import entries
+from docs.site.__main__ import render
 from docs.site.docstrings import markdown as docstring
 from docs.site.formulas import mathml
 from docs.site.names import Names
 from docs.site.search_index import put_pages_first
-from docs.site.stage import Stage, place_of
+from docs.site.stage import ROOT, Stage, place_of
 from docs.site.tutorials import execute, page
 
 SPACE = "{http://www.w3.org/1998/Math/MathML}"
@@ -148,6 +150,30 @@ def test_names_commands_and_links_that_do_not_exist_are_refused(names, tmp_path)
     stage.page("[here](nowhere.md)", "docs/method.md")
     with pytest.raises(LookupError, match=r"docs/method\.md links to nowhere\.md"):
         stage.finish()
+
+
+@pytest.mark.parametrize("address", [None, "https://github.com/someone/semfov"])
+def test_a_page_has_version_and_licence_and_a_link_that_asks_its_server_for_nothing(tmp_path, monkeypatch, address):
+    settings = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[0]
+    for line, here in (
+        ("docs_dir: build/pages", "docs_dir: pages"),
+        ("site_dir: build/site", "site_dir: site"),
+        ("custom_dir: docs", f"custom_dir: {ROOT}/docs"),
+    ):
+        assert line in settings
+        settings = settings.replace(line, here)
+    (tmp_path / "mkdocs.yml").write_text(settings.replace("extra_css: [site.css]\n", ""), encoding="utf-8")
+    (tmp_path / "pages").mkdir()
+    (tmp_path / "pages/index.md").write_text("# A page\n", encoding="utf-8")
+    monkeypatch.delenv("REPOSITORY_URL", raising=False)
+    if address:
+        monkeypatch.setenv("REPOSITORY_URL", address)
+    done = render(tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "site/index.html").read_text(encoding="utf-8")
+    assert f"semfov {semfov.__version__}, MIT licence" in page
+    assert page.count(f'<a href="{address}"') == (2 if address else 0)  # in the head, and in the menu of a telephone
+    assert 'data-md-component="source"' not in page  # to which the theme adds stars and releases
 
 
 def test_links_are_rewritten_to_the_paths_on_the_site(tmp_path):
