@@ -16,7 +16,7 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
     return {word: ours for ours, others in rows.items() for word in others.split()}
 
 
-_VERBS = ("draw", "exclude", "export", "hide", "ignore", "plot", "print", "save", "show", "to", "write")
+_VERBS = ("as", "draw", "exclude", "export", "hide", "ignore", "plot", "print", "return", "save", "show", "to", "write")
 """Verbs with which others' words begin."""
 
 _NEGATIONS = ("disable", "no", "not", "without")
@@ -53,9 +53,10 @@ OPTIONS = _by_word(
         "min_gain": "expected_gain gain min_improvement tol tolerance",
         "stop_below": "early_stopping stop stop_threshold stopping_threshold",
         "target": (
-            "class class_name classes cls filter find label labels name object objects only prompt query targets text"
+            "class class_name classes cls filter find for label labels name object objects only prompt query targets "
+            "text"
         ),
-        "picture": "file image img path photo source",
+        "picture": "file image img input path photo source",
         "grid": "cells columns rows",
         "detector name": "model yolo",
         "model": "models",
@@ -108,6 +109,19 @@ def note_of_former(former: str, present: str) -> str:
     return f"{former} is called {present} now; the earlier name will go"
 
 
+SHORT = {
+    "c": "confirm score_threshold",
+    "d": "device",
+    "i": "picture",
+    "n": "passes people",
+    "o": "out",
+    "q": "quiet",
+    "s": "picture",
+    "t": "target",
+    "v": "looks",
+}
+"""Options of the command, several where one letter of others can mean each of them, by that letter."""
+
 COMMANDS = _by_word(
     {
         "find": "analyse analyze annotate batch count detect infer label predict run segment survey",
@@ -151,6 +165,8 @@ _ADVICE_FOR_OBJECTS = _by_word(
         "--out FILE.csv has all objects, to sort by their scores": "best k max_det max_objects sort top top_k topk",
         "--out FILE.jsonl has each picture as soon as it is done": "stream",
         "boxes of several looks become one object by themselves": "match_metric merge nmm postprocess",
+        "boxes are upright, as the detector's are": "obb oriented rotated",
+        "--how fovea looks with a fovea, and --sensor chooses it": "fovea fovea_radius fovea_size foveal_radius",
         "semfov looks again where that pays": "augment tta",
         "in Python an agent is made with it: semfov.ActivePerception.recommended(grid=…)": "cells columns grid rows",
         "the agent has one; in a checkout `python -m eval.search --help` compares several": (
@@ -161,14 +177,17 @@ _ADVICE_FOR_OBJECTS = _by_word(
 
 _ADVICE_FOR_GAZE = _by_word(
     {
-        "the map keeps the picture's colours; --out FOLDER writes it beside a table": "cmap colormap colourmap opacity",
+        "the map keeps the picture's colours; --out FOLDER writes it beside a table": (
+            "alpha cmap colormap colourmap opacity transparency"
+        ),
         "the model is of adults without a task; `semfov fit --help` has that of your viewers": (
             "age audience gender persona"
         ),
         "the places are printed by their shares, the largest first": "k peaks sort top top_k topk",
         "--seconds says how long a viewer looks": "fixations saccades shifts",
         "the fitted model has its own centre bias and blur": (
-            "blur center_bias centerbias centre_bias dva pixel_per_degree pixels_per_degree ppd sigma temperature"
+            "blur center_bias centerbias centre_bias distance dva pixel_per_degree pixels_per_degree ppd screen sigma "
+            "temperature viewing_distance"
         ),
     }
 )
@@ -235,6 +254,7 @@ _OTHER_PLACES = _by_word(
             "csv export format html json out output plot project report save show tensorboard visualize wandb"
         ),
         "record.objects has all, to sort by their scores": "best k sort top top_k topk",
+        "record.belief_map(-1), of looks by a fovea or a head": "belief_map heat_map heatmap",
         "agent.live(target).step(frame) takes the frames of a stream": "stream video vid_stride",
         "leave it out, as nothing is printed; on_look= is called after each look": "progress quiet verbose",
         "a whole list is looked at by semfov.run(pictures, target, workers=)": "batch_size jobs num_workers workers",
@@ -292,12 +312,22 @@ MAKERS = {"ActivePerception": "ActivePerception.recommended()"}
 PACKAGE = _by_word(
     {
         "agent = semfov.ActivePerception.recommended(), which has search, find_all, explore, gaze and live": (
-            "Agent detect explore find find_all load predict search"
+            "Agent Model ObjectDetector Pipeline Predictor Searcher detect explore find find_all inference load "
+            "predict search"
         ),
         "record.plot(), or semfov.viz": "plot show",
         "seed= of a search or an exploration, or torch.manual_seed": "manual_seed seed seed_everything set_seed",
-        "semfov.envs, whose environments gymnasium.make knows": "Env env environment environments make",
-        "semfov.read_image": "imread open",
+        "semfov.envs, whose environments gymnasium.make knows": (
+            "Env FoveatedEnv GazeEnv SearchEnv env environment environments make make_env"
+        ),
+        "semfov.read_image": "imread load_image open",
+        "semfov.data, which reads pictures, COCO's annotations and fixations": (
+            "CocoDetection DataLoader Dataset dataset datasets load_dataset"
+        ),
+        "semfov.sensor, whose modules take pictures": (
+            "Fovea Foveate Transform Transforms augmentation fovea transforms"
+        ),
+        "semfov.viz, or record.report(path)": "draw visualization visualize",
         "semfov.load_detector(name or file), or semfov.ActivePerception.recommended(name)": (
             "AutoDetectionModel AutoModel Detector YOLO from_pretrained get_model load_model pipeline"
         ),
@@ -338,6 +368,8 @@ AGENT = _by_word(
         "agent.classes[1:]": "class_names labels names",
         "agent.eye.detector": "detector model",
         "next(agent.parameters()).device": "device",
+        "agent.requires_grad_(False)": "freeze",
+        "print(agent)": "describe info summary",
         "semfov.fit_detector, which writes a folder of models, and semfov.ActivePerception.from_pretrained(folder)": (
             "export save save_model save_pretrained"
         ),
@@ -363,7 +395,8 @@ DECISION = _by_word(
 
 LIVE = _by_word(
     {
-        "live.step(frame)": "detect forward predict process push read run track update",
+        "live.step(frame)": "detect forward next predict process push read run track update",
+        "the release of your own capture, as nothing else is open": "close release stop",
         "the moment that live.step(frame) returns": "boxes decision objects tracks",
     }
 )
@@ -382,32 +415,41 @@ OBJECTS = _by_word(
         "record.to_csv(path, 'objects')": "save to_csv write",
         "record.to_frame('objects')": "dataframe df to_dataframe to_df to_frame to_pandas",
         "record.object_rows()": "to_dict to_json tolist",
-        "the method of the record": "to_coco to_geojson to_supervision to_yolo",
+        "record.to_coco()": "to_coco",
+        "record.to_geojson()": "to_geojson",
+        "record.to_supervision()": "sv to_supervision",
+        "record.to_yolo()": "to_yolo",
         "record.to_yolo(), in shares of the picture": "xywhn xyxyn",
         "record.plot()": "draw plot show",
         "objects.boxes": "bbox box xyxy",
         "objects.scores": "conf confidence probability score",
         "objects.labels": "class_id cls label",
-        "objects.classes": "names",
+        "objects.classes": "class_names names",
+        "objects.boxes, objects.scores and objects.labels, which are tensors": "cpu cuda data detach numpy tensor",
     }
 )
 
 RECORD = _by_word(
     {
-        "its objects, such as record.objects.boxes": "boxes labels scores xyxy",
+        "its objects, such as record.objects.boxes": "bboxes boxes labels scores xyxy",
+        "record.objects.scores, or record.decision.probability": "conf confidences probs",
+        "record.to_supervision()": "as_detections as_supervision supervision sv to_detections to_sv to_sv_detections",
         "record.decision.box, or its objects, record.objects.boxes": "box",
         "record.decision.probability": "confidence prob probability score",
         "record.decision.outcome": "answer outcome result",
-        "len(record.objects), or record.expected with what was not seen": "count counts n num_objects number total",
+        "len(record.objects), or record.expected with what was not seen": (
+            "count counts n n_detections n_objects num_boxes num_detections num_objects number total"
+        ),
         "record.to_frame()": "dataframe df to_dataframe to_df to_excel to_pandas",
         "record.why_it_ended()": "reason stop_reason stopped why",
-        "record.looks": "history n_looks num_looks slices steps tiles windows",
+        "record.looks": "history slices steps tiles windows",
+        "len(record)": "n_fixations n_looks n_steps num_fixations num_looks num_steps",
         "record.objects.boxes, as the detector has no masks": "mask masks segmentation",
         "record.objects.above(score), or record.objects.of(name)": "filter select where",
         "record.objects, to sort by their scores": "best sort sorted top top_k topk",
         "record.expected_error, and record.objects.scores": "std uncertainties uncertainty",
         "record.rows(), which has the value of each look": "gains reward rewards values",
-        "record.plot()": "draw show visualize",
+        "record.plot()": "annotate annotated draw render show visualise visualize",
         "record.classes": "names",
         "record.objects, or the detections of a look, record[0].detections": (
             "detections object_prediction_list predictions results"
@@ -465,6 +507,7 @@ GAZE_PREDICTION = _by_word(
         "gaze.save_density(path), gaze.report(path) or gaze.to_csv(path)": (
             "export save to_frame to_json to_pandas to_png"
         ),
+        "gaze.density.numpy()": "array cpu numpy tensor",
         "gaze.density": "fixation_map heat_map heatmap map probability saliency saliency_map",
         "semfov.paths.Drafts(gaze, other)": "ab diff difference versus",
         "gaze.density.log()": "log_density log_probability logits",

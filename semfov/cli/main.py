@@ -23,6 +23,7 @@ from semfov.words import (
     COMMANDS,
     FORMER,
     OPTIONS,
+    SHORT,
     dashed,
     meant_options,
     note_of_former,
@@ -244,7 +245,20 @@ def _of_others(command: str, words: Sequence[str]) -> str | None:
     """Say what is wrong with an option that other subcommands or other programs have; None if there is none."""
     options = [word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")]
     refusals = (_refusal(command, option) for option in options)
-    return next(filter(None, refusals), None) or _without_dashes(command, words)
+    return next(filter(None, refusals), None) or _one_letter(command, words) or _without_dashes(command, words)
+
+
+def _one_letter(command: str, words: Sequence[str]) -> str | None:
+    """Say what is meant by an option of one letter, of which there are none; None if no word is one."""
+    letters = (word[1] for word in words if re.fullmatch("-[a-z]", word))
+    meant = ((letter, option) for letter in letters for option in SHORT.get(letter, "").split())
+    positional = SUBCOMMANDS[command].positional
+    for letter, option in meant:
+        if option in _option_names(command):
+            return f"unknown option -{letter}; did you mean --{dashed(option)}?"
+        if positional is not None and option == "picture":  # what is looked at, which may be a stream
+            return _without_option(command, f"-{letter}", positional)
+    return None
 
 
 def _without_dashes(command: str, words: Sequence[str]) -> str | None:
@@ -270,11 +284,11 @@ def _refusal(command: str, option: str) -> str | None:
         return None
     if (command, option) == ("fit", "detector"):
         # The parts of the detector are options of `semfov fit`: detector.name and others.
-        return _without_option(command, option, positional)
+        return _without_option(command, f"--{option}", positional)
     if not option or option in _option_names(command):
         return None
     if _means_positional(option, positional):
-        return _without_option(command, option, positional)
+        return _without_option(command, f"--{option}", positional)
     # The parser lists all options of the other subcommands, which have few.
     is_advised = command in (*_LOOKING, "gaze", "app", "compare")
     return _meant_instead(command, option) if is_advised else None
@@ -284,7 +298,7 @@ def _without_option(command: str, option: str, positional: str) -> str:
     """Say that what a subcommand is for stands after its name, without an option."""
     singular = positional.removesuffix("s")
     usage = f"semfov {command} {singular.upper()}"
-    return f"unknown option --{option}; the {singular} has no option before it: {usage}"
+    return f"unknown option {option}; the {singular} has no option before it: {usage}"
 
 
 def _means_positional(option: str, positional: str) -> bool:
