@@ -169,7 +169,7 @@ def _agreement(last: Point, slices: Point) -> list[str]:
     false_alarms = amount(last.listed - last.right, "other")
     share = last.seconds / slices.seconds
     return [
-        f"After {_passes(last)} semfov lists {found} and {false_alarms}, in {share:.2f} of their time.",
+        f"After {_passes(last)} semfov lists {found} and {false_alarms}, in {share:.2f} times their time.",
         "All slices miss and invent objects, too: AP50 says how well semfov agrees with them. To judge both by "
         "your own boxes, give --annotations FILE.",
     ]

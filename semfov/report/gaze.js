@@ -93,7 +93,7 @@ function show() {
   const there = picture.paths.filter((points) => points.length >= step).length;
   const words = step
     ? `Where ${there} viewer${there > 1 ? "s" : ""} will look next, after ${step} fixation${step > 1 ? "s" : ""}`
-    : "All fixations; 1 to 3 are the first";
+    : "The first three fixations, and where most are";
   find("status").textContent = who ? `Viewer ${who}. ${words}` : words;
   find("drawing").replaceChildren();
   find("drawing").setAttribute("viewBox", `0 0 ${picture.size.join(" ")}`);

@@ -230,7 +230,6 @@
       find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
       find("class").value = chosenClass;
     }
-    find("word").textContent = word()[0].toUpperCase() + word().slice(1);
     find("back").setAttribute("aria-label", `Previous ${word()}`);
     find("forward").setAttribute("aria-label", `Next ${word()}`);
     for (const told of document.querySelectorAll("[data-about]")) {

@@ -16,7 +16,9 @@ function stepper({ last, show, word, pause, first = 1 }) {
     // Before the first step all are shown.
     const place = steps.at + first;
     const number = place > 0 ? `${place} of ${last() + first}` : "all";
+    const name = word()[0].toUpperCase() + word().slice(1);
     find("fixation").setAttribute("aria-valuetext", `${word()} ${number}`);
+    find("word").textContent = place > 0 ? name : `${name}s:`;
     find("number").textContent = number;
     find("back").disabled = steps.at === 0;
     find("forward").disabled = steps.at === last();

@@ -254,10 +254,13 @@ def heat(page):
 def test_the_slider_steps_through_the_fixations(opened):
     most = int(opened.locator("#fixation").get_attribute("max"))
     assert opened.locator("#number").inner_text() == "all"
+    assert opened.locator("#word").inner_text() == "Fixations:"
+    assert opened.locator("#status").inner_text() == "The first three fixations, and where most are"
     assert circles(opened) == 3  # the first fixations of all viewers
     before = heat(opened)
     opened.keyboard.press("ArrowRight")
     assert opened.locator("#number").inner_text() == f"1 of {most}"
+    assert opened.locator("#word").inner_text() == "Fixation"
     assert circles(opened) == 5
     assert heat(opened) != before
     assert "after 1 fixation" in opened.locator("#status").inner_text()

@@ -190,6 +190,14 @@ ASKED = {
     "cite": "index",
     "tobii": "tasks/eye-tracker",
     "gym": "guides/environments",
+    "rl": "guides/environments",
+    "mask": "/zoom.html",
+    "zoom": "/zoom.html",
+    "resolution": "/zoom.html",
+    "panorama": "/head.html",
+    "ptz": "pan-tilt",
+    "scanpath": "tasks/poster",
+    "version": "changelog",
 }
 """Words that a reader may ask for, and a page that is among the first three answers."""
 ANSWERS = """() => {
