@@ -325,8 +325,8 @@ class Record(Conversion):
         return cls(**{name: value for name, value in fields.items() if name in arguments})
 
     @abstractmethod
-    def _contents(self) -> tuple[dict[str, Tensor], Values]:
-        """Tensors and JSON values of a file, beside those of the base."""
+    def _contents(self) -> tuple[dict[str, Tensor | None], Values]:
+        """Tensors and JSON values of a file, beside those of the base; tensors that are None are left out."""
 
     @classmethod
     @abstractmethod

@@ -141,7 +141,7 @@ class Format:
         self,
         path: str | PathLike[str],
         outcome: _Shared,
-        tensors: Mapping[str, Tensor],
+        tensors: Mapping[str, Tensor | None],
         record: Mapping[str, Any],
     ) -> None:
         """Write the file of a record, atomically.
@@ -149,7 +149,7 @@ class Format:
         Args:
             path: the file.
             outcome: the record, whose attributes that all records have are written.
-            tensors: the tensors of its kind.
+            tensors: the tensors of its kind; those that are None are left out.
             record: the JSON values of its kind.
 
         Raises:
@@ -171,7 +171,8 @@ class Format:
             "closer": [{name: getattr(look, name) for name in _CLOSER} for look in outcome.closer],
             **record,
         }
-        write_file(path, {**_shared_tensors(outcome), **tensors}, values)
+        all_tensors = {**_shared_tensors(outcome), **tensors}
+        write_file(path, {name: tensor for name, tensor in all_tensors.items() if tensor is not None}, values)
 
     def read(self, path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any], SharedFields]:
         """Read and check a file that `write` wrote.
@@ -215,19 +216,16 @@ def _shared_fields(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> 
     }
 
 
-def _shared_tensors(outcome: _Shared) -> dict[str, Tensor]:
+def _shared_tensors(outcome: _Shared) -> dict[str, Tensor | None]:
     """Collect the tensors that all records have: detections, the photograph, and boxes of decision and closer looks."""
-    tensors = {}
+    tensors: dict[str, Tensor | None] = {}
     for name in _ROWS:
         # Batches of one become rows, one look after the other.
         tensors[name] = torch.cat([getattr(look, name)[0] for look in outcome.detections])
     tensors["highest"] = torch.cat([look.highest for look in outcome.detections])
-    if outcome.decision is not None and outcome.decision.box is not None:
-        tensors["box"] = outcome.decision.box
-    if outcome.photograph is not None:
-        tensors["photograph"] = outcome.photograph
-    if outcome.closer:
-        tensors["closer_boxes"] = torch.stack([look.box for look in outcome.closer])
+    tensors["box"] = None if outcome.decision is None else outcome.decision.box
+    tensors["photograph"] = outcome.photograph
+    tensors["closer_boxes"] = torch.stack([look.box for look in outcome.closer]) if outcome.closer else None
     return tensors
 
 

@@ -389,8 +389,8 @@ class HeadPath(Record):
         window = image[None, :, top:bottom, left:right]
         return resize(window, self.views.world.size)[0].clamp(0, 1)
 
-    def _contents(self) -> tuple[dict[str, Tensor], Values]:
-        tensors = {
+    def _contents(self) -> tuple[dict[str, Tensor | None], Values]:
+        tensors: dict[str, Tensor | None] = {
             "actions": torch.tensor(self.actions),
             "maps": self.maps,
             "values": torch.tensor(self.values, dtype=torch.float64),

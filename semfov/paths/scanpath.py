@@ -105,12 +105,8 @@ class _CellRecord(Record):
         width, height = (int(side) for side in self.grid.extent)
         return width, height
 
-    def _contents(self) -> tuple[dict[str, Tensor], Values]:
-        tensors = {}
-        for name in self._tensors:
-            tensor = getattr(self, name)
-            if tensor is not None:
-                tensors[name] = tensor
+    def _contents(self) -> tuple[dict[str, Tensor | None], Values]:
+        tensors = {name: getattr(self, name) for name in self._tensors}
         grid = self.grid
         record = {
             **{name: getattr(self, name) for name in self._plain},
@@ -350,7 +346,7 @@ class Scanpath(_CellRecord):
 
         return scanpath_html(self)
 
-    def _contents(self) -> tuple[dict[str, Tensor], Values]:
+    def _contents(self) -> tuple[dict[str, Tensor | None], Values]:
         tensors, record = super()._contents()
         closer = [look for look in self.looks if look.is_closer]
         if closer:

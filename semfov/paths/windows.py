@@ -400,11 +400,9 @@ class ZoomPath(Record):
         """`(width, height)` of the picture in pixels."""
         return self.lattice.size
 
-    def _contents(self) -> tuple[dict[str, Tensor], Values]:
+    def _contents(self) -> tuple[dict[str, Tensor | None], Values]:
         looks = self.window_looks
-        tensors = {f"object_{name}": getattr(self.candidates, name) for name in _OBJECTS}
-        if self.candidates.track_ids is not None:
-            tensors["object_track_ids"] = self.candidates.track_ids
+        tensors = {f"object_{name}": getattr(self.candidates, name) for name in (*_OBJECTS, "track_ids")}
         tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
         tensors["cut"] = torch.cat([look.cut for look in looks])  # (M,), which `lengths` separates again
         tensors["show"] = torch.stack([look.show for look in looks])  # (n, K)
@@ -563,7 +561,7 @@ class WindowMoment(ZoomPath, Moment):
             lines.append(f"{self.number + 1},{number},{box},{score:.4f},-1,-1,-1\n")
         return "".join(lines)
 
-    def _contents(self) -> tuple[dict[str, Tensor], Values]:
+    def _contents(self) -> tuple[dict[str, Tensor | None], Values]:
         tensors, record = super()._contents()
         record["number"] = self.number
         record["next_window"] = _values_of(self.next_window)
