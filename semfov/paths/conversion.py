@@ -18,7 +18,6 @@ from semfov.data.classes import canonical_name
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture
-from semfov.decision import Decision
 from semfov.detection.exchange import CocoResult, category_ids, coco_results, named_detections
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
@@ -172,18 +171,17 @@ class Conversion(Outcome, OtherWords):
             "prior": self.prior,
             "assumed": None if self.assumed is None else round(self.assumed, 6),
             "place_probability": digits(self.place_probability) if is_probability else None,
-            **self._decided_place(decision),
+            **self._decided_place(),
         }
 
-    def _decided_place(self, decision: Decision) -> dict[str, float | None]:
+    def _decided_place(self) -> dict[str, float | None]:
         """Make JSON values of the place of a found target, or of the best place: a point and a box."""
         if self.best_place is not None:
             return _middle_and_box(*self.best_place[0].tolist())
+        if self._find is not None and self._find.box is not None:
+            return _middle_and_box(*self._find.box.tolist())
         x, y = self.found_at or (None, None)
-        edges = [None] * 4
-        if decision.outcome == "found" and decision.box is not None:
-            edges = decision.box.tolist()
-        return _rounded_place(x, y, *edges)
+        return _rounded_place(x, y, *[None] * 4)
 
     def object_rows(self) -> list[Values]:
         """Make a table of the objects, of plain values, most confident first.

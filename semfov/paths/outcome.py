@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.belief.prior import Prior, check_share
 from semfov.data.classes import known_class
 from semfov.decision import CloseUp, Decision
@@ -187,16 +186,15 @@ class Outcome(ABC):
     @property
     def found_at(self) -> tuple[float, float] | None:
         """`(x, y)` in picture pixels of the found target: the middle of its box, or else of its cell; None for none."""
-        decision = self.decision
-        if decision is None or decision.outcome != "found":
+        if self._find is None or self._find.box is None:
             return None
-        if decision.box is not None:
-            x1, y1, x2, y2 = decision.box.tolist()
-            return (x1 + x2) / 2, (y1 + y2) / 2
-        grid = getattr(self, "grid", None)
-        if decision.cell is None or not isinstance(grid, Grid):
-            return None
-        return tuple(grid.centres[decision.cell].tolist())
+        x1, y1, x2, y2 = self._find.box.tolist()
+        return (x1 + x2) / 2, (y1 + y2) / 2
+
+    @property
+    def _find(self) -> Decision | None:
+        """The decision of a search that has found its target; None for others."""
+        return self.decision if self.decision is not None and self.decision.outcome == "found" else None
 
     @property
     def image(self) -> Tensor | None:
@@ -303,8 +301,7 @@ class Outcome(ABC):
         if best is not None:
             is_probability = len(self.closer) > 0 or self.unseen is not None
             return best[1] if is_probability else None
-        decision = self.decision
-        return None if decision is None or decision.outcome != "found" else decision.place
+        return None if self._find is None else self._find.place
 
     @property
     def is_doubtful(self) -> bool:
@@ -344,27 +341,21 @@ class Outcome(ABC):
     @property
     def _found_place(self) -> _ConfirmedPlace | None:
         """The place where the decision found the target; None if it did not, or shows no box."""
-        decision = self.decision
-        if decision is None or decision.outcome != "found":
+        find = self._find
+        if find is None or find.box is None or self.target is None:
             return None
-        if decision.box is None or self.target is None:
-            return None
-        probability = decision.probability if decision.place is None else decision.place
-        close_ups = [close_up for close_up in self.closer if close_up.box.equal(decision.box)]
+        probability = find.probability if find.place is None else find.place
+        close_ups = [close_up for close_up in self.closer if close_up.box.equal(find.box)]
         # A box of no closer look is of the look by which the search decided, its last one.
         look = close_ups[0].index_of_look if close_ups else len(self) - 1
-        return _ConfirmedPlace(decision.box, self.target, probability, look)
-
-    @property
-    def _has_missed(self) -> bool:
-        """Whether a search is over and has not found its target."""
-        return self.decision is not None and self.decision.outcome != "found" and not self._goes_on
+        return _ConfirmedPlace(find.box, self.target, probability, look)
 
     @cached_property
     def _outcome(self) -> tuple[Objects, Tensor]:
-        """The objects, and which of them were confirmed; none of a search that has not found its target."""
+        """The objects, and which of them were confirmed; none of a search that is over without a find."""
         objects, confirmed = self._shown_objects
-        return (objects[:0], confirmed[:0]) if self._has_missed else (objects, confirmed)
+        is_over = self.decision is not None and not self._goes_on
+        return (objects[:0], confirmed[:0]) if is_over and self._find is None else (objects, confirmed)
 
     @cached_property
     def _shown_objects(self) -> tuple[Objects, Tensor]:
@@ -373,7 +364,7 @@ class Outcome(ABC):
         for place in self._confirmed_places:
             listing.confirm(place)
         objects, confirmed = listing.result()
-        if self.decision is not None and self.decision.outcome != "found":
+        if self.decision is not None and self._find is None:
             # No closer look was as sure as the search asks for, so what it shows counts by its probability alone.
             objects = objects[~confirmed | (objects.scores >= self.score_threshold)]
             confirmed = torch.zeros(len(objects), dtype=torch.bool)

@@ -100,6 +100,15 @@ class _CellRecord(Record):
         return stages if all(stages) else ()
 
     @property
+    def found_at(self) -> tuple[float, float] | None:
+        """`(x, y)` in picture pixels of the found target: the middle of its box, or else of its cell; None for none."""
+        find = self._find
+        if find is None or find.box is not None or find.cell is None:
+            return super().found_at
+        x, y = self.grid.centres[find.cell].tolist()
+        return x, y
+
+    @property
     def size(self) -> tuple[int, int]:
         """`(width, height)` of the photograph or frame in pixels."""
         width, height = (int(side) for side in self.grid.extent)
