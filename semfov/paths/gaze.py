@@ -126,21 +126,17 @@ class GazePrediction(OtherWords):
         lookup(quality, get_args(Quality), "quality")
         is_wide = size[0] >= _ROUND * size[1]
         check(is_wide or not panorama, "panorama", "a picture that is at least 1.5 times as wide as high", size)
-        # A copy, as the shipped model is shared by all predictions.
-        suits = image.dtype == fitted.read.dtype and image.device == fitted.read.device
-        converted = fitted if suits else deepcopy(fitted).to(image)
-        if seen is None:
-            fixations = None
-            with torch.no_grad():
+        converted = _converted(fitted, image)
+        fixations = None
+        unlikeness = None  # what a fovea has shown is unlike a sharp picture, whatever the picture is
+        with torch.no_grad():
+            if seen is None:
                 terms, unlikeness = picture_terms(detector, image, converted, quality=quality, panorama=panorama)
-        else:
-            eye = _fovea_of(looking, quality, panorama)
-            fixations = fixations_of(seen, "seen", size, source)
-            with torch.no_grad():
-                on_image = fixations if size == size_of_image else fixations.resized(size_of_image)
-                terms = converted.terms(_foveal_features(eye, image, on_image, fitted), size[::-1])
-            # What a fovea has shown is unlike a sharp picture, whatever the picture is.
-            unlikeness = None
+            else:
+                eye = _fovea_of(looking, quality, panorama)
+                fixations = fixations_of(seen, "seen", size, source)
+                features = _foveal_features(eye, image, fixations.resized(size_of_image), fitted)
+                terms = converted.terms(features, size[::-1])
 
         on_processor = {name: term.cpu() for name, term in terms.items()}
         photograph = reduced_copy(image)
@@ -572,6 +568,12 @@ class GazePrediction(OtherWords):
     def _log(self) -> Tensor:
         """Sum the terms to the log density over the cells, `(rows, columns)`, up to a constant."""
         return torch.stack([term[0] for term in self.terms.values()]).sum(0)
+
+
+def _converted(model: FixationDensity, image: Tensor) -> FixationDensity:
+    """Convert a model to the precision and the device of a picture: a copy, as predictions share the shipped model."""
+    suits = image.dtype == model.read.dtype and image.device == model.read.device
+    return model if suits else deepcopy(model).to(image)
 
 
 def _is_blank(photograph: Tensor) -> bool:
