@@ -113,21 +113,29 @@ def reduced_copy(picture: LargePicture | Tensor) -> Tensor:
         `(3, h, w)`, with at most `LONGEST` pixels along the longer side.
     """
     if isinstance(picture, Tensor):
-        height, width = picture.shape[-2:]
-    else:
-        width, height = picture.size
+        return _reduced_pixels(picture)
+    width, height = picture.size
     scale = min(1.0, LONGEST / max(width, height))
-    reduced_width = max(1, round(width * scale))
-    reduced_height = max(1, round(height * scale))
-    if isinstance(picture, Tensor):
-        if scale == 1:
-            return in_bytes(picture)
-        if picture.dtype == torch.uint8:
-            return resized(picture, (reduced_height, reduced_width))[0].clone()
-        return in_bytes(resize(picture[None], (reduced_width, reduced_height))[0])
     pixels = picture.read((0, 0, width, height), picture.reduction(1 / scale, oversampling=1))
     # Frames may share the memory of a camera; a copy in the order of memory is made ten times faster than another.
-    return resized(pixels, (reduced_height, reduced_width))[0].clone()
+    return resized(pixels, _reduced_sides(height, width))[0].clone()
+
+
+def _reduced_pixels(image: Tensor) -> Tensor:
+    """Reduce pixels `(3, H, W)`, of bytes or in [0, 1], to bytes of at most `LONGEST` pixels along the longer side."""
+    height, width = image.shape[-2:]
+    if max(height, width) <= LONGEST:
+        return in_bytes(image)
+    rows, columns = _reduced_sides(height, width)
+    if image.dtype == torch.uint8:
+        return resized(image, (rows, columns))[0].clone()
+    return in_bytes(resize(image[None], (columns, rows))[0])
+
+
+def _reduced_sides(height: int, width: int) -> tuple[int, int]:
+    """Compute height and width of a picture of at most `LONGEST` pixels along the longer side."""
+    scale = min(1.0, LONGEST / max(height, width))
+    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def in_bytes(image: Tensor) -> Tensor:
