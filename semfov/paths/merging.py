@@ -28,7 +28,7 @@ class FixationBoxes(NamedTuple):
 
 
 def merge_fixations(
-    fixations: Iterable[FixationBoxes], closer: Sequence[CloseUp] = (), *, around: float | None = None
+    fixations: Iterable[FixationBoxes], closer: Sequence[CloseUp], *, around: float | None = None
 ) -> Objects:
     """Merge the detections of fixations and of closer looks into objects.
 

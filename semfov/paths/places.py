@@ -12,7 +12,7 @@ Place = dict[str, float]
 """`x` and `y` in pixels of the picture, and `share`, the probability of a fixation around it."""
 
 
-def places_of(cells: Tensor, size: tuple[int, int], *, around: bool = False) -> list[Place]:
+def places_of(cells: Tensor, size: tuple[int, int], *, around: bool) -> list[Place]:
     """List all places of a density, the most likely first.
 
     Near fixations count more in the choice of a place, so that it is where the density is high. Places are at least
@@ -62,7 +62,7 @@ def _distances(points: Tensor, around: float | None) -> Tensor:
     return distance.minimum(distance_left).minimum(distance_right)
 
 
-def are_apart(place: Place, others: list[Place], size: tuple[int, int], *, around: bool = False) -> bool:
+def are_apart(place: Place, others: list[Place], size: tuple[int, int], *, around: bool) -> bool:
     """Tell whether a place is as far from all others as two places of one density are."""
     least = 2 * REACH * max(size)
     for other in others:

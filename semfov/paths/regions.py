@@ -86,13 +86,5 @@ def _regions(labels: Tensor) -> list[list[int]]:
 def _neighbours(cell: int, rows: int, columns: int) -> set[int]:
     """List the cells that share a side with a cell."""
     row, column = divmod(cell, columns)
-    neighbours = set()
-    if row > 0:
-        neighbours.add(cell - columns)
-    if row < rows - 1:
-        neighbours.add(cell + columns)
-    if column > 0:
-        neighbours.add(cell - 1)
-    if column < columns - 1:
-        neighbours.add(cell + 1)
-    return neighbours
+    places = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
+    return {y * columns + x for y, x in places if 0 <= y < rows and 0 <= x < columns}

@@ -220,8 +220,8 @@ def look_at_window(
     shown: WindowLook,
     lattice: Lattice,
     number: int,
-    seconds: float | None = None,
-    value: float = math.inf,
+    seconds: float | None,
+    value: float,
 ) -> LookAtWindow:
     """Make the complete look at a window.
 
@@ -467,15 +467,15 @@ class WindowMomentWords(WindowWords, MomentWords):
 
         A stream lists objects of low probabilities, too, so that it may list more of them than there are.
         """
+        are_doubtful = any(map(self._exceeds_expected, self.record.sought))
+        return f"{super()._listed}, some of them doubtful" if are_doubtful else super()._listed
+
+    def _exceeds_expected(self, label: int) -> bool:
+        """Tell whether more objects of a class are listed than the words say to expect."""
         record = self.record
-        listed = super()._listed
-        for label in record.sought:
-            number = len(record.objects.of([label]))
-            if not self._expected(label):
-                continue
-            if number > round(record.expected[record.classes[label]]):
-                return f"{listed}, some of them doubtful"
-        return listed
+        if not self._expected(label):
+            return False
+        return len(record.objects.of([label])) > round(record.expected[record.classes[label]])
 
     @property
     def lines(self) -> list[str]:
