@@ -110,7 +110,8 @@ class Part(ABC):
         if not self.data["count"]:
             doubt = " The best place, not sure enough, is dashed." if self.data["best"] else ""
             return f"<p>No objects were found.{doubt}</p>"
-        titles = "".join(map(_sortable_head, self._object_heads()))
+        # Cells are named by the heads of their columns; the crops have none.
+        titles = "".join(map(_sortable_head, ["#", "", *self._object_cells(objects[0])]))
         rows = "".join(self._object_row(order, found) for order, found in enumerate(objects, 1))
         label = f"Objects with boxes x1,y1–x2,y2 in picture pixels and the {self.nearest}"
         table = (
@@ -118,27 +119,20 @@ class Part(ABC):
         )
         return f"{scrollable(table, label)}{left_out(self.data['count'] - len(objects), 'object')}"
 
-    def _object_heads(self) -> list[str]:
-        """Name the columns of the list, in the order of the cells of `_object_row`; that of the crops has no name."""
-        heads = ["#", "", "class", "score"]
+    def _object_cells(self, found: Data) -> dict[str, str]:
+        """Write what the list says of an object, by the heads of its columns."""
+        cells = {"class": escape(found["label"]), "score": f"{found['score']:.2f}"}
         if self.data["turns"]:
-            heads.append("pan, tilt")
-        heads.append(self.look)
+            cells["pan, tilt"] = f"{found['pan']:z.0f}°, {found['tilt']:z.0f}°"  # z: never -0°
+        cells[self.look] = str(found["look"])
         if self.data["confirmable"]:
-            heads.append("confirmed")
-        heads.append("box")
-        return heads
+            cells["confirmed"] = "yes" if found["confirmed"] else "no"
+        cells["box"] = box_text(found["box"])
+        return cells
 
     def _object_row(self, order: int, found: Data) -> str:
         """Make the row of an object in the list."""
-        cells = [escape(found["label"]), f"{found['score']:.2f}"]
-        if self.data["turns"]:
-            cells.append(f"{found['pan']:z.0f}°, {found['tilt']:z.0f}°")  # z: never -0°
-        cells.append(str(found["look"]))
-        if self.data["confirmable"]:
-            cells.append("yes" if found["confirmed"] else "no")
-        cells.append(box_text(found["box"]))
-        numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
+        numbers = "".join(f'<td class="number">{cell}</td>' for cell in self._object_cells(found).values())
         return (
             f'<tr data-object="{order}" data-look="{found["look"] - 1}"><th scope="row">'
             f'<button type="button" class="pick">{order}</button></th><td>{self._crop(found)}</td>{numbers}</tr>'
