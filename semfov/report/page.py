@@ -103,7 +103,7 @@ def _of_single(episode: Data) -> dict[str, str]:
         "outcome": _outcome_html(episode),
         "heading": ' class="unseen"',
         "of_episode": "",
-        "details": _details_html([episode], _known_details(episode)),
+        "details": _details_html(episode, _known_details(episode)),
     }
 
 
@@ -113,13 +113,13 @@ def _of_several(episodes: Sequence[Data]) -> dict[str, str]:
     details = ""
     if episodes:
         of_episode = _outcome_html(episodes[0])
-        details = _details_html(episodes, _DETAILS)
+        details = _details_html(episodes[0], _DETAILS)
     return {"outcome": "", "heading": "", "of_episode": of_episode, "details": details}
 
 
 def _outcome_html(episode: Data) -> str:
     """Say what came of a single episode, below the title."""
-    fact = escape(episode.get("decision") or "")
+    fact = escape(episode["decision"] or "")
     return f'<div{hidden_unless(fact)}><p class="outcome" data-about="decision">{fact}</p></div>'
 
 
@@ -129,16 +129,15 @@ _DETAILS = tuple(fact for fact in ABOUT if fact != "decision")
 
 def _known_details(episode: Data) -> list[str]:
     """Choose the details of a single episode; a picture without a file is named by its size, which is one of them."""
-    is_named = episode.get("name") != episode.get("pixels")
+    is_named = episode["name"] != episode["pixels"]
     return [fact for fact in _DETAILS if is_named or fact != "name"]
 
 
-def _details_html(episodes: Sequence[Data], facts: Iterable[str]) -> str:
-    """List facts about the first episode, which the script updates; those that only others have are hidden."""
+def _details_html(episode: Data, facts: Iterable[str]) -> str:
+    """List facts about the first episode, which the script updates; those that are not known of it are hidden."""
     rows = []
     for key in facts:
-        if any(key in episode for episode in episodes):
-            fact = escape(episodes[0].get(key) or "")
-            definition = f'<dt>{ABOUT[key]}</dt><dd data-about="{key}">{fact}</dd>'
-            rows.append(f"<div{hidden_unless(fact)}>{definition}</div>")
+        fact = escape(episode[key] or "")
+        definition = f'<dt>{ABOUT[key]}</dt><dd data-about="{key}">{fact}</dd>'
+        rows.append(f"<div{hidden_unless(fact)}>{definition}</div>")
     return f'<h3>Details</h3><dl id="about" class="facts">{"".join(rows)}</dl>\n'
