@@ -87,28 +87,32 @@ def _show_in_notebook(figure: Figure) -> None:
     shell = None if ipython is None else ipython.get_ipython()
     if shell is None:
         return
-    from IPython.core.pylabtools import print_figure
-    from IPython.display import display
     from matplotlib.figure import Figure
-
-    def print_once(shown: Figure) -> object:
-        """Print a figure that is the last value of the cell, which then need not wait for the end."""
-        _waiting[:] = [waiting for waiting in _waiting if waiting is not shown]
-        return print_figure(shown)
-
-    def end_cell() -> None:
-        """Show the figures that the cell has made and not returned."""
-        while _waiting:
-            display(_waiting.pop(0))
 
     shows_pictures = hasattr(shell, "kernel")  # a terminal has none, and can show none
     pictures = shell.display_formatter.formatters["image/png"]
     if Figure not in pictures.type_printers:
-        pictures.for_type(Figure, print_once)
+        pictures.for_type(Figure, _print_once)
         if shows_pictures:
-            shell.events.register("post_execute", end_cell)
+            shell.events.register("post_execute", _end_cell)
     if shows_pictures:
         _waiting.append(figure)
+
+
+def _print_once(figure: Figure) -> object:
+    """Print a figure that is the last value of the cell, which then need not wait for the end."""
+    from IPython.core.pylabtools import print_figure
+
+    _waiting[:] = [waiting for waiting in _waiting if waiting is not figure]
+    return print_figure(figure)
+
+
+def _end_cell() -> None:
+    """Show the figures that the cell has made and not returned."""
+    from IPython.display import display
+
+    while _waiting:
+        display(_waiting.pop(0))
 
 
 def lay_out(figure: Figure) -> None:
