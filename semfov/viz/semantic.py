@@ -22,7 +22,7 @@ from semfov.viz.drawing import (
     draw_scale,
     text_size,
 )
-from semfov.viz.labels import place_within
+from semfov.viz.labels import LabelBox, place_within
 from semfov.viz.style import UNCERTAINTY, lay_out, make_figure, styled
 
 if TYPE_CHECKING:
@@ -130,19 +130,7 @@ def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artis
     borders = LineCollection(sides, colors="white")
     borders.set(linewidths=1.3, zorder=3)
     drawn: list[Artist] = [axes.add_collection(borders, autolim=False)]
-    candidates = []
-    sizes = []
-    for region in regions:
-        # The name stands on a cell of the region, as near as there is room to the middle.
-        centres = grid.centres[region.cells] + 0.5
-        from_middle = (centres - centres.mean(0)).norm(dim=-1)
-        nearest_first = centres[from_middle.argsort(stable=True)].tolist()
-        width, height = text_size(axes, region.name, _NAME_POINTS)
-        candidates.append([(x - width / 2, y - height / 2) for x, y in nearest_first])
-        sizes.append((width, height))
-    frame_width, frame_height = grid.extent.tolist()
-    places = place_within(candidates, sizes, (frame_width, frame_height))
-    for region, (x1, y1, x2, y2) in zip(regions, places, strict=True):
+    for region, (x1, y1, x2, y2) in zip(regions, _places_of_names(axes, grid, regions), strict=True):
         x = (x1 + x2) / 2
         y = (y1 + y2) / 2
         text = axes.text(x, y, region.name, color="black", fontsize=_NAME_POINTS, clip_on=True)
@@ -150,6 +138,21 @@ def write_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[Artis
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         drawn.append(text)
     return drawn
+
+
+def _places_of_names(axes: Axes, grid: Grid, regions: Sequence[Region]) -> list[LabelBox]:
+    """Place each name on a cell of its region, as near as there is room to the middle."""
+    candidates = []
+    sizes = []
+    for region in regions:
+        centres = grid.centres[region.cells] + 0.5
+        from_middle = (centres - centres.mean(0)).norm(dim=-1)
+        nearest_first = centres[from_middle.argsort(stable=True)].tolist()
+        width, height = text_size(axes, region.name, _NAME_POINTS)
+        candidates.append([(x - width / 2, y - height / 2) for x, y in nearest_first])
+        sizes.append((width, height))
+    frame_width, frame_height = grid.extent.tolist()
+    return place_within(candidates, sizes, (frame_width, frame_height))
 
 
 def _borders(grid: Grid, region: Sequence[int]) -> list[_Line]:
