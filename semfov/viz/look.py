@@ -25,7 +25,7 @@ from semfov.viz.drawing import (
     photograph_of,
     picture_array,
 )
-from semfov.viz.objects import annotation_entries, draw_legend, draw_marks, draw_place, object_marks
+from semfov.viz.objects import annotation_entries, draw_legend, draw_marks, draw_place, grid_of, object_marks
 from semfov.viz.path import LookPath
 from semfov.viz.semantic import write_names
 from semfov.viz.style import lay_out, make_figure, styled
@@ -147,7 +147,7 @@ class LookFigure:
         panels = 2 if believed is None else 3
         self.figure, self.axes = self._open(panels, image.shape[-2] / image.shape[-1], axes)
         path_axes, view_axes = self.axes[:2]
-        draw_place(path_axes, record, image, boxes)
+        draw_place(path_axes, grid_of(record), image, boxes)
         draw_legend(path_axes, annotation_entries(record, boxes))
         path_axes.set_title("look 1")
         self.view = view_axes.imshow(picture_array(view.pixels), interpolation="bilinear")

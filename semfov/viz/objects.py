@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.fixations import Fixations
 from semfov.paths import Record
 from semfov.paths.conversion import Values
 from semfov.viz.drawing import Tag, draw_boxes, draw_grid, draw_image, draw_tags
@@ -49,23 +48,25 @@ class Mark(NamedTuple):
     text: str | None = None
 
 
-def draw_place(axes: Axes, record: Record | Fixations, image: Tensor, boxes: Tensor | None) -> None:
+def draw_place(axes: Axes, grid: Grid, image: Tensor, boxes: Tensor | None) -> None:
     """Draw the picture, the cells of a fovea, and the true boxes of the target.
 
     Args:
         axes: axes to draw in.
-        record: the record, or the fixations of a person.
+        grid: cells over the picture (`grid_of`).
         image: `(3, h, w)`, the picture.
         boxes: `(M, 4)`, true boxes; None for none.
     """
-    grid = Grid(1, 1, record.size)
-    grid_and_belief = record.belief_map(0) if isinstance(record, Record) and record.kind.grid else None
-    if grid_and_belief is not None:
-        grid, _ = grid_and_belief
     draw_image(axes, image, grid)
     draw_grid(axes, grid)
     if boxes is not None:
         draw_boxes(axes, boxes, TRUTH, "--", 1.8)
+
+
+def grid_of(record: Record) -> Grid:
+    """Find the cells at which a fovea looks; for other kinds of look the picture is a single one."""
+    grid_and_belief = record.belief_map(0) if record.kind.grid else None
+    return Grid(1, 1, record.size) if grid_and_belief is None else grid_and_belief[0]
 
 
 def annotation_entries(record: Record, boxes: Tensor | None) -> list[LegendEntry]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.inputs import ImageLike
 from semfov.errors import check, checked_keywords
@@ -23,6 +24,7 @@ from semfov.viz.objects import (
     draw_mark_labels,
     draw_marks,
     draw_place,
+    grid_of,
     object_entries,
     object_marks,
 )
@@ -89,7 +91,7 @@ def _draw_people(axes: Axes, fixations: Fixations, image: Tensor, boxes: Tensor 
     """Draw the fixations of a person, and the box of the target where none is given."""
     if boxes is None and fixations.box is not None:
         boxes = Tensor([fixations.box])
-    draw_place(axes, fixations, image, boxes)
+    draw_place(axes, Grid(1, 1, fixations.size), image, boxes)
     title = f"{len(fixations)} fixations"
     if fixations.target is not None:
         title = f"“{fixations.target}”{_FOUND_IN_WORDS[fixations.found]}"
@@ -100,7 +102,7 @@ def _draw_people(axes: Axes, fixations: Fixations, image: Tensor, boxes: Tensor 
 
 def _draw_record(axes: Axes, record: Record, image: Tensor, boxes: Tensor | None, *, objects: bool) -> None:
     """Draw the looks of a record, and its objects if they are wanted."""
-    draw_place(axes, record, image, boxes)
+    draw_place(axes, grid_of(record), image, boxes)
     remarks = filter(None, [record.words.lack(), record.words.assumption()])
     title = ". ".join([record.describe(), " ".join(remarks)]).removesuffix(". ")
     axes.set_title(fill(title, 100), parse_math=False)
@@ -206,7 +208,7 @@ def plot_episode(
     place: Any = figure or Figure(figsize=(width, 2 * 2.5 * aspect + 0.9), layout="constrained")
     path_side, look_side = place.subfigures(1, 2, width_ratios=[5.2, width - 5.2])
     path_axes = path_side.subplots()
-    draw_place(path_axes, scanpath, image, boxes)
+    draw_place(path_axes, scanpath.grid, image, boxes)
     path_axes.set_title(scanpath.describe(), parse_math=False)
     draw_legend(path_axes, annotation_entries(scanpath, boxes))
     panels = look_side.subplots(2, len(fixations), squeeze=False)
