@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 
 from tqdm import tqdm
 
@@ -82,11 +83,11 @@ def _check_options(options: CompareOptions) -> None:
 def _ways(options: CompareOptions, agent: ActivePerception, labels: tuple[int, ...], side: int) -> dict[str, Way]:
     """Make semfov's way to look at a picture, and those that it is compared with; slices of a side in pixels."""
     eye = agent.zoom.eye
-    ways: dict[str, Way] = {SEMFOV: by_semfov(agent, labels, options.passes)}
+    ways: dict[str, Way] = {SEMFOV: partial(by_semfov, agent, labels, options.passes)}
     if "sahi" in options.with_:
-        ways[ALL_SLICES] = all_slices(eye, labels, side, options.overlap)
+        ways[ALL_SLICES] = partial(all_slices, eye, labels, side, options.overlap)
     if "ranked" in options.with_:
-        ways["best slices"] = best_slices(eye, labels, side, options.overlap, options.passes)
+        ways["best slices"] = partial(best_slices, eye, labels, side, options.overlap, options.passes)
     return ways
 
 

@@ -87,69 +87,67 @@ class Point:
         return self.listed, self.right, self.reference
 
 
-def by_semfov(agent: ActivePerception, labels: Sequence[int], passes: int) -> Way:
-    """Make the way of an agent, which chooses each window and may end before its last pass.
+def by_semfov(agent: ActivePerception, labels: Sequence[int], passes: int, picture: LargePicture) -> list[Finding]:
+    """Look as an agent does, which chooses each window and may end before its last pass.
 
     Args:
         agent: the agent.
         labels: classes 1..K to find; none for all.
         passes: most passes.
+        picture: the picture.
 
     Returns:
-        The way.
+        What was found after some numbers of passes.
     """
+    wanted = _wanted(passes)
+    stops: list[tuple[float, Record]] = []
+    began = time.perf_counter()
 
-    def way(picture: LargePicture) -> list[Finding]:
-        wanted = _wanted(passes)
-        stops: list[tuple[float, Record]] = []
-        began = time.perf_counter()
+    def stop_the_clock(record: Record) -> None:
+        if record.passes in wanted:
+            stops.append((time.perf_counter() - began, record))
 
-        def stop_the_clock(record: Record) -> None:
-            if record.passes in wanted:
-                stops.append((time.perf_counter() - began, record))
-
-        last = agent.find_all(picture, [*labels] or None, how="windows", passes=passes, on_look=stop_the_clock)
-        # The last record counts also where it ends between two of the numbers.
-        if not stops or stops[-1][1].passes < last.passes:
-            stops.append((time.perf_counter() - began, last))
-        findings = []
-        for seconds, record in stops:
-            # Objects are merged after the search, and the time for that is added to each point.
-            merging = time.perf_counter()
-            objects = record.candidates.of(labels)
-            seconds += time.perf_counter() - merging
-            findings.append(Finding(record.passes, seconds, objects, record.score_threshold))
-        return findings
-
-    return way
+    last = agent.find_all(picture, [*labels] or None, how="windows", passes=passes, on_look=stop_the_clock)
+    # The last record counts also where it ends between two of the numbers.
+    if not stops or stops[-1][1].passes < last.passes:
+        stops.append((time.perf_counter() - began, last))
+    findings = []
+    for seconds, record in stops:
+        # Objects are merged after the search, and the time for that is added to each point.
+        merging = time.perf_counter()
+        objects = record.candidates.of(labels)
+        seconds += time.perf_counter() - merging
+        findings.append(Finding(record.passes, seconds, objects, record.score_threshold))
+    return findings
 
 
-def all_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float) -> Way:
-    """Make the way that looks at the whole picture and at all its slices, as SAHI does (Akyon et al., 2022).
+def all_slices(
+    eye: WindowEye, labels: Sequence[int], side: int, overlap: float, picture: LargePicture
+) -> list[Finding]:
+    """Look at the whole picture and at all its slices, as SAHI does (Akyon et al., 2022).
 
     Args:
         eye: the eye, with the detector.
         labels: classes 1..K to find; none for all.
         side: of a slice in pixels.
         overlap: share of its side that the next one repeats.
+        picture: the picture.
 
     Returns:
-        The way.
+        What was found after all passes.
     """
-
-    def way(picture: LargePicture) -> list[Finding]:
-        clock = _Clock()
-        source = LiveWindowLooks(eye, eye.open(picture))
-        windows = [Window.overview(source.lattice), *_slices_of(source.lattice, side, overlap)]
-        # Slices are not chosen by hints, so that no time is spent on making them.
-        looks = [source.see([window], hints=False)[0] for window in windows]
-        return [clock.finding(looks, labels)]
-
-    return way
+    clock = _Clock()
+    source = LiveWindowLooks(eye, eye.open(picture))
+    windows = [Window.overview(source.lattice), *_slices_of(source.lattice, side, overlap)]
+    # Slices are not chosen by hints, so that no time is spent on making them.
+    looks = [source.see([window], hints=False)[0] for window in windows]
+    return [clock.finding(looks, labels)]
 
 
-def best_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float, passes: int) -> Way:
-    """Make the way that looks at the slices in the order of the raw scores that the whole picture has in them.
+def best_slices(
+    eye: WindowEye, labels: Sequence[int], side: int, overlap: float, passes: int, picture: LargePicture
+) -> list[Finding]:
+    """Look at the slices in the order of the raw scores that the whole picture has in them.
 
     Args:
         eye: the eye, with the detector.
@@ -157,28 +155,25 @@ def best_slices(eye: WindowEye, labels: Sequence[int], side: int, overlap: float
         side: of a slice in pixels.
         overlap: share of its side that the next one repeats.
         passes: most passes.
+        picture: the picture.
 
     Returns:
-        The way.
+        What was found after some numbers of passes.
     """
     wanted = _wanted(passes)
-
-    def way(picture: LargePicture) -> list[Finding]:
-        clock = _Clock()
-        source = LiveWindowLooks(eye, eye.open(picture))
-        order = ranked(_slices_of(source.lattice, side, overlap), labels)
-        looks: list[WindowLook] = []
-        findings = []
-        for step in islice(look_by_look(source, order, None), passes):
-            looks.append(step.look)
-            if len(looks) in wanted:
-                findings.append(clock.finding(looks, labels))
-        # The last look counts also where there are no more slices before the next of the numbers.
-        if len(looks) not in wanted:
+    clock = _Clock()
+    source = LiveWindowLooks(eye, eye.open(picture))
+    order = ranked(_slices_of(source.lattice, side, overlap), labels)
+    looks: list[WindowLook] = []
+    findings = []
+    for step in islice(look_by_look(source, order, None), passes):
+        looks.append(step.look)
+        if len(looks) in wanted:
             findings.append(clock.finding(looks, labels))
-        return findings
-
-    return way
+    # The last look counts also where there are no more slices before the next of the numbers.
+    if len(looks) not in wanted:
+        findings.append(clock.finding(looks, labels))
+    return findings
 
 
 class _Clock:
