@@ -263,17 +263,24 @@ def _one_letter(command: str, words: Sequence[str]) -> str | None:
 
 def _without_dashes(command: str, words: Sequence[str]) -> str | None:
     """Say how an option is written that stands as NAME=VALUE, as in other programs; None if there is none."""
-    known = _option_names(command) if any("=" in word for word in words) else []
-    for before, word in pairwise(["", *words]):
-        name, equals, value = word.partition("=")
-        # The value of an option may have this form, too, and so may the name of a file, which may be too long for one.
-        if before.startswith("-") or word.startswith("-") or not equals or os.path.exists(word):
-            continue
-        option = name.replace("-", "_")
-        if option in known:
-            return f"expected --{dashed(option)} {value}, got {word}"
-        if option == SUBCOMMANDS[command].positional or not OPTIONS.keys().isdisjoint((option, *parts_of(option))):
-            return _refusal(command, option) or f"expected options with two dashes, --NAME VALUE, got {word}"
+    # The value of an option may have this form, too.
+    others = [word for before, word in pairwise(["", *words]) if not before.startswith("-")]
+    refusals = (_refusal_of_assignment(command, word) for word in others)
+    return next(filter(None, refusals), None)
+
+
+def _refusal_of_assignment(command: str, word: str) -> str | None:
+    """Say how the option is written that a word means, NAME=VALUE; None for others, which the names of files may be."""
+    name, equals, value = word.partition("=")
+    # `exists` takes a word that is too long for the name of a file, too.
+    if word.startswith("-") or not equals or os.path.exists(word):
+        return None
+    option = name.replace("-", "_")
+    if option in _option_names(command):
+        return f"expected --{dashed(option)} {value}, got {word}"
+    is_of_others = not OPTIONS.keys().isdisjoint((option, *parts_of(option)))
+    if option == SUBCOMMANDS[command].positional or is_of_others:
+        return _refusal(command, option) or f"expected options with two dashes, --NAME VALUE, got {word}"
     return None
 
 
