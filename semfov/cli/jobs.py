@@ -52,7 +52,7 @@ class PictureJob(ABC, Generic[_Options_co]):
         title: what is done, in words.
         target: class that is searched for, or the first of those to find; None for all.
         targets: the classes that results are about; None for all.
-        weights: probability that each class is meant by the target of a search; None for other tasks.
+        weights: probability that each class is meant by the target of a search; empty for other tasks.
     """
 
     task: ClassVar[type[CheckedSettings]]
@@ -64,7 +64,7 @@ class PictureJob(ABC, Generic[_Options_co]):
         self.title = ""
         self.target: str | None = None
         self.targets: Sequence[str] | None = None
-        self.weights: dict[str, float] | None = None
+        self.weights: dict[str, float] = {}
         self.sources = picture_sources(options)
         self.several = len(self.sources) > 1
         # The cheap checks come first: a mistake is told before files are read and the detector is loaded.
@@ -217,7 +217,7 @@ class SearchJob(PictureJob[SearchOptions]):
         if not options.target:
             name = options.models_folder or detector_of(options)
             raise InputError(f"target: expected a class, --target cup, got none; `semfov detectors {name}` lists them")
-        if classes is not None and self.weights is None:
+        if classes is not None and not self.weights:
             self.weights = meant_classes(options, classes)
             self.target = next(iter(self.weights))
             self.targets = [self.target]
@@ -225,24 +225,22 @@ class SearchJob(PictureJob[SearchOptions]):
 
     def look(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
         """Search a picture, for several classes with a fovea; elsewhere for the most likely one of them."""
-        weights = self.weights or {}
-        several = len(weights) > 1
+        several = len(self.weights) > 1
         foveal = several or self.options.is_for_fovea
         if self.agent.kind_of_look(picture, settings["how"], foveal=foveal) == "fovea":
             return self._search_with_fovea(picture, settings, source)
         if several:
             note = f"large pictures and scenes are searched only for the most likely class: {self.target}"
             print(note, file=sys.stderr)
-        return self.agent.search(picture, next(iter(weights)), **settings)
+        return self.agent.search(picture, next(iter(self.weights)), **settings)
 
     def _search_with_fovea(self, picture: PictureLike, settings: dict[str, Any], source: PictureSource) -> Record:
         """Search a picture for the classes with their weights; the first look at an example is off the target."""
-        weights = self.weights or {}
         if settings["start"] is None:
             settings = {**settings, "start": self._start_off_target(source)}
-        if len(weights) > 1:
-            return self.agent.search(picture, weights, **{**settings, "how": "fovea"})
-        return self.agent.search(picture, next(iter(weights)), **settings)
+        if len(self.weights) > 1:
+            return self.agent.search(picture, self.weights, **{**settings, "how": "fovea"})
+        return self.agent.search(picture, next(iter(self.weights)), **settings)
 
     def _start_off_target(self, source: PictureSource) -> int | None:
         """Draw a first cell off the target of an example; None for other pictures, whose target is not known."""
