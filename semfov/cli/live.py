@@ -4,7 +4,7 @@ import shutil
 import sys
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import fields
 from pathlib import Path
 from shlex import quote
@@ -120,24 +120,18 @@ def _watch(live: LivePerception, stream: Stream, path: Path | None, tracks: Path
     mot_lines: list[str] = []
     print(f"{stream.name}: {live.describe()}")
     written = nullcontext() if path is None else video(path, stream.rate or _UNKNOWN_RATE)
-    with written as add_frame:
-        try:
-            for picture, moment in _moments(live, stream):
-                speed.count_frame()
-                sums.add(moment)
-                if tracks is not None:
-                    mot_lines.append(_mot_lines(moment))
-                if speed.frames == 1:
-                    print("\n".join(_legend(live, moment)))
-                rate = speed.recent()
-                lines.show(f"  {_moment_line(moment)}  {rate}")
-                if add_frame is not None:
-                    add_frame(draw_moment(picture.image, moment, f"{moment.describe()}   {rate}"))
-        except KeyboardInterrupt:  # ends a stream in good order: what was written until then is whole
-            lines.end()
-            print("  stopped")
-        finally:
-            lines.end()
+    with written as add_frame, lines.until_stopped():
+        for picture, moment in _moments(live, stream):
+            speed.count_frame()
+            sums.add(moment)
+            if tracks is not None:
+                mot_lines.append(_mot_lines(moment))
+            if speed.frames == 1:
+                print("\n".join(_legend(live, moment)))
+            rate = speed.recent()
+            lines.show(f"  {_moment_line(moment)}  {rate}")
+            if add_frame is not None:
+                add_frame(draw_moment(picture.image, moment, f"{moment.describe()}   {rate}"))
     if tracks is not None:
         write_text(tracks, "".join(mot_lines))
     print(_totals(stream, speed))
@@ -151,6 +145,17 @@ class _FrameLines:
     def __init__(self) -> None:
         self._is_renewed = sys.stdout.isatty()
         self._is_open = False
+
+    @contextmanager
+    def until_stopped(self) -> Iterator[None]:
+        """Open a block for the frames, which Ctrl-C ends in good order: what was written until then is whole."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.end()
+            print("  stopped")
+        finally:
+            self.end()
 
     def show(self, line: str) -> None:
         """Print the line of a frame; on a terminal as much of it as a line of it holds."""
