@@ -1,8 +1,9 @@
 """Subcommand detectors: lists the detectors that can be named, or the classes of one."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from os import fspath
 from pathlib import Path
+from typing import Any
 
 from semfov.agent import ActivePerception
 from semfov.belief import Verification
@@ -37,7 +38,7 @@ def _show_one(options: DetectorsOptions, path: Path) -> int:
     """List the classes of a detector, or try it out in a photograph."""
     name = fspath(path)
     loading = detector_options(options)
-    classes = Manifest.read(path).classes if path.is_dir() else _classes_of(name, options)
+    classes = Manifest.read(path).classes if path.is_dir() else _classes_of(name, options, loading)
     written = remember(options, name)
     if written is not None:
         print(f"wrote {written}")
@@ -50,10 +51,9 @@ def _show_one(options: DetectorsOptions, path: Path) -> int:
     return 0
 
 
-def _classes_of(name: str, options: DetectorsOptions) -> Sequence[str]:
+def _classes_of(name: str, options: DetectorsOptions, loading: Mapping[str, Any]) -> Sequence[str]:
     """Find the classes of a detector; one whose classes are registered is loaded only to try the options."""
     check_onnx_options(options, name)
-    loading = detector_options(options)
     registered = check_detector(name)
     if registered is None or loading:
         return load_detector(name, **loading).classes
