@@ -12,7 +12,7 @@ import yaml
 
 from semfov.errors import check
 from semfov.io.ranges import CheckedSettings
-from semfov.runs.setting_types import FlagType, ListType, SettingType, setting_types
+from semfov.runs.setting_types import FlagType, ListType, SettingType, next_value, setting_types
 from semfov.runs.settings import Settings, load_yaml
 from semfov.words import FORMER, dashed, note_of_former
 
@@ -48,16 +48,12 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         if option in options:
             kind = types.get(option[2:], _NO_SETTING)
             _check_once(option, kind, usual)
-            value = _value_of(word, kind, words)
-            usual.append(option if value is None else f"{option}={kind.in_brackets(value)}")
-            if value is None and words and not words[0].startswith("--"):
-                usual.append(words.popleft())
+            usual += _with_value(word, kind, words)
         elif word.startswith("-") and word != "-":
-            usual.append(word)  # left to the parser, with its messages
             # An item of a dictionary, as `--sensor.settings.fovea`, is no option of its own, but has a value.
             is_item = option.rpartition(".")[0] in options and "=" not in word
-            if is_item and words and not words[0].startswith("--"):
-                usual.append(words.popleft())
+            value = next_value(words) if is_item else None
+            usual += [word] if value is None else [word, value]  # left to the parser, with its messages
         else:
             place = place if free else len(usual)
             free.append(word)
@@ -94,6 +90,16 @@ def _check_once(option: str, kind: SettingType, before: Iterable[str]) -> None:
     takes_several = isinstance(kind, ListType) or kind.hint is str
     remedy = "; where it takes several, as a,b" if takes_several else ""
     check(not is_repeated, _in_messages(option), "once", f"it again{remedy}")
+
+
+def _with_value(word: str, kind: SettingType, words: deque[str]) -> list[str]:
+    """Write an option and its value as one word; a value of a type that the parser reads stays a word after it."""
+    option = _option_of(word)
+    value = _value_of(word, kind, words)
+    if value is not None:
+        return [f"{option}={kind.in_brackets(value)}"]
+    value = next_value(words)
+    return [option] if value is None else [option, value]
 
 
 def _value_of(word: str, kind: SettingType, words: deque[str]) -> str | None:

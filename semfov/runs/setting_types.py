@@ -69,7 +69,7 @@ class ListType(SettingType):
     """Type of a list of words, paths or numbers of any length: `tuple[str, ...]`."""
 
     def value_after(self, words: deque[str]) -> str | None:
-        return _next_value(words)
+        return next_value(words)
 
     def in_brackets(self, value: str) -> str:
         if value.startswith("["):
@@ -89,7 +89,7 @@ class OneOrTupleType(SettingType):
     """Type of one value or a tuple of several, as a cell by its number or its column and row."""
 
     def value_after(self, words: deque[str]) -> str | None:
-        return _next_value(words)
+        return next_value(words)
 
     def in_brackets(self, value: str) -> str:
         has_several = "," in value and not value.startswith("[")
@@ -110,7 +110,7 @@ class AnnotatedType(SettingType):
         pattern = "".join(annotation.more for annotation in self.annotations if isinstance(annotation, Form))
         if not pattern:
             return self.base.value_after(words)
-        value = _next_value(words)
+        value = next_value(words)
         while value is not None and words and re.fullmatch(pattern, words[0]):
             value = f"{value} {words.popleft()}"
         return value
@@ -124,7 +124,7 @@ class AnnotatedType(SettingType):
         return " ".join([noun, *map(repr, self.annotations)])
 
 
-def _next_value(words: deque[str]) -> str | None:
+def next_value(words: deque[str]) -> str | None:
     """Take the next word, unless it is an option or there is none."""
     return words.popleft() if words and not words[0].startswith("--") else None
 
