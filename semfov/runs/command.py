@@ -19,7 +19,7 @@ from semfov.errors import InputError, SemfovError
 from semfov.io.files import discard_unfinished
 from semfov.io.ranges import check_settings
 from semfov.runs.arguments import in_present_names, mistake, usual_form
-from semfov.runs.setting_types import ListType, setting_types
+from semfov.runs.setting_types import ListType, SettingType, setting_types
 from semfov.runs.settings import Settings, load_yaml
 
 if TYPE_CHECKING:
@@ -109,11 +109,17 @@ def make_parser(
         allow_abbrev=False,  # --conf would be --config
     )
     parser.add_argument("--config", action="config", help="YAML file with settings; options after it override it.")
-    if positional is None:
-        parser.add_class_arguments(config, as_group=True, skip={*config.unused})
-        return parser
-    name, text = positional
-    kind = setting_types(config)[name]
+    no_options = {*config.unused}
+    if positional is not None:
+        name, text = positional
+        _add_positional(parser, name, text, setting_types(config)[name])
+        no_options.add(name)
+    parser.add_class_arguments(config, as_group=True, skip=no_options)
+    return parser
+
+
+def _add_positional(parser: ArgumentParser, name: str, text: str, kind: SettingType) -> None:
+    """Add the setting that has no option before it, with its help."""
     takes_several = isinstance(kind, ListType)
     parser.add_argument(
         name,
@@ -122,8 +128,6 @@ def make_parser(
         type=str if takes_several or kind.hint is str else Path,
         default=SUPPRESS,  # without one of its own it leaves what a file of --config says
     )
-    parser.add_class_arguments(config, as_group=True, skip={*config.unused, name})
-    return parser
 
 
 def _with_readable_types(text: str) -> str:
