@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 from semfov.belief.observers import Observer, Semantic, SemanticMap, SemanticSearch
@@ -94,26 +94,24 @@ class _Models(NamedTuple):
 
 
 class _LoadedModels:
-    """Models by name, each loaded when it is asked for the first time."""
+    """Models by name, each loaded and checked by detector and sensor when it is asked for the first time."""
 
     def __init__(self, belief: BeliefConfig, eye: Eye) -> None:
-        self.belief = belief
-        self.eye = eye
-        self.loaded: dict[str, Any] = {}
+        self._make: dict[str, Callable[[], FovealObservationModel]] = {
+            "observation": partial(make_observation, belief.model, eye),
+            "search": partial(make_searching, belief.search_model, eye),
+            "map": partial(make_map, belief.map_model, eye),
+        }
+        self.loaded: dict[str, FovealObservationModel] = {}
 
-    def __call__(self, name: str) -> Any:
+    def __call__(self, name: str) -> FovealObservationModel:
         if name not in self.loaded:
-            self.loaded[name] = _load(name, self.belief, self.eye)
+            self.loaded[name] = self._make[name]()
         return self.loaded[name]
 
 
-def _load(name: str, belief: BeliefConfig, eye: Eye) -> Any:
-    """Load a model that a policy needs, and check that it was fitted for the detector and the sensor."""
-    if name == "observation":
-        return make_observation(belief.model, eye)
-    if name == "search":
-        return make_searching(belief.search_model, eye)
-    return make_map(belief.map_model, eye)
+_Model = Callable[[str], FovealObservationModel]
+"""Gives a model by its name (`_LoadedModels`)."""
 
 
 def _belief_settings(policy: PolicyConfig) -> PolicyConfig:
@@ -126,7 +124,7 @@ def _make_strategy(
     task: Task,
     belief: BeliefConfig,
     components: int,
-    model: Callable[[str], Any],
+    model: _Model,
     fovea: float,
 ) -> Strategy:
     """Build the observer and the policy that settings describe.
@@ -149,7 +147,7 @@ def _make_strategy(
     return Strategy(_make_semantic(policy, belief, components, model), chosen)
 
 
-def _make_policy(policy: PolicyConfig, belief: BeliefConfig, model: Callable[[str], Any], fovea: float) -> Policy:
+def _make_policy(policy: PolicyConfig, belief: BeliefConfig, model: _Model, fovea: float) -> Policy:
     """Build the policy, with what its acquisition function takes."""
     function = FUNCTIONS[policy.policy]
     needed = model("observation") if "model" in function.takes else None
@@ -158,9 +156,7 @@ def _make_policy(policy: PolicyConfig, belief: BeliefConfig, model: Callable[[st
     return Policy(function, needed, samples=policy.samples, calibrated=policy.scores == "calibrated", **options)
 
 
-def _make_semantic(
-    policy: PolicyConfig, belief: BeliefConfig, components: int, model: Callable[[str], Any]
-) -> Semantic:
+def _make_semantic(policy: PolicyConfig, belief: BeliefConfig, components: int, model: _Model) -> Semantic:
     """Build the observer that fuses scores, with the settings of the policy or else those of the belief."""
     settings = {name: getattr(belief if getattr(policy, name) is None else policy, name) for name in _OF_SEMANTIC}
     settings["misses"] = model("observation") if settings["misses"] else None
