@@ -60,15 +60,15 @@ class DetectionStore(SceneStore):
     more: Mapping[str, Field] = {}  # names, shapes and ranges of the tensors that a look has besides its detections
 
     def __init__(
-        self, folder: Path, what: Mapping[str, object], sources: Sequence[str], components: int | None = None
+        self, folder: Path, what: Mapping[str, object], sources: Sequence[str], components: int
     ) -> None:
         fields = {
             "actions": Field(("N", self.width), torch.float64),
             "count": Field(("N",), torch.int64, low=0),
             "boxes": Field(("M", 4)),
-            "scores": Field(("M", "C" if components is None else components), low=0, high=1),
+            "scores": Field(("M", components), low=0, high=1),
             "confidence": Field(("M",), low=0, high=1),
-            "highest": Field(("N", "C" if components is None else components), low=0, high=1),
+            "highest": Field(("N", components), low=0, high=1),
         }
         super().__init__(folder, what, modules_digest(*sources, __name__), Schema(fields | {**self.more}))
 
@@ -126,7 +126,7 @@ def cell_store(
     settings: Mapping[str, object],
     columns: int,
     rows: int,
-    components: int | None = None,
+    components: int,
 ) -> DetectionStore:
     """Open a store of looks from the cells of a grid, and of closer looks."""
     # The cell centres in a picture of odd size identify the way in which a grid is laid out.

@@ -40,7 +40,7 @@ class _ClusterLost(Exception):
 
 
 @contextmanager
-def _open_cluster(address: str, *, again: bool = False) -> Iterator[tuple[Executor, int]]:
+def _open_cluster(address: str, *, again: bool) -> Iterator[tuple[Executor, int]]:
     """Connect to a Dask scheduler, and give tasks to its workers; tells how many tasks they can have at once."""
     try:
         from distributed import Client, KilledWorker
