@@ -342,10 +342,11 @@ class OnvifCamera(PanTiltCamera):
         Raises:
             DataError: the camera does not answer, or does not tell it.
         """
-        return self._status()[0]
+        position, _ = self._status()
+        return position
 
-    def _status(self) -> tuple[Position, bool | None]:
-        """Ask for the position, and whether the camera moves; None where it does not say."""
+    def _status(self) -> tuple[Position, bool]:
+        """Ask for the position, and whether the camera says that it moves."""
         answer = self._command("GetStatus")
         pan_and_tilt = answer.find(".//t:PanTilt[@x]", _PREFIXES)
         if pan_and_tilt is None:
@@ -359,7 +360,8 @@ class OnvifCamera(PanTiltCamera):
             raise DataError(f"camera: expected {expected}, got {pan:g}, {tilt:g} in {units or 'no named space'}")
         zoomed = answer.find(".//t:Zoom[@x]", _PREFIXES)
         zoom = 0.0 if zoomed is None else _number(zoomed, "x")
-        return Position(pan, tilt, zoom), _is_moving(answer)
+        states = [element.text for element in answer.iterfind(".//t:MoveStatus/*", _PREFIXES)]
+        return Position(pan, tilt, zoom), "MOVING" in states
 
     def _approach(self, goal: Position) -> None:
         """Turn by relative moves, the short way round; one is at most as long as ONVIF allows, so there may be two."""
@@ -436,14 +438,6 @@ def _time_of(moment: XML.Element) -> datetime:
         min(number("Time", "Second"), 59),  # a leap second is 60
         tzinfo=UTC,
     )
-
-
-def _is_moving(status: XML.Element) -> bool | None:
-    """Read from a status whether any motor moves; None where it says nothing of them."""
-    states = [element.text for element in status.iterfind(".//t:MoveStatus/*", _PREFIXES)]
-    if "MOVING" in states:
-        return True
-    return False if "IDLE" in states else None
 
 
 def _limited(length: float) -> float:
