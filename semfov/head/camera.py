@@ -88,7 +88,7 @@ class _CameraScene(Sphere):
 
     still = False
 
-    def __init__(self, camera: PanTiltCamera, color: Color = "rgb") -> None:
+    def __init__(self, camera: PanTiltCamera, color: Color) -> None:
         _check_camera(camera)
         fields = check_fields(camera.fields)
         # As many pixels to a degree as the narrowest view has.

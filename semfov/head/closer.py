@@ -36,7 +36,7 @@ class CloserLookOffers:
         target: class 1..K of a search; None for the objects of all classes.
     """
 
-    def __init__(self, gain: LookGain, speeds: Speeds | None, target: int | None = None) -> None:
+    def __init__(self, gain: LookGain, speeds: Speeds | None, target: int | None) -> None:
         self.gain = gain
         self.views: Views = gain.views
         self.speeds = speeds

@@ -34,7 +34,7 @@ Detect = Callable[[int], Detections]
 class _HeadLooks(Looks):
     """Looks of an eye in a head."""
 
-    def __init__(self, views: Views, detect: Detect, target: int | None = None) -> None:
+    def __init__(self, views: Views, detect: Detect, target: int | None) -> None:
         self.views = views
         self.detect = detect
         self.target = target

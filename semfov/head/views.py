@@ -98,15 +98,14 @@ class Views:
         Returns:
             The action that fixates the point, as nearly as the limits of the head allow.
         """
-        free = [] if free is None else free
         pose = self.world.aim(point, field)
         same_poses = (self.poses == pose).all(-1).nonzero()
         if len(same_poses):
             number = int(same_poses[0, 0])
-            if number in free:
+            if free and number in free:
                 free.remove(number)
         else:
-            number = self.add(pose) if not free else self.replace(free.pop(), pose)
+            number = self.replace(free.pop(), pose) if free else self.add(pose)
         pixel, _ = self.world.to_view(point[None], pose)
         return number * self.cells + int(self.view_grid.cell_of(pixel))
 
