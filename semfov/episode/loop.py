@@ -82,20 +82,24 @@ def attend(
     """
     look = looks.see(observer, episodes, cell, fixation)
     watch = Stopwatch(look.seconds)
-    belief = memory.belief
-    age = memory.age
     if forgetting is not None:
         # What was seen before fades first: the new look counts in full.
-        age = age + look.passed
-        share_left = forgetting.share_left(look.passed)
-        belief = observer.fade(belief, look.evidence, share_left, forgetting.visited(age))
-    belief = observer.update(belief, look.evidence)
+        memory = _faded(memory, observer, look, forgetting)
+    belief = observer.update(memory.belief, look.evidence)
     watch.lap("update belief")
-    visited = memory.visited.scatter(-1, cell[:, None], True)
-    if forgetting is not None:
-        age = age.scatter(-1, cell[:, None], 0)
-        visited = forgetting.visited(age)
-    return replace(look, seconds=watch.seconds), Memory(belief, visited, age)
+    timed_look = replace(look, seconds=watch.seconds)
+    if forgetting is None:
+        return timed_look, Memory(belief, memory.visited.scatter(-1, cell[:, None], True), memory.age)
+    age = memory.age.scatter(-1, cell[:, None], 0)
+    return timed_look, Memory(belief, forgetting.visited(age), age)
+
+
+def _faded(memory: Memory, observer: Observer, look: EpisodeLook, forgetting: Forgetting) -> Memory:
+    """Let belief and visits fade over the time that a look took."""
+    age = memory.age + look.passed
+    share_left = forgetting.share_left(look.passed)
+    belief = observer.fade(memory.belief, look.evidence, share_left, forgetting.visited(age))
+    return replace(memory, belief=belief, age=age)
 
 
 def rollout(
