@@ -92,7 +92,7 @@ def _objects_lines(record: Record) -> list[str]:
     lines = [_object_line(row) for row in rows[:_OBJECTS_LISTED]]
     if len(rows) > _OBJECTS_LISTED:
         lines.append(f"  and {len(rows) - _OBJECTS_LISTED} more (--out FILE.json writes all)")
-    if record.target is None and not record.targets and len(rows) > 1:
+    if not record.sought and len(rows) > 1:
         lines.append(f"  in all: {record.words.classes}")
     return lines
 

@@ -80,16 +80,21 @@ def _opened(path: Record, picture: LargePicture | ImageLike | None) -> LargePict
 
 def _outcome_in_words(path: Record) -> str:
     """Tell the decision or the objects, why the record ended, the best place of doubt, and what is assumed."""
-    result = f"{path.words.objects}."
-    is_exploration = path.target is None and not path.targets
-    if is_exploration and len(path.objects):
-        result = f"{path.words.objects}: {path.words.classes}."
+    sentences = [f"{_result_in_words(path)}.", path.why_it_ended(), *path.words.remarks]
+    return " ".join(filter(None, sentences))
+
+
+def _result_in_words(path: Record) -> str:
+    """Tell the decision of a search, or the objects, in an exploration by class."""
+    words = path.words
     if path.decision is not None:
-        by_probability = path.words.decided_by == "probability"
+        by_probability = words.decided_by == "probability"
         measure = "probability that the picture holds it" if by_probability else "best score"
-        verdict = path.words.verdict(f"“{path.target_name}”")
-        result = f"{verdict[0].upper()}{verdict[1:]}, {measure}: {path.decision.probability:.2f}."
-    return " ".join(filter(None, [result, path.why_it_ended(), *path.words.remarks]))
+        verdict = words.verdict(f"“{path.target_name}”")
+        return f"{verdict[0].upper()}{verdict[1:]}, {measure}: {path.decision.probability:.2f}"
+    if len(path.objects) and not path.sought:
+        return f"{words.objects}: {words.classes}"
+    return words.objects
 
 
 def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Data:
@@ -100,8 +105,9 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
     width_seen = max(1, round((x2 - x1) * magnification))
     detections = _detections(path, look, view)
     closer = _closer_look(path, look)
-    certainty = None if closer is None else f"probability {closer.place:.2f} that the target is there"
+    brought = _brought_in_words(path, look)
     pose = _pose_in_words(look) if path.kind.turns else None
+    where = _where_in_words(path, look, magnification, pose)
     return {
         "view": jpeg_uri(view.pixels, width_seen, quality),
         "box": [round(side) for side in look.region],
@@ -112,23 +118,21 @@ def _look(path: Record, look: RecordedLook, view: LookView, quality: int) -> Dat
         "magnification": magnification,
         "value": look.value,
         "seconds": look.seconds,
-        "closer": certainty,
+        "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
         "detections": detections[:_MOST_DETECTIONS],
         "count": len(detections),
-        "brought": _brought_in_words(path, look),
-        "status": _status(path, look, magnification, pose),
+        "brought": brought,
+        "status": _status(f"{_number_in_words(path, look)}{where}.", look, closer, brought),
     }
 
 
-def _status(path: Record, look: RecordedLook, magnification: float, pose: str | None) -> str:
+def _status(place: str, look: RecordedLook, closer: CloseUp | None, brought: str) -> str:
     """Tell of a look where it was, its value, and what came of it."""
-    sentences = [f"{_number_in_words(path, look)}{_where_in_words(path, look, magnification, pose)}."]
+    sentences = [place]
     if look.value is not None:
         sentences.append(f"Its value was {look.value:.2g}.")
-    closer = _closer_look(path, look)
     if closer is not None:
         sentences.append(_closer_in_words(look, closer))
-    brought = _brought_in_words(path, look)
     if brought:
         sentences.append(f"Best seen in this look: {brought}.")
     return " ".join(sentences)
