@@ -367,20 +367,21 @@ class OnvifCamera(PanTiltCamera):
         """Turn by relative moves, the short way round; one is at most as long as ONVIF allows, so there may be two."""
         position = self.where()
         while True:
-            pan = self._turn(position.pan, goal.pan)
-            distance = Position(pan, goal.tilt - position.tilt, goal.zoom - position.zoom)
-            step = Position(_limited(distance.pan), _limited(distance.tilt), _limited(distance.zoom))
+            way = self._way(position, goal)
+            step = Position(*map(_limited, way))
             stop = Position(position.pan + step.pan, position.tilt + step.tilt, position.zoom + step.zoom)
             self._move("RelativeMove", "Translation", step)
             self._wait(stop)
-            if step == distance:
+            if step == way:
                 return
             position = stop
 
-    def _turn(self, start: float, end: float) -> float:
-        """Compute the turn between two pans in the units of ONVIF; of a camera without borders the shorter one."""
-        turn = end - start
-        return (turn + 1) % 2 - 1 if self._is_round else turn
+    def _way(self, position: Position, goal: Position) -> Position:
+        """Compute the translation to a goal, of a camera without borders by the shorter turn."""
+        pan = goal.pan - position.pan
+        if self._is_round:
+            pan = (pan + 1) % 2 - 1
+        return Position(pan, goal.tilt - position.tilt, goal.zoom - position.zoom)
 
     def _wait(self, goal: Position) -> None:
         """Wait until the camera stands still at a position."""
@@ -396,10 +397,8 @@ class OnvifCamera(PanTiltCamera):
 
     def _distance(self, position: Position, goal: Position) -> float:
         """Compute the longest of the ways to a goal; the zoom of a camera that does not zoom says nothing."""
-        pan = abs(self._turn(position.pan, goal.pan))
-        tilt = abs(goal.tilt - position.tilt)
-        zoom = abs(goal.zoom - position.zoom) if self._zooms else 0.0
-        return max(pan, tilt, zoom)
+        pan, tilt, zoom = map(abs, self._way(position, goal))
+        return max(pan, tilt, zoom if self._zooms else 0.0)
 
     def _move(self, command: str, name: str, to: Position) -> None:
         """Send a movement."""
