@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
-from semfov.eye import Eye, View
+from semfov.eye import Eye
 
 LOOK_SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.reading", __name__)
 """The modules that turn an image into detections; all modules that they import count, too."""
@@ -28,14 +28,12 @@ def photograph_looks(
         A function from a look to its detections, a batch of one without padding.
     """
     image = cache(image)
-    view: View | None = None  # opened at the first look from a cell
+    open_view = cache(lambda: eye.open(image()))  # at the first look from a cell
 
     def look(action: int | tuple[float, ...]) -> Detections:
-        nonlocal view
         if isinstance(action, tuple):
             return tight(eye.close_up(image(), torch.tensor(action)))
-        if view is None:
-            view = eye.open(image())
+        view = open_view()
         return tight(eye.look(view, grid.centres.to(view.canvas)[[action]]))
 
     return look
