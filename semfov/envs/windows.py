@@ -66,9 +66,7 @@ class WindowGaze(Gazes[_WindowEpisode]):
     looking: GivenWindows
     window: Window
 
-    def __init__(
-        self, scenery: ZoomScenery, task: Task, settings: GazeSettings, grid: tuple[int, int] = (10, 10)
-    ) -> None:
+    def __init__(self, scenery: ZoomScenery, task: Task, settings: GazeSettings, grid: tuple[int, int]) -> None:
         columns, rows = grid
         self.shape = (rows, columns)
         # Place and magnification; a space of this type holds numbers of any other kind.

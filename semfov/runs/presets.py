@@ -140,8 +140,7 @@ def _preset(name: str, task: Task) -> PolicyConfig:
 def _check_takes_samples(choice: PolicyConfig, task: Task) -> None:
     """Raise `InputError` for drawn looks of a policy that takes no expectation over looks."""
     names = [name for name in policy_names(task) if "likelihoods" in FUNCTIONS[name].takes]
-    takes_them = choice.policy in FUNCTIONS and "likelihoods" in FUNCTIONS[choice.policy].takes
-    if not takes_them:
+    if choice.policy not in names:
         raise InputError(
             f"samples: expected null, except for {', '.join(names)}; got {choice.samples} for {choice.policy!r}"
         )
