@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache, cached_property, lru_cache, partial
 from inspect import signature
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -316,15 +316,16 @@ class ZoomScenery(_Surroundings[WindowEye]):
 
     Attributes:
         evidence: predicts from a look what closer looks will find.
-        annotated: whether the objects in the pictures are known.
         looks_at: opens the looks at a picture.
         episodes: lists the targets of all searches of a picture.
     """
 
+    annotated: ClassVar[bool] = True
+    """Whether the objects in the pictures are known."""
+
     def __init__(self, looking: WindowLooking, passes: int, targets: _Targets, reopen: Callable[[], object]) -> None:
         super().__init__(looking.scenes, looking.eye, passes - 1, targets, reopen)
         self.evidence = looking.evidence
-        self.annotated = not isinstance(self.pictures, Pictures)
         # Looks are kept for as long as an environment uses this scenery.
         self.looks_at = cache(looking.looks_at)
         self.episodes = cache(self._list)
@@ -332,22 +333,13 @@ class ZoomScenery(_Surroundings[WindowEye]):
     @cached_property
     def windows(self) -> int:
         """Largest number of windows of any of the pictures."""
-        pictures = self.pictures
-        if isinstance(pictures, Pictures):
-            # The size is in the head of the file, so that no picture is decoded.
-            sizes = {open_large(pictures.root / str(name)).size for name in pictures.ids}
-        else:
-            sizes = {pictures.annotation(index).size for index in range(len(pictures))}
         # Most pictures of a folder have one of a few sizes, and a lattice depends on the size alone.
-        lattices = [Lattice.over(size, self.eye.detector.input_size, finest=self.eye.finest) for size in sizes]
+        lattices = [Lattice.over(size, self.eye.detector.input_size, finest=self.eye.finest) for size in self._sizes()]
         return max(map(len, lattices))
 
-    def targets(self, scene: int) -> list[int]:
-        if self.annotated:
-            return super().targets(scene)
-        if self._chosen is None:
-            raise InputError("targets: expected classes to search for in pictures without annotations, got none")
-        return self._chosen
+    def _sizes(self) -> set[tuple[int, int]]:
+        """List the different sizes of the pictures."""
+        return {self.pictures.annotation(index).size for index in range(len(self.pictures))}
 
     def _list(self, scene: int) -> list[int]:
         """List the targets of a picture's searches: those that the look at the whole picture does not show already."""
@@ -382,22 +374,46 @@ class ZoomScenery(_Surroundings[WindowEye]):
         )
 
     def _may_have_objects(self, scene: int) -> bool:
-        """Tell whether a picture has objects; without annotations nobody knows, so that it may."""
-        return not self.annotated or len(self.pictures.annotation(scene).boxes) > 0
+        """Tell whether a picture has objects, as far as that is known."""
+        return len(self.pictures.annotation(scene).boxes) > 0
 
     def found(self, looks: Sequence[WindowLook], scene: int, target: int) -> bool:
-        """Whether looks have found an object of the target class: by its box, or without annotations by the score."""
-        if not self.annotated:
-            return any(float(look.show[target - 1]) >= SCORE_THRESHOLD for look in looks)
+        """Whether looks have found an object of the target class, by its box."""
         annotation = self.pictures.annotation(scene)
         targets = annotation.take(annotation.labels == target)
         return bool(found_in(looks, targets, target).any())
 
     def share(self, looks: Sequence[WindowLook], scene: int) -> float:
-        """Compute the share of a picture's objects that looks have found; without annotations their number."""
-        if not self.annotated:
-            return float(len(merge(looks, None, score=SCORE_THRESHOLD)))
+        """Compute the share of a picture's objects that looks have found."""
         return float(found_in(looks, self.pictures.annotation(scene)).float().mean())
+
+
+class _UnannotatedScenery(ZoomScenery):
+    """Large pictures of a folder without annotations: what they hold is not known, and scores say what is found."""
+
+    annotated = False
+    pictures: Pictures
+
+    def targets(self, scene: int) -> list[int]:
+        """Classes to search for, which have to be named."""
+        if self._chosen is None:
+            raise InputError("targets: expected classes to search for in pictures without annotations, got none")
+        return self._chosen
+
+    def _sizes(self) -> set[tuple[int, int]]:
+        # The size is in the head of the file, so that no picture is decoded.
+        return {open_large(self.pictures.root / str(name)).size for name in self.pictures.ids}
+
+    def _may_have_objects(self, scene: int) -> bool:
+        return True
+
+    def found(self, looks: Sequence[WindowLook], scene: int, target: int) -> bool:
+        """Whether looks show the target class with a score from which on objects are listed."""
+        return any(float(look.show[target - 1]) >= SCORE_THRESHOLD for look in looks)
+
+    def share(self, looks: Sequence[WindowLook], scene: int) -> float:
+        """Compute the number of objects that looks have found, as their share is not known."""
+        return float(len(merge(looks, None, score=SCORE_THRESHOLD)))
 
 
 class _PictureLooking(WindowLooking):
@@ -496,7 +512,9 @@ def open_zoom_scenery(
         cache=_path(cache),
         store=store,
     )
-    return ZoomScenery(_PictureLooking(config, scenes), passes, targets, reopen)
+    looking = _PictureLooking(config, scenes)
+    kind = _UnannotatedScenery if isinstance(looking.scenes, Pictures) else ZoomScenery
+    return kind(looking, passes, targets, reopen)
 
 
 _Scenery = TypeVar("_Scenery", Scenery, ZoomScenery)
