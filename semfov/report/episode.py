@@ -102,9 +102,13 @@ def episode_data(
     presence = None
     if scanpath.presence is not None:
         presence = [rounded(chance, 9) for chance in scanpath.presence.tolist()]
+    data = object_data(scanpath)
+    for found in data["objects"]:
+        # The page steps through fixations, and closer looks are none.
+        found["look"] = scanpath.fixation_after(found["look"] - 1) + 1
     return {
         "name": name,
-        **object_data(scanpath),
+        **data,
         **_about_data(scanpath, settings),
         "summary": scanpath.describe(),
         "outcome": _outcome_data(scanpath),
@@ -168,8 +172,6 @@ def object_data(record: Record) -> Data:
     for row, score in zip(rows[:_DRAWN], record.objects.scores.tolist(), strict=False):
         box = [row[edge] for edge in ("x1", "y1", "x2", "y2")]
         more: Data = {name: row[name] for name in ("look", "confirmed", "pan", "tilt") if name in row}
-        if isinstance(record, Scanpath):  # whose page steps through its fixations
-            more["look"] = record.fixation_after(row["look"] - 1) + 1
         objects.append({"box": box, "label": row["class"], "score": score, **more})
     return {
         "pixels": f"{width} × {height} px",
