@@ -144,11 +144,9 @@ def run_tasks(
             bar.update(count(task))
 
         if isinstance(processes, int) and min(processes, len(tasks)) <= 1:
-            if made is None:
-                prepare_worker()
-                made = make(*settings)
+            ready = _prepared(make, settings) if made is None else made
             for task in tasks:
-                yield task, function(made, task)
+                yield task, function(ready, task)
                 tell(task)
             return
         # Workers of other machines may have another version of the code.
@@ -197,10 +195,15 @@ class _Job(NamedTuple, Generic[_Made, _Task, _Result]):
         _ready.clear()
         if self.folder.is_dir():  # relative paths of the settings are those of the process that asks
             os.chdir(self.folder)
-        prepare_worker()
-        made = self.make(*self.settings)
+        made = _prepared(self.make, self.settings)
         _ready.append(_Ready(self.make, self.settings, made))
         return made
+
+
+def _prepared(make: Callable[..., _Made], settings: tuple[object, ...]) -> _Made:
+    """Prepare this process for tasks, and make what they need."""
+    prepare_worker()
+    return make(*settings)
 
 
 class _Ready(NamedTuple):
