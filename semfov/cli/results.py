@@ -46,7 +46,7 @@ def kind_of(path: Path) -> str | None:
     return suffix
 
 
-def results_format(path: Path, *, searched: bool = False, truth: Truth | None = None) -> ResultsFormat:
+def results_format(path: Path, *, searched: bool = False, truth: Truth | None) -> ResultsFormat:
     """Make the format of a file of results; that in a folder is JSON.
 
     Args:

@@ -19,7 +19,7 @@ _STEPS = (
 )
 
 
-def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str], *, is_named: bool = True) -> str:
+def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str], *, is_named: bool) -> str:
     """Make the article of a record: the picture with its objects and windows, the list of the objects, and all looks.
 
     Args:

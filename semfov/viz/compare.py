@@ -28,7 +28,7 @@ class ComparedPoint(Protocol):
 
 
 @styled
-def plot_comparison(points: Sequence[ComparedPoint], measure: str = "AP50") -> Figure:
+def plot_comparison(points: Sequence[ComparedPoint], measure: str) -> Figure:
     """Draw the average precision of each way of looking over its seconds; numbers at the points are passes.
 
     Args:

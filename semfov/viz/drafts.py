@@ -26,7 +26,7 @@ _DIVERGING = "PuOr_r"  # fewer fixations are purple, more are orange
 
 
 @styled
-def plot_drafts(drafts: Drafts, *, areas: AreasLike | None = None) -> Figure:
+def plot_drafts(drafts: Drafts, *, areas: AreasLike | None) -> Figure:
     """Draw where people look in two drafts on one scale, and what differs where proportions are the same.
 
     Args:
