@@ -119,27 +119,15 @@ class SceneObserver(Observer):
     def update(self, belief: Belief, look: Evidence) -> SceneBelief:
         belief = own(belief, SceneBelief, "belief")
         look = own(look, _SceneEvidence, "look")
-        views = self.views
         pose = look.pose
-        values = belief.values
-        if not bool(belief.looks):
-            values = self._unseen(look.target, values)
+        values = belief.values.clone() if bool(belief.looks) else self._unseen(look.target, belief.values)
         before = belief.views.get(pose)
         if before is None:
-            before = self.inner.start(1, views.view_grid, values)
+            before = self.inner.start(1, self.views.view_grid, values)
         view = self.inner.update(before, look.inner)
-        shown = views.shown[pose]
-        cells = shown.cells  # (V,), of the scene
-        probabilities = views.spread(self._probabilities(view, look.target), pose).mT  # (V, C)
-        closest_so_far = belief.closest[0, cells]
-        is_owner = belief.owner[0, cells] == pose
-        # The distances of this gaze, and of earlier ones in the same view.
-        distance = shown.distances[int(look.cell)]
-        nearest = torch.minimum(distance, torch.where(is_owner, closest_so_far, torch.inf))
-        # The view takes the cells to which its gaze came closest, and renews those that it had.
-        takes = (nearest <= closest_so_far) | is_owner
-        taken = cells[takes]
-        values = values.clone()
+        probabilities = self.views.spread(self._probabilities(view, look.target), pose).mT  # (V, C)
+        nearest, takes = self._nearest(belief, look)
+        taken = self.views.shown[pose].cells[takes]  # of the scene
         closest = belief.closest.clone()
         owner = belief.owner.clone()
         values[0, taken] = probabilities[takes]
@@ -147,6 +135,19 @@ class SceneObserver(Observer):
         owner[0, taken] = pose
         examined = belief.examined.scatter(-1, look.gaze[:, None], True)
         return SceneBelief(values, closest, owner, examined, belief.looks + 1, {**belief.views, pose: view})
+
+    def _nearest(self, belief: SceneBelief, look: _SceneEvidence) -> tuple[Tensor, Tensor]:
+        """Compute how close the gazes in the view of a look came to its cells, `(V,)`, and which of them it takes.
+
+        A view takes the cells to which its gaze came closest, and renews those that it had.
+        """
+        shown = self.views.shown[look.pose]
+        closest_so_far = belief.closest[0, shown.cells]
+        is_owner = belief.owner[0, shown.cells] == look.pose
+        # The distances of this gaze, and of earlier ones in the same view.
+        distance = shown.distances[int(look.cell)]
+        nearest = torch.minimum(distance, torch.where(is_owner, closest_so_far, torch.inf))
+        return nearest, (nearest <= closest_so_far) | is_owner
 
     def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> SceneBelief:
         """Discount the evidence of the looks so far; all cells return towards what is believed of an unseen one.
