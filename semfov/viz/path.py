@@ -165,12 +165,16 @@ class GazePath:
             axes.add_collection(lines, autolim=False)
         x, y = self.path.T
         self.dots = axes.scatter(x, y, s=16, c=self.colours, edgecolors="white", linewidths=0.6, zorder=5)
-        self.numbers = self._numbers(axes)
+        scale = per_point(axes)
+        places = self._places_of_numbers(scale)
+        self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
+        self.numbers: list[Annotation | None] = []
+        for index, place in enumerate(places):
+            self.numbers.append(None if place is None else self._number(axes, index, place, scale))
         self.show(count - 1)
 
-    def _numbers(self, axes: Axes) -> list[Annotation | None]:
-        """Write the number of each fixation on its dot or near it; None where there is no room."""
-        scale = per_point(axes)
+    def _places_of_numbers(self, scale: float) -> list[LabelBox | None]:
+        """Find room for the number of each fixation on its dot or near it; None where there is none."""
         # The width of a digit is about 0.64 of the font size, and the frame adds 4 points.
         height = (_POINTS + 4) * scale
         points: list[tuple[float, float]] = []
@@ -179,12 +183,7 @@ class GazePath:
             digits = len(str(number))
             points.append((x, y))
             sizes.append(((0.64 * digits * _POINTS + 4.5) * scale, height))
-        places = place_numbers(points, sizes, self.frame, 60 * scale)
-        self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
-        numbers: list[Annotation | None] = []
-        for index, place in enumerate(places):
-            numbers.append(None if place is None else self._number(axes, index, place, scale))
-        return numbers
+        return place_numbers(points, sizes, self.frame, 60 * scale)
 
     def _number(self, axes: Axes, index: int, place: LabelBox, scale: float) -> Annotation:
         """Write the number of a fixation into a rectangle; a line joins it to its dot if it is not written on it."""
