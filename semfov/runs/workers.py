@@ -262,20 +262,28 @@ def _in_processes(
     title: str,
     tell: Callable[[_Task], object],
 ) -> Iterator[tuple[_Task, _Result]]:
-    shared = _shared.get()
     try:
-        with ExitStack() as stack:
-            pools, executors = shared or (stack, {})
-            if processes not in executors:
-                # Processes that are kept may have more tasks in a later call.
-                number = processes if shared else min(processes, len(tasks))
-                executors[processes] = pools.enter_context(_started(number))
-            yield from _results(executors[processes], job, tasks, tell, _deaf_children())
+        with _executor(processes, len(tasks)) as executor:
+            yield from _results(executor, job, tasks, tell, _deaf_children())
     except BrokenProcessPool:
         raise SemfovError(
             f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
             "continues where this one stopped, or add --workers 1 to use a single process"
         ) from None
+
+
+@contextmanager
+def _executor(processes: int, tasks: int) -> Iterator[Executor]:
+    """Start processes for so many tasks, or give those that are kept, which may have more tasks in a later call."""
+    shared = _shared.get()
+    if shared is None:
+        with _started(min(processes, tasks)) as executor:
+            yield executor
+        return
+    pools, executors = shared
+    if processes not in executors:
+        executors[processes] = pools.enter_context(_started(processes))
+    yield executors[processes]
 
 
 @contextmanager
