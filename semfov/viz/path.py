@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -168,9 +169,7 @@ class GazePath:
         scale = per_point(axes)
         places = self._places_of_numbers(scale)
         self.number_boxes: list[LabelBox] = [place for place in places if place is not None]
-        self.numbers: list[Annotation | None] = []
-        for index, place in enumerate(places):
-            self.numbers.append(None if place is None else self._number(axes, index, place, scale))
+        self.numbers = self._numbers(axes, places, scale)
         self.show(count - 1)
 
     def _places_of_numbers(self, scale: float) -> list[LabelBox | None]:
@@ -184,6 +183,13 @@ class GazePath:
             points.append((x, y))
             sizes.append(((0.64 * digits * _POINTS + 4.5) * scale, height))
         return place_numbers(points, sizes, self.frame, 60 * scale)
+
+    def _numbers(self, axes: Axes, places: Sequence[LabelBox | None], scale: float) -> list[Annotation | None]:
+        """Write the numbers of the fixations into their places; None where a number has none."""
+        numbers: list[Annotation | None] = []
+        for index, place in enumerate(places):
+            numbers.append(None if place is None else self._number(axes, index, place, scale))
+        return numbers
 
     def _number(self, axes: Axes, index: int, place: LabelBox, scale: float) -> Annotation:
         """Write the number of a fixation into a rectangle; a line joins it to its dot if it is not written on it."""
