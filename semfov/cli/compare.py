@@ -105,11 +105,8 @@ def _look_at_all(
         try:
             _look(source, eye, ways, scores)
         except Exception as error:
-            # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
-            fault = source.fault(error, several=len(sources) > 1)
-            if len(sources) == 1:
-                raise fault from error
-            source.tell_skipped(fault)
+            # Whatever fails at one picture, the others are looked at; `skip` raises what ends the command.
+            source.skip(error, several=len(sources) > 1)
             skipped += 1
     return skipped
 

@@ -374,15 +374,11 @@ def _look_at_pictures(job: _GazeJob) -> int:
 
 def _look_at_picture(job: _GazeJob, number: int) -> None:
     """Predict where people look in a picture; one of several that cannot be looked at is skipped."""
-    source = job.sources[number]
     try:
         job.look(number)
     except Exception as error:
-        # Whatever fails at one picture, the others are looked at; `fault` raises what ends the command.
-        fault = source.fault(error, several=job.several)
-        if not job.several:
-            raise
-        source.tell_skipped(fault)
+        # Whatever fails at one picture, the others are looked at; `skip` raises what ends the command.
+        job.sources[number].skip(error, several=job.several)
     else:
         job.keep(number)
         tqdm.write(job.outcomes[number]["text"], file=sys.stdout)

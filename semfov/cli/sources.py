@@ -97,6 +97,13 @@ class PictureSource(NamedTuple):
         """Say why this picture is left out, beside the progress bar of the others."""
         tqdm.write(f"skipped {self.name}: {fault}", file=sys.stderr)
 
+    def skip(self, error: Exception, *, several: bool) -> None:
+        """Leave this picture out of several after an error, and say why; the error of a single one is raised."""
+        fault = self.fault(error, several=several)
+        if not several:
+            raise fault
+        self.tell_skipped(fault)
+
     def fault(self, error: Exception, *, several: bool) -> SemfovError:
         """Say what is wrong with this picture.
 
