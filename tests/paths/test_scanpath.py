@@ -55,6 +55,17 @@ def test_a_record_counts_detections_from_the_score_that_the_detector_names(agent
     assert len(agent.explore(image, start=3, shifts=2).objects) > 0
 
 
+def test_a_find_without_a_box_is_at_the_centre_of_its_cell(agent, image):
+    """Cell 6 of 5 × 4 is the second of the second row; pixels have their centres at integers."""
+    search = agent.search(image, "red", how="fovea", start=3, shifts=2)
+    in_cell = replace(search, decision=Decision("found", 0.9, 6), closer=())
+    assert in_cell.found_at == pytest.approx((1.5 * 130 / 5 - 0.5, 1.5 * 90 / 4 - 0.5))
+    values = in_cell.to_dict()
+    assert (values["x"], values["y"], values["x1"]) == (*map(pytest.approx, in_cell.found_at), None)
+    for decision in (Decision("absent", 0.1, 6), Decision("found", 0.9)):
+        assert replace(in_cell, decision=decision).found_at is None
+
+
 @pytest.fixture(params=["search", "exploration"])
 def scanpath(request, agent, image):
     with torch.inference_mode():
