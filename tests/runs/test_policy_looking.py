@@ -31,7 +31,7 @@ from semfov.runs import policy_looking
 from semfov.runs.config import BeliefConfig, DataConfig, PolicyConfig
 from semfov.runs.policy_looking import (
     _belief_settings,
-    _load,
+    _LoadedModels,
     _make_strategy,
 )
 from semfov.runs.presets import presets, resolve
@@ -113,17 +113,20 @@ def test_models_are_loaded_by_the_names_in_the_settings(monkeypatch):
     monkeypatch.setattr(policy_looking, "make_map", lambda name, eye: ("map", name))
     monkeypatch.setattr(policy_looking, "make_searching", lambda name, eye: ("search", name))
     belief = BeliefConfig(model="mine", search_model="sought", map_model="everything")
-    assert [_load(name, belief, SimpleNamespace()) for name in ("observation", "search", "map")] == [
+    models = _LoadedModels(belief, SimpleNamespace())
+    assert [models(name) for name in ("observation", "search", "map")] == [
         ("observation", "mine"),
         ("search", "sought"),
         ("map", "everything"),
     ]
+    assert models("map") is models.loaded["map"]  # loaded once
 
 
 def test_a_run_has_the_models_that_its_policies_need(model, monkeypatch, tmp_path):
     looked = SearchConfig(policies=("random",), data=DataConfig(limit=1, min_instances=0), cache=tmp_path)
     monkeypatch.setattr("semfov.runs.looking.make_eye", lambda detector, sensor: Eye(Foveation(9.0), Blobs()))
-    monkeypatch.setattr(policy_looking, "_load", lambda name, belief, eye: model)
+    for make in ("make_observation", "make_searching", "make_map"):
+        monkeypatch.setattr(policy_looking, make, lambda name, eye: model)
     assert not any(SearchRun(looked).models)
     guided = (PolicyConfig("non-predictive", "learned", saliency="vocus2"), "random")
     models = SearchRun(replace(looked, policies=guided)).models
