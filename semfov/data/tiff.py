@@ -245,11 +245,13 @@ class _Tiles:
     Attributes:
         width, height: of a tile in pixels. Of a picture that is one strip of plain rows, some rows are a tile.
         columns, rows: of tiles in the grid of a channel.
-        separate: whether each channel has a grid of tiles of its own.
+        has_layers: whether each channel has a page of its own.
+        separate: whether each channel has a grid of tiles of its own, in its page or in a plane of the only one.
 
-    Private attributes: `_decoded` keeps strips that are the whole picture, by page and number, as each window would
-    decode them again. `_inflatable` has page and number of the large packed tiles that inflate to their size: each is
-    asked once, as that takes as long as decoding it. `_lock` is held while the place in the file is moved.
+    Private attributes: `_grids` has the page and the plane of each grid, and `_samples` the numbers of a pixel in one.
+    `_decoded` keeps strips that are the whole picture, by page and number, as each window would decode them again.
+    `_inflatable` has page and number of the large packed tiles that inflate to their size: each is asked once, as that
+    takes as long as decoding it. `_lock` is held while the place in the file is moved.
 
     Invariant: tiles of a grid cover the picture without overlaps, `columns` by `rows` of them; those of the last column
     and the last row may reach beyond it. `_decoded` is empty for pictures of several tiles.
@@ -259,7 +261,6 @@ class _Tiles:
         self._path = path
         self._file = file
         self._page = page
-        self._layers = layers
         self._lock = Lock()
         self._decoded: dict[tuple[int, int], Values] = {}
         self._inflatable: set[tuple[int, int]] = set()
@@ -274,12 +275,12 @@ class _Tiles:
             self.height = min(_ROWS, height)
         self.columns = len(_tiles_along(0, width, self.width))
         self.rows = len(_tiles_along(0, height, self.height))
-        has_planes = page.planarconfig == PLANES and page.samplesperpixel > 1
-        self.separate = self.has_layers or has_planes
-
-    @property
-    def has_layers(self) -> bool:
-        return len(self._layers) > 1
+        planes = page.samplesperpixel if page.planarconfig == PLANES else 1
+        self.has_layers = len(layers) > 1
+        self.separate = self.has_layers or planes > 1
+        self._samples = 1 if self.separate else page.samplesperpixel
+        # Either has one of them alone: a page of several samples has no layers.
+        self._grids = [*product(layers, range(planes))]
 
     @cached_property
     def _is_stored(self) -> NDArray[np.bool_]:
@@ -325,8 +326,7 @@ class _Tiles:
 
     def _tile(self, row: int, column: int, channel: int) -> Values | None:
         """Read a tile, `(h, w, samples)`; None for one that is not stored in the file."""
-        layer = self._layers[channel] if self.has_layers else self._page
-        plane = channel if self.separate and not self.has_layers else 0
+        layer, plane = self._grids[channel]
         if self._has_plain_rows:
             return self._plain_rows(layer, plane, row)
         # In a page, the tiles of a plane follow those of the planes before it.
@@ -340,12 +340,11 @@ class _Tiles:
         stored = layer.databytecounts[number]
         if not stored:
             return None
-        samples = 1 if self.separate else self._page.samplesperpixel
-        size = self.width * self.height * samples * self._page.dtype.itemsize
+        bytes_a_pixel = self._samples * self._page.dtype.itemsize
+        size = self.width * self.height * bytes_a_pixel
         check_tile(size, stored, f"image {self._path}")
         if self._is_one_strip:  # is there unpacked, decoded, and as the bytes that are shown
-            a_pixel = 2 * samples * self._page.dtype.itemsize + 3
-            check_decoding(self._size, a_pixel, stored, f"image {self._path}")
+            check_decoding(self._size, 2 * bytes_a_pixel + 3, stored, f"image {self._path}")
         data = self.read_bytes(layer.dataoffsets[number], stored)
         self._check_inflation(key, data, size)
         tile: Values = self._page.decode(data, number, jpegtables=self._page.jpegtables)[0][0]
@@ -368,11 +367,10 @@ class _Tiles:
         """Read rows of a picture that is one strip as it is, `(h, w, samples)`; `part` counts such parts of a plane."""
         top = part * self.height
         rows = min(self.height, self._size[1] - top)
-        samples = 1 if self._page.planarconfig == PLANES else self._page.samplesperpixel
         kind = self._page.dtype.newbyteorder(self._file.byteorder)
-        line = self.width * samples * kind.itemsize
+        line = self.width * self._samples * kind.itemsize
         data = self.read_bytes(layer.dataoffsets[plane] + top * line, rows * line)
-        return np.frombuffer(data, kind).reshape(rows, self.width, samples)
+        return np.frombuffer(data, kind).reshape(rows, self.width, self._samples)
 
     def read_bytes(self, offset: int, count: int) -> bytes:
         """Read bytes of the file."""
