@@ -84,7 +84,7 @@ _PLAIN = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of up to
 _TRANSPARENT = ("RGBA", "LA", "PA", "RGBa", "La")  # modes with an alpha
 
 
-def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: White | None = None) -> Tensor:
+def read_photograph(path: str | PathLike[str], *, oriented: bool, white: White | None) -> Tensor:
     """Read an image file by Pillow alone; arguments, result and errors are those of `semfov.read_image`."""
     name = f"image {Path(path)}"
     with opening(Path(path), "decoded"), open_pillow(path) as image:
@@ -96,7 +96,7 @@ def read_photograph(path: str | PathLike[str], *, oriented: bool = True, white: 
         are_spread = white is not None and image.format == "JPEG2000" and jpeg2000_bits(path) > 8
         check_data(not are_spread, name, f"white=None beside more than 8 bits of JPEG 2000, {_JPEG2000_REMEDY}", white)
         decoded = _decoded(image, path, upright=oriented)
-        extremes = _extremes(decoded, name) if white is None else None
+        extremes = _extremes(decoded, white, name)
         pixels = decoded.floats(white)
     _warn_of_extremes(extremes, decoded, path)
     return torch.from_numpy(pixels)
@@ -112,13 +112,13 @@ def _halves(image: "ImageFile") -> int:
     return 8 if is_deep(image) else 4
 
 
-def _extremes(decoded: Decoded, name: str) -> tuple[float, float] | None:
-    """Find the least and the greatest value of a picture of more than 8 bits; None for others.
+def _extremes(decoded: Decoded, white: White | None, name: str) -> tuple[float, float] | None:
+    """Find the least and the greatest value of more than 8 bits; None for others, and where their white is stated.
 
     Raises:
         DataError: there are some beyond black or white.
     """
-    if decoded.most == _MOST_OF_BYTES:
+    if white is not None or decoded.most == _MOST_OF_BYTES:
         return None
     least, greatest = decoded.extremes()
     got = f"{least:g} to {greatest:g}; give white='auto', or the values that are black and white"
@@ -386,8 +386,7 @@ def from_pillow(image: "Image", name: str, white: White | None = None) -> Tensor
     with opening(name, "decoded"):
         check_area(image.size, name)
         decoded = _decoded(image, None, upright=True)
-        if white is None:
-            _extremes(decoded, name)
+        _extremes(decoded, white, name)  # which refuses some
         return torch.from_numpy(decoded.floats(white))
 
 
@@ -523,7 +522,7 @@ class PhotographPicture(LargePicture):
                 check_area(image.size, name)
             check_decoding(image.size, _BYTES + _halves(image), self.path.stat().st_size, name)
             decoded = _decoded(image, self.path, upright=True)
-            extremes = _extremes(decoded, name) if self._white is None else None
+            extremes = _extremes(decoded, self._white, name)
             pixels = decoded.bytes(self._white)
         _warn_of_extremes(extremes, decoded, self.path)
         return pixels
