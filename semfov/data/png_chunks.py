@@ -1,5 +1,6 @@
 """Chunks of a PNG, some of which may say how it is turned, also behind its pixels."""
 
+from collections.abc import Iterator
 from typing import IO
 
 _SIGNATURE = 8  # bytes before the first chunk
@@ -30,19 +31,29 @@ def has_late_orientation(file: IO[bytes]) -> bool:
 def _has_late_orientation(file: IO[bytes]) -> bool:
     """Do what `has_late_orientation` does, and move the place of the file."""
     is_late = False
+    for kind in _kinds_of_chunks(file):
+        if is_late and _may_orient(kind, file):
+            return True
+        is_late = is_late or kind == b"IDAT"
+    return False
+
+
+def _kinds_of_chunks(file: IO[bytes]) -> Iterator[bytes]:
+    """Go from chunk to chunk up to the last one, and give the kind of each; the place of the file is at its content."""
     start = _SIGNATURE
     while True:
         file.seek(start)
         head = file.read(_HEAD)
         kind = head[4:]
         if len(head) < _HEAD or kind == b"IEND":
-            return False
-        if is_late and (kind == b"eXIf" or (kind in _TEXTS and _keyword(file) in _KEYWORDS)):
-            return True
-        is_late = is_late or kind == b"IDAT"
+            return
+        yield kind
         start += _HEAD + int.from_bytes(head[:4], "big") + _CHECKSUM
 
 
-def _keyword(file: IO[bytes]) -> bytes:
-    """Read the keyword of a text."""
-    return file.read(_MOST_KEYWORD + 1).partition(b"\0")[0]
+def _may_orient(kind: bytes, file: IO[bytes]) -> bool:
+    """Tell whether a chunk of a kind, at whose content the file is, may hold an orientation."""
+    if kind not in _TEXTS:
+        return kind == b"eXIf"
+    keyword = file.read(_MOST_KEYWORD + 1).partition(b"\0")[0]
+    return keyword in _KEYWORDS
