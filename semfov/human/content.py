@@ -18,6 +18,7 @@ picture is its *fit* in bits.
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -118,22 +119,14 @@ def _shares_stretched(points: _Array, frame: _Array, picture: _Array) -> _Array:
     return np.asarray((points + 0.5) / frame)
 
 
-def _shares_at_part(part: float) -> _Shares:
-    """Make the map for pictures that filled a part of what they could, in the middle of the frame."""
-
-    def shares(points: _Array, frame: _Array, picture: _Array) -> _Array:
-        return np.asarray((_shares_as_read(points, frame, picture) - 0.5) / part + 0.5)
-
-    return shares
+def _shares_at_part(part: float, points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Let the picture fill a part of what it could, in the middle of the frame."""
+    return np.asarray((_shares_as_read(points, frame, picture) - 0.5) / part + 0.5)
 
 
-def _shares_in_frame(scale: float) -> _Shares:
-    """Make the map for points whose frame was larger or smaller than the file says."""
-
-    def shares(points: _Array, frame: _Array, picture: _Array) -> _Array:
-        return _shares_as_read(points / scale, frame, picture)
-
-    return shares
+def _shares_in_frame(scale: float, points: _Array, frame: _Array, picture: _Array) -> _Array:
+    """Take the frame to have been larger or smaller than the file says."""
+    return _shares_as_read(points / scale, frame, picture)
 
 
 _PRESENT_READING = _Reading(_shares_as_read)
@@ -160,7 +153,7 @@ _NAMED_PLACES = (
 
 _PARTS_OF_FRAME = tuple(
     _Reading(
-        _shares_at_part(part),
+        partial(_shares_at_part, part),
         f"the pictures filled about {100 * part:.0f} % of the frame, in the middle",
         "give the place of the picture, in_picture(size, place=…)",
     )
@@ -170,7 +163,7 @@ _PARTS_OF_FRAME = tuple(
 
 def _in_frame(scale: float) -> _Reading:
     """Make the reading for a frame that was larger or smaller than the file says."""
-    return _Reading(_shares_in_frame(scale), "their frame had another size", frame_scale=scale)
+    return _Reading(partial(_shares_in_frame, scale), "their frame had another size", frame_scale=scale)
 
 
 _OTHER_FRAMES = tuple(_in_frame(scale) for scale in _FRAME_SCALES)
@@ -209,13 +202,14 @@ def content_suspicions(
     evidence = _Evidence(records, sizes, _particular_densities(names, densities))
     shift = _shift_of(evidence, records, "all fixations", _LEAST_SHIFT)
     reading = _better_reading(evidence)
+    fit_of_shift = 0.0 if shift is None else shift.fit
     # A shift and another size of the frame look alike where few fixations lie at the borders.
-    best = max(filter(None, (shift, reading)), key=lambda finding: finding.fit, default=None)
-    if best is None or best is shift:
-        # Of pictures at a place that no reading comes close to, some fixations fit by a shift, too.
-        best = _place_on_frame(evidence, 0.0 if best is None else best.fit) or best
-    if best is not None:
-        return [best.line]
+    if reading is not None and reading.fit > fit_of_shift:
+        return [reading.line]
+    # Of pictures at a place that no reading comes close to, some fixations fit by a shift, too.
+    elsewhere = _place_on_frame(evidence, fit_of_shift) or shift
+    if elsewhere is not None:
+        return [elsewhere.line]
     # A drift may be so large that the later fixations do not fit their pictures.
     return _wrong_names(evidence) or _misfit(evidence) or _shifts_of_some(evidence)
 
