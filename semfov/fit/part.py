@@ -65,18 +65,15 @@ class PartInputs:
     def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.run = run
         # Of few photographs more are held out, so that there are some to compare on.
-        self.config = replace(
-            config,
-            holdout=config.holdout or (3 if len(run.scenes) < _MANY else 5),
-        )
+        holdout = config.holdout or (3 if len(run.scenes) < _MANY else 5)
+        self.config = replace(config, holdout=holdout)
         self.components = len(run.scenes.classes) + 1
         self.absent = 2 if self.components <= _FEW else None
         shifts = min(_MOST_SHIFTS, self.config.columns * self.config.rows - 1)  # until all cells are fixated
         self.protocol = ProtocolConfig(shifts=shifts, seed=self.config.seed)
         self.compared_at = min(5, shifts)
-        every = self.config.holdout or 5
-        self.training = [index for index in range(len(run.scenes)) if index % every]
-        self.held_out = [index for index in range(len(run.scenes)) if index % every == 0]
+        self.training = [index for index in range(len(run.scenes)) if index % holdout]
+        self.held_out = [index for index in range(len(run.scenes)) if index % holdout == 0]
         self.judged: Sequence[int] = self.held_out[: self.config.judged]
         self.results: dict[str, PartResult] = {}
 
