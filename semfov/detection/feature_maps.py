@@ -1,9 +1,10 @@
 """Feature maps of a look: what a network computes on the way to its boxes, named by their place in it and stride."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from math import log2
 from typing import NamedTuple
 
@@ -207,20 +208,18 @@ def record_maps(modules: Mapping[str, nn.Module]) -> Iterator[dict[str, list[Ten
     """
     runs: dict[str, list[list[Tensor]]] = {name: [] for name in modules}
     maps: dict[str, list[Tensor]] = {}
-
-    def hook_of(name: str) -> Callable[[nn.Module, object, object], None]:
-        def note(module: nn.Module, inputs: object, output: object) -> None:
-            tensors = filter(_is_map, _tensors_in(output))
-            runs[name].append(list(tensors))
-
-        return note
-
     with ExitStack() as hooks:
         for name, module in modules.items():
-            hooks.callback(module.register_forward_hook(hook_of(name)).remove)
+            hooks.callback(module.register_forward_hook(partial(_note, runs[name])).remove)
         yield maps
         for name, parts in runs.items():
             maps[name] = [torch.cat(pieces) for pieces in zip(*parts, strict=True)]
+
+
+def _note(runs: list[list[Tensor]], module: nn.Module, inputs: object, output: object) -> None:
+    """Note the maps in what a module returns, as a hook of it."""
+    tensors = filter(_is_map, _tensors_in(output))
+    runs.append(list(tensors))
 
 
 def _is_map(tensor: Tensor) -> bool:
