@@ -263,14 +263,10 @@ class FixationDensity(Pretrained):
         """
         cells = cells_of(size)
         units_by_shape = self._units(features, self.read if read is None else read)
-        hidden: Tensor | None = None
-        for shape, units in units_by_shape.items():
-            on_cells = on_picture(units, features, shape, cells)
-            if hidden is None:
-                hidden = on_cells + self.shift[:, None, None]
-            else:
-                hidden.add_(on_cells)
-        assert hidden is not None
+        first, *others = (on_picture(units, features, shape, cells) for shape, units in units_by_shape.items())
+        hidden = first + self.shift[:, None, None]
+        for on_cells in others:
+            hidden.add_(on_cells)
         units_of_readout = self.mix.shape[-1]
         first_layer = F.relu_(hidden).flatten(2).unflatten(1, (-1, units_of_readout))
         second_layer = F.relu_(self.mix @ first_layer + self.mix_shift[..., None])
