@@ -33,6 +33,7 @@ from semfov.runs.store import SceneStore
 LONGEST = 20  # number of fixations of a scanpath that are used, the first ones
 _SECONDS = 3.0  # time for which people view a picture, where none is given
 
+_BLUR = 2.5  # standard deviation in cells by which the centre bias is blurred
 _UNIFORM = 0.02  # share of a uniform density in the centre bias, which keeps its logarithm finite
 _LAYERS = ("backbone8", "backbone16", "backbone32", "head8", "head16", "head32")
 
@@ -338,13 +339,12 @@ class Events(NamedTuple):
         return Events(self.before[index], self.cell[index], self.person[index])
 
 
-def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, blur: float = 2.5) -> Tensor:
+def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]]) -> Tensor:
     """Compute the log density of all fixations, blurred and mixed with 2 % uniform; all groups count alike.
 
     Args:
         groups: pictures of one size each, with everybody's scanpaths.
         pictures: numbers of the pictures of each group.
-        blur: standard deviation of the blur, in cells.
 
     Returns:
         The log density, `(39, 52)`.
@@ -355,6 +355,6 @@ def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]], *, b
             counts = group.counts[torch.as_tensor(numbers)].sum(0)
             # Pictures of all sizes have their fixations on the same cells.
             resized = F.interpolate(counts[None, None], total.shape, mode="bilinear")[0, 0]
-            smooth = blurred(resized, torch.tensor(blur))
+            smooth = blurred(resized, torch.tensor(_BLUR))
             total += smooth / smooth.sum()
     return ((1 - _UNIFORM) * total / total.sum() + _UNIFORM / total.numel()).log()
