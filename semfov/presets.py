@@ -70,8 +70,8 @@ def model_file_arguments(
     model = open_model(path)
     if detector is None:
         detector = model.metadata.get("detector", {}).get("name")
-    expected = "the detector that the model was fitted to, which its file does not name"
     if detector is None:
+        expected = "the detector that the model was fitted to, which its file does not name"
         raise InputError(f"detector: expected {expected}, got None")
     arguments = recommended_arguments(detector, grid, **options)
     if isinstance(model, GlimpseEvidence):
