@@ -1,6 +1,7 @@
 """One scanpath beside those of people in the same picture, by the measures of this folder."""
 
 from collections.abc import Callable, Iterable, Sequence, Sized
+from functools import partial
 from os import PathLike
 from typing import NamedTuple, TypeVar
 
@@ -27,6 +28,8 @@ _DIMENSIONS = ("shape", "direction", "length", "position")  # of MultiMatch, tho
 _Points = NDArray[np.float64]
 _Measure = Callable[[_Points, Sequence[_Points]], float]
 """Compares the fixations of one scanpath with those of others."""
+_ScoreInMap = Callable[[_Points, _Points, _Points], NDArray[np.float64]]
+"""Scores fixations, by their x and y, in a map."""
 
 _Words = TypeVar("_Words", bound=Sized)  # what a scanpath is compared as
 
@@ -215,17 +218,17 @@ class _Measures:
 
     def by_name(self) -> dict[str, _Measure]:
         """List the measures by name, in the order of the table."""
-        of_multimatch = {f"MultiMatch {name}": self._multimatch_of(name) for name in _DIMENSIONS}
+        of_multimatch = {f"MultiMatch {name}": partial(self._multimatch, name) for name in _DIMENSIONS}
         return of_multimatch | {
-            "sequence score": _averaged(_unless_empty(sequence_score, self._words)),
-            "edit distance": _averaged(_unless_empty(_share_of_edits, self._words)),
-            "ScanMatch": _averaged(_unless_empty(self._scanmatch, self._inside)),
-            "time warping": _averaged(_unless_empty(self._warping, self._inside)),
-            "time delay embedding": _averaged(_unless_empty(self._embedding, self._inside)),
+            "sequence score": partial(_averaged, sequence_score, self._words),
+            "edit distance": partial(_averaged, _share_of_edits, self._words),
+            "ScanMatch": partial(_averaged, self._scanmatch, self._inside),
+            "time warping": partial(_averaged, self._warping, self._inside),
+            "time delay embedding": partial(_averaged, self._embedding, self._inside),
             "saccade lengths": self._lengths,
             "saccade directions": self._directions,
-            "NSS": self._in_density(nss),
-            "AUC": self._in_density(auc),
+            "NSS": partial(self._in_density, nss),
+            "AUC": partial(self._in_density, auc),
         }
 
     def _inside(self, points: _Points) -> _Points:
@@ -236,11 +239,8 @@ class _Measures:
         """List the cells of the points inside the picture."""
         return [int(cell) for cell in cell_labels(self._inside(points), _CELLS, _CELLS, self.size)]
 
-    def _multimatch_of(self, dimension: str) -> _Measure:
-        def similarity(one: _Points, other: _Points) -> float:
-            return float(getattr(multimatch(one, other, self.size), dimension))
-
-        return _averaged(similarity)
+    def _multimatch(self, dimension: str, points: _Points, others: Sequence[_Points]) -> float:
+        return _mean([getattr(multimatch(points, other, self.size), dimension) for other in others])
 
     def _scanmatch(self, one: _Points, other: _Points) -> float:
         return scanmatch(one, other, self.size)
@@ -257,18 +257,14 @@ class _Measures:
     def _directions(self, points: _Points, others: Sequence[_Points]) -> float:
         return direction_distance(saccades([points])[1], saccades(others)[1])
 
-    def _in_density(self, score: Callable[[_Points, _Points, _Points], NDArray[np.float64]]) -> _Measure:
-        """Make a measure that scores fixations in the density of the others."""
+    def _in_density(self, score: _ScoreInMap, points: _Points, others: Sequence[_Points]) -> float:
+        """Score fixations in the density of the others."""
         columns, rows = (max(1, round(side * _LONGEST / self.longer)) for side in self.size)
-
-        def measure(points: _Points, others: Sequence[_Points]) -> float:
-            fixated = np.concatenate([self._inside(other) for other in others])
-            density = _people_density(fixated, self.size, (rows, columns))
-            # A person who is compared is not among the others, whose density would else know where they looked.
-            x, y = _map_points(self._inside(points), self.size, (rows, columns)).T
-            return _mean(score(density, x, y).tolist())
-
-        return measure
+        fixated = np.concatenate([self._inside(other) for other in others])
+        density = _people_density(fixated, self.size, (rows, columns))
+        # A person who is compared is not among the others, whose density would else know where they looked.
+        x, y = _map_points(self._inside(points), self.size, (rows, columns)).T
+        return _mean(score(density, x, y).tolist())
 
 
 def _share_of_edits(one: list[int], other: list[int]) -> float:
@@ -276,26 +272,17 @@ def _share_of_edits(one: list[int], other: list[int]) -> float:
     return edit_distance(one, other) / max(len(one), len(other))
 
 
-def _averaged(score: Callable[[_Points, _Points], float]) -> _Measure:
-    """Make a measure of the mean of a score of pairs of scanpaths."""
-
-    def measure(points: _Points, others: Sequence[_Points]) -> float:
-        return _mean([score(points, other) for other in others])
-
-    return measure
-
-
-def _unless_empty(
-    score: Callable[[_Words, _Words], float], convert: Callable[[_Points], _Words]
-) -> Callable[[_Points, _Points], float]:
-    """Make a score of points from one of what they are converted to; NaN where nothing is left of one scanpath."""
-
-    def of_points(one: _Points, other: _Points) -> float:
-        a = convert(one)
-        b = convert(other)
-        return score(a, b) if len(a) and len(b) else float("nan")
-
-    return of_points
+def _averaged(
+    score: Callable[[_Words, _Words], float],
+    convert: Callable[[_Points], _Words],
+    points: _Points,
+    others: Sequence[_Points],
+) -> float:
+    """Average a score of what a scanpath and each of the others are converted to, those of which something is left."""
+    one = convert(points)
+    if not len(one):
+        return float("nan")
+    return _mean([score(one, other) for other in map(convert, others) if len(other)])
 
 
 def _mean(values: Sequence[float]) -> float:
