@@ -98,11 +98,7 @@ class AnyOf(Observer):
 
     def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> _AnyBelief:
         """Fade the beliefs of the inner observer."""
-
-        def faded(inner: Belief, inner_look: Evidence) -> Belief:
-            return self.observer.fade(inner, inner_look, keep, visited)
-
-        return self._change(belief, look, faded)
+        return self._change(belief, look, lambda inner, evidence: self.observer.fade(inner, evidence, keep, visited))
 
     def update(self, belief: Belief, look: Evidence) -> _AnyBelief:
         """Update the beliefs of the inner observer."""
