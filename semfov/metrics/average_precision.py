@@ -4,12 +4,16 @@ import contextlib
 import io
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.annotations import ABSENT, PARTIAL, Annotations, Entry, Id
 from semfov.data.classes import canonical_name
+
+if TYPE_CHECKING:
+    from pycocotools.coco import COCO
 
 
 def average_precision(
@@ -131,26 +135,13 @@ def _precision(
     Returns:
         `(10, 101, K)`, for the classes of both; -1 for those without objects.
     """
-    from pycocotools.coco import COCO
     from pycocotools.cocoeval import COCOeval
 
     classes = sorted({entry["category_id"] for entry in (*truth, *boxes)})
-
-    def indexed(entries: Sequence[Entry]) -> COCO:
-        """Put entries into the form of an annotation file, which pycocotools reads."""
-        side = COCO()
-        side.dataset = {
-            "images": [{"id": number} for number in range(1, images + 1)],
-            "categories": [{"id": number} for number in classes],
-            "annotations": list(entries),
-        }
-        side.createIndex()
-        return side
-
     if limit is None:
         limit = max(len(boxes), 1)  # so many boxes at most are there
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
-        judge = COCOeval(indexed(truth), indexed(boxes), "bbox")
+        judge = COCOeval(_indexed(truth, images, classes), _indexed(boxes, images, classes), "bbox")
         # One range of areas, all of them, whose label COCOeval expects beside it.
         judge.params.areaRng = [[0, math.inf]]
         judge.params.areaRngLbl = ["all"]
@@ -163,3 +154,17 @@ def _precision(
                 result["dtIgnore"] |= result["dtMatches"] == 0
         judge.accumulate()
     return judge.eval["precision"][..., 0, 0]  # of one range of areas, and one limit
+
+
+def _indexed(entries: Sequence[Entry], images: int, classes: Sequence[int]) -> "COCO":
+    """Put the entries of so many images into the form of an annotation file, which pycocotools reads."""
+    from pycocotools.coco import COCO
+
+    side = COCO()
+    side.dataset = {
+        "images": [{"id": number} for number in range(1, images + 1)],
+        "categories": [{"id": number} for number in classes],
+        "annotations": list(entries),
+    }
+    side.createIndex()
+    return side
