@@ -195,11 +195,11 @@ def fit_oculomotor(
     """
     generator = torch.Generator().manual_seed(fit.seed)
     model.oculomotor = OculomotorBias()
-    map_of = [dict(zip(numbers, of_group, strict=True)) for numbers, of_group in zip(pictures, maps, strict=True)]
-    events_of = [
-        {picture: Events.of(group.paths[picture], group.size, cells_of(group.size)) for picture in numbers}
-        for group, numbers in zip(groups, pictures, strict=True)
-    ]
+    to_predict: list[dict[int, tuple[Tensor, Events]]] = []  # map and fixations of each picture of a group
+    for group, numbers, of_group in zip(groups, pictures, maps, strict=True):
+        cells = cells_of(group.size)
+        events_of_group = (Events.of(group.paths[picture], group.size, cells) for picture in numbers)
+        to_predict.append(dict(zip(numbers, zip(of_group, events_of_group, strict=True), strict=True)))
     batches = _batches(pictures, fit.batch, generator)
 
     def loss_of(_: int) -> Tensor | None:
@@ -212,9 +212,10 @@ def fit_oculomotor(
             # parameters.
             row, column = torch.randint(_EVERY, (2,), generator=generator).tolist()
             corner = row, column
-            events = _events_on(events_of[number][picture], corner, size, generator)
+            maps_of_picture, events_of_picture = to_predict[number][picture]
+            events = _events_on(events_of_picture, corner, size, generator)
             if len(events.cell):
-                losses.append(_saccade_loss(model, map_of[number][picture], centre, events, size, corner))
+                losses.append(_saccade_loss(model, maps_of_picture, centre, events, size, corner))
         return torch.stack(losses).mean() if losses else None
 
     steps = fit.saccade_epochs * _steps(pictures, fit.batch)
@@ -286,7 +287,7 @@ def score(
     size = group.size
     generator = torch.Generator().manual_seed(0)  # the same fixations for all models
     centre = model.centre_bias(size)[None]
-    rows: list[list[Tensor]] = [[] for _ in without]
+    scores = [torch.zeros(0, len(without), 3)]
     for maps_of_picture, picture in zip(maps, pictures, strict=True):
         events = Events.of(group.paths[picture], size, raster[::-1])
         if conditional:
@@ -294,10 +295,10 @@ def score(
         terms = {"centre bias": centre, "map": _for_events(maps_of_picture, events)}
         if conditional:
             terms = model.given(terms, size, events.before)
-        for names, scores in zip(without, rows, strict=True):
-            density = _density(terms, names, raster).expand(len(events.cell), -1)
-            scores.append(_scores(density, events.cell))
-    return [torch.stack(scores) if scores else torch.zeros(0, 3) for scores in rows]
+        densities = (_density(terms, names, raster).expand(len(events.cell), -1) for names in without)
+        of_picture = [_scores(density, events.cell) for density in densities]
+        scores.append(torch.stack(of_picture)[None])
+    return [*torch.cat(scores).unbind(1)]
 
 
 def _density(terms: dict[str, Tensor], left_out: Sequence[str], raster: tuple[int, int]) -> Tensor:
