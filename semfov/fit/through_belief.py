@@ -1,7 +1,7 @@
 """Fit an observation model through the belief, so that searches with it land on their targets sooner."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -54,7 +54,13 @@ def landing_loss(observer: SemanticSearch, searched: AnnotatedLooks, order: Tens
         probability = belief[rows].chance(targets).masked_fill(visited, 0)
         landing = (probability * goal[going]).sum(-1) / probability.sum(-1)
         losses.append(-landing.log().mean())
-    return torch.stack(losses).mean() if losses else None
+    return _mean(losses)
+
+
+def _mean(losses: Iterable[Tensor | None]) -> Tensor | None:
+    """Average the losses that are there; None where none is."""
+    known = [loss for loss in losses if loss is not None]
+    return torch.stack(known).mean() if known else None
 
 
 @torch.no_grad()
@@ -140,10 +146,8 @@ def fit_through_belief(
         for number in torch.randint(len(searches), (batch,), generator=generator).tolist():
             searched = searches[number]
             order = torch.randperm(len(searched.fixations), generator=generator)[:looks]
-            loss = landing_loss(observer, searched, order)
-            if loss is not None:
-                losses.append(loss)
-        return torch.stack(losses).mean() if losses else None
+            losses.append(landing_loss(observer, searched, order))
+        return _mean(losses)
 
     parameters = [parameter for parameter in trained.parameters() if parameter.requires_grad]
     descend(parameters, loss_of, steps, rate, decay=0.0, clip=None, title="fitting through the belief")
