@@ -1,6 +1,7 @@
 """One-step lookahead: the belief about the whole map after the scores that are expected of a fixation, or drawn."""
 
 from abc import abstractmethod
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -262,21 +263,30 @@ class Lookahead(AcquisitionFunction):
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
         expected = self.model.expected_scores() if self.likelihoods is None else None
-
-        def values(maps: Tensor, fixated: Tensor) -> Tensor:
-            """Compute the values in maps `(..., X·Y, K+1)`, of which `(..., X·Y)` were fixated."""
-            after = self._after_drawn(maps, fixated) if expected is None else self._after_expected(maps, expected)
-            change = after - self._at_present(maps)[..., None]
-            # As many fixations at once as stay in the processor's cache.
-            blocks = self.levels.split(_block(_PAIRS, maps, maps.shape[-2]), -1)
-            return torch.cat([self.pool(at_levels(change, levels)) for levels in blocks], -1)
-
+        values = partial(self._values, expected)
         if beta.ndim == 2 or self.levels.ndim > 2:
             return values(beta, visited)
         # One map at a time stays in the processor's cache; a batch at once takes four times as long.
         maps = beta.flatten(0, -3)
         fixated = visited.expand(beta.shape[:-1]).flatten(0, -2)
         return one_by_one(values, maps, fixated).view(beta.shape[:-1])
+
+    def _values(self, expected: Tensor | None, beta: Tensor, visited: Tensor) -> Tensor:
+        """Compute the values in maps.
+
+        Args:
+            expected: E[S | k, n], `(K+1, N, K+1)`; None for looks that are drawn.
+            beta: the present belief, `(..., X·Y, K+1)`.
+            visited: cells that were fixated, `(..., X·Y)`.
+
+        Returns:
+            `(..., X·Y)`.
+        """
+        after = self._after_drawn(beta, visited) if expected is None else self._after_expected(beta, expected)
+        change = after - self._at_present(beta)[..., None]
+        # As many fixations at once as stay in the processor's cache.
+        blocks = self.levels.split(_block(_PAIRS, beta, beta.shape[-2]), -1)
+        return torch.cat([self.pool(at_levels(change, levels)) for levels in blocks], -1)
 
     def _at_present(self, beta: Tensor) -> Tensor:
         """Compute `present`, a block of cells at a time."""
