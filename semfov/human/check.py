@@ -259,15 +259,20 @@ class _Reading(NamedTuple):
         except FrameError as error:
             if self.sizes is None:
                 raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
-            try:
-                records = read_by(reader, path, {**arguments, "size": self.sizes})
-                return _FileContent(records, has_frames=False)
-            except InputError:
-                if self.sizes.damage:
-                    # A file whose frames are its pictures cannot be read without their sizes.
-                    damage = next(iter(self.sizes.damage.values()))
-                    raise DataError(f"{damage}; or leave out the lines of this picture, or give --size") from None
-                raise
+            return _FileContent(_read_in_pictures(reader, path, arguments, self.sizes), has_frames=False)
+
+
+def _read_in_pictures(
+    reader: _Reader, path: Path, arguments: dict[str, Any], sizes: _PictureSizes
+) -> list[Fixations]:
+    """Read the records of a file whose frames are its pictures; raises `DataError` where one cannot be opened."""
+    try:
+        return read_by(reader, path, {**arguments, "size": sizes})
+    except InputError:
+        if not sizes.damage:
+            raise
+        damage = next(iter(sizes.damage.values()))
+        raise DataError(f"{damage}; or leave out the lines of this picture, or give --size") from None
 
 
 def _content(records: list[Fixations], usual: str) -> str:
