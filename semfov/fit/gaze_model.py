@@ -1,7 +1,9 @@
 """A model of where people look for a detector: fitted anew or adapted, and evaluated on folds of the pictures."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -55,7 +57,7 @@ class GazeModelFit(ViewingData):
 def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
     """Set first fixations, durations and pauses of a model to those of all people."""
     _describe_starts(model, groups)
-    logs: list[list[Tensor]] = [[] for _ in range(_DURATIONS)]
+    logs: dict[int, list[Tensor]] = defaultdict(list)  # of durations, by the number of the fixation
     pauses = []
     for group in groups:
         for scanpath in _timed(group):
@@ -66,9 +68,7 @@ def _describe_viewing(model: FixationDensity, groups: Sequence[Viewed]) -> None:
             # The time that no fixation takes, for each of them.
             pauses.append((1000 * group.seconds - durations.sum()) / len(durations))
     if pauses:
-        by_number = [torch.stack(of_number) for of_number in logs if of_number]
-        # Without Bessel's correction, by which a single duration has a spread of NaN.
-        model.duration = torch.stack([torch.stack([log.mean(), log.std(correction=0)]) for log in by_number])
+        model.duration = torch.stack([_mean_and_spread(torch.stack(of_number)) for of_number in logs.values()])
         model.pause = torch.stack(pauses).mean().clamp(min=0)  # durations may exceed the stated time
 
 
@@ -77,9 +77,15 @@ def _describe_starts(model: FixationDensity, groups: Sequence[Viewed]) -> None:
     starts = []
     for group in groups:
         height, width = group.size
-        starts += [(path[0] + 0.5) / torch.tensor([width, height]) for paths in group.paths for path in paths]
-    start = torch.stack(starts)
-    model.start = torch.stack([start.mean(0), start.std(0, correction=0)]).clamp(0, 1)
+        firsts = torch.stack([path[0] for path in chain.from_iterable(group.paths)])
+        starts.append((firsts + 0.5) / torch.tensor([width, height]))
+    model.start = _mean_and_spread(torch.cat(starts)).clamp(0, 1)
+
+
+def _mean_and_spread(values: Tensor) -> Tensor:
+    """Compute mean and standard deviation along the first side, `(2, ...)`."""
+    # Without Bessel's correction, by which a single value has a spread of NaN.
+    return torch.stack([values.mean(0), values.std(0, correction=0)])
 
 
 def _timed(group: Viewed) -> Iterator[Fixations]:
