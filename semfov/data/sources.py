@@ -257,11 +257,11 @@ def _open_recorder(source: "_Source", most: int | None, white: White | None) -> 
     recorder = _recorder(cv2, source)
     if not recorder.isOpened():
         raise DataError(f"{name}: cannot be opened; check that {source.remedy}")
-    rate = float(recorder.get(cv2.CAP_PROP_FPS))
     gaps: Counter[str] = Counter()
-    frames = _Recording(cv2, recorder, source, gaps, white).frames(most)
+    recording = _Recording(cv2, recorder, source, gaps, white)
+    frames = recording.frames(most)
     first = next(frames)
-    return Stream(name, rate if 0 < rate < _FASTEST else None, chain([first], frames), gaps)
+    return Stream(name, recording.rate, chain([first], frames), gaps)
 
 
 def _read_frames(files: Sequence[Path], gaps: Counter[str], white: White | None) -> Iterator[Picture]:
@@ -485,6 +485,9 @@ class _Recording:
         gaps: to which frames are added that were `lost`, and `reconnected`.
         white: the values of 16 bits that are black and white.
 
+    Attributes:
+        rate: frames a second; None where the source states none.
+
     Private attributes, all of the frames so far: `_read` counts those that were read, and `_gaps` those that were lost
     between them; `_missed` counts attempts since the last frame that gave none; `_waited` has the seconds for which a
     stream was away since then.
@@ -499,7 +502,7 @@ class _Recording:
         recorder: _Recorder,
         source: _Source,
         gaps: Counter[str],
-        white: White | None = None,
+        white: White | None,
     ) -> None:
         self._cv2 = cv2
         self._recorder = recorder
@@ -508,11 +511,12 @@ class _Recording:
         self._white = white
         self._total = float(recorder.get(cv2.CAP_PROP_FRAME_COUNT))
         rate = float(recorder.get(cv2.CAP_PROP_FPS))
+        self.rate = rate if 0 < rate < _FASTEST else None
         # An address may be that of a film, too, which states how long it is.
         self._is_file = isinstance(source, _Film) or 0 < self._total < _MOST_FRAMES
         # The time stamps of Matroska are whole milliseconds.
         is_rounded = source.container == "matroska"
-        self._clock = _Clock(1 / rate if 0 < rate < _FASTEST else FRAME, rounded=is_rounded)
+        self._clock = _Clock(FRAME if self.rate is None else 1 / self.rate, rounded=is_rounded)
         self._read = 0
         self._missed = 0
         self._waited = 0.0
