@@ -328,11 +328,7 @@ class _Evidence:
         edges = np.stack([np.zeros(2), frame]) - 0.5  # corners of the frame, as points
         start, end = reading.shares(edges, frame, picture)
         sides = frame / (end - start)
-        points = self._places(self.records, _AS_POINTS)
-
-        def fit_of(place: PicturePlace) -> float:
-            return float(np.mean([self._fit(place.shares(points[name]), name) for name in self.names]))
-
+        fit_of = partial(self._fit_at, self._places(self.records, _AS_POINTS))
         best = best_place(PicturePlace(-start * sides, sides), fit_of)
         own_size = best.resized(picture / best.sides)
         scale = np.sqrt(np.prod(best.sides / picture))
@@ -342,6 +338,10 @@ class _Evidence:
             if fit_of(best) - fit_of(likely) < _TIE:
                 return likely
         return best
+
+    def _fit_at(self, points: Mapping[str, _Array], place: PicturePlace) -> float:
+        """Compute the mean fit in bits of points on the frame, by their pictures, if these lay at a place on it."""
+        return float(np.mean([self._fit(place.shares(points[name]), name) for name in self.names]))
 
     def _places(self, records: Sequence[Fixations], reading: _Reading) -> dict[str, _Array]:
         """Places of the fixations of records in shares of the sides, `(n, 2)`, by their pictures."""
@@ -452,18 +452,16 @@ def _finer(coarse: _Reading, evidence: _Evidence) -> _Reading:
     """
     place = evidence.place_near(coarse)
     exact = coarse if place is None else _at(place)
-    named = [*_NAMED_PLACES, coarse]
+    candidates = [*_NAMED_PLACES, coarse]
     if coarse in _OTHER_FRAMES:
         # Between the frames that are tried lie those of other screens.
         frames = [_in_frame(coarse.frame_scale * factor) for factor in _FINER_SCALES]
-        named.append(max(frames, key=evidence.fit))
-    for reading in named:
-        if evidence.fit(exact) - evidence.fit(reading) >= _TIE:
-            continue
-        # What fills a part of the frame is read by its place, as nothing else says how.
-        has_numbers = place is not None and reading in _PARTS_OF_FRAME
-        return replace(exact, fault=reading.fault) if has_numbers else reading
-    return exact
+        candidates.append(max(frames, key=evidence.fit))
+    best_fit = evidence.fit(exact)
+    named = next((reading for reading in candidates if best_fit - evidence.fit(reading) < _TIE), exact)
+    # What fills a part of the frame is read by its place, as nothing else says how.
+    has_numbers = place is not None and named in _PARTS_OF_FRAME
+    return replace(exact, fault=named.fault) if has_numbers else named
 
 
 def _at(place: PicturePlace) -> _Reading:
