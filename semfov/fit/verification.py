@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from semfov.belief.prior import with_prior
 from semfov.belief.verification import CLOSER_FEATURES, Verification
@@ -322,21 +322,31 @@ def fit_to_closer_looks(
     standardised = (features - mean) / scale
     model = Verification()
     for row, answers in enumerate((closer_looks.right, closer_looks.present)):
-        centre = torch.zeros(CLOSER_FEATURES + 1, dtype=torch.float64)
-        # The regression sums over cases, so that λ counts N times, and takes half of a precision.
-        precision = torch.full_like(centre, 2 * _RIDGE * len(features))
-        precision[0] = 0.0
-        if prior is not None:
-            weight = prior.linear.weight[row].detach().double()
-            centre = torch.cat([(prior.linear.bias[row].detach().double() + weight @ mean)[None], weight * scale])
-            precision = torch.full_like(centre, 2 * _STRENGTH)
-        offset, *weights = logistic_regression(standardised, answers[chosen], known=known, prior=(centre, precision))
+        before = _penalty(len(features)) if prior is None else _near(prior.linear, row, mean, scale)
+        offset, *weights = logistic_regression(standardised, answers[chosen], known=known, prior=before)
         # The model reads features as they are.
         of_feature = torch.tensor(weights, dtype=torch.float64) / scale
         with torch.no_grad():
             model.linear.weight[row] = of_feature
             model.linear.bias[row] = offset - of_feature @ mean
     return model.eval().requires_grad_(False)
+
+
+def _penalty(cases: int) -> tuple[Tensor, Tensor]:
+    """Make centre and precision of coefficients `(8,)`, the offset first, that λ holds near 0, for N cases."""
+    centre = torch.zeros(CLOSER_FEATURES + 1, dtype=torch.float64)
+    # The regression sums over cases, so that λ counts N times, and takes half of a precision.
+    precision = torch.full_like(centre, 2 * _RIDGE * cases)
+    precision[0] = 0.0
+    return centre, precision
+
+
+def _near(linear: nn.Linear, row: int, mean: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Make centre and precision of coefficients of standardised features that are held near those of a model's row."""
+    weight = linear.weight[row].detach().double()
+    offset = linear.bias[row].detach().double() + weight @ mean
+    centre = torch.cat([offset[None], weight * scale])
+    return centre, torch.full_like(centre, 2 * _STRENGTH)
 
 
 def mean_of(models: Sequence[Verification]) -> Verification:
