@@ -498,10 +498,7 @@ def _misfit(evidence: _Evidence) -> list[str]:
     own_fits = evidence.fits(_PRESENT_READING)
     if _is_clear(own_fits, 0.0):
         return []
-    drift = _drift(evidence)
-    if drift is not None:
-        return [drift.line]
-    return [
+    return _drift(evidence) or [
         f"fixations do not fit the pictures that they are named for ({own_fits.mean():.2f} bits above those of the "
         "other pictures): are these their pictures, and is the frame right?"
     ]
@@ -537,10 +534,7 @@ def _shifts_of_some(evidence: _Evidence) -> list[str]:
             shift = _shift_of(evidence, records, f"the fixations of person {person}", _LEAST_SHIFT_OF_SOME)
             if shift is not None:
                 lines.append(shift.line)
-    if lines:
-        return lines
-    drift = _drift(evidence)
-    return [] if drift is None else [drift.line]
+    return lines or _drift(evidence)
 
 
 def _by_person(records: Sequence[Fixations]) -> dict[str, list[Fixations]]:
@@ -551,13 +545,14 @@ def _by_person(records: Sequence[Fixations]) -> dict[str, list[Fixations]]:
     return by_person
 
 
-def _drift(evidence: _Evidence) -> _Finding | None:
+def _drift(evidence: _Evidence) -> list[str]:
     """Find a shift of later fixations: a tracker drifts while a person looks at one picture after the other."""
     second_halves: list[Fixations] = []
     for records in _by_person(evidence.records).values():
         second_halves += records[len(records) // 2 :]
     label = "fixations in the second half of each person's pictures"
-    return _shift_of(evidence, second_halves, label, _LEAST_SHIFT_OF_SOME)
+    shift = _shift_of(evidence, second_halves, label, _LEAST_SHIFT_OF_SOME)
+    return [] if shift is None else [shift.line]
 
 
 def _shift_of(evidence: _Evidence, records: Sequence[Fixations], label: str, least_shift: float) -> _Finding | None:
