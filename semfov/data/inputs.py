@@ -249,18 +249,15 @@ def _channels_first(pixels: Tensor, argument: str, *, choose: bool) -> Tensor:
     if len(shape) == 2:
         return pixels.expand(1, 3, *shape)
     batch = pixels if len(shape) == 4 else pixels[None]
-    for channels in (3, 1):
-        is_first = batch.shape[1] == channels
-        is_last = batch.shape[-1] == channels
-        is_ambiguous = is_first and is_last and not choose
-        got = f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
-        check(not is_ambiguous, argument, _SHAPES, got)
-        if is_first or is_last:
-            channels_first = batch if is_first else batch.movedim(-1, 1)
-            return channels_first.expand(-1, 3, -1, -1)
-    has_alpha = 4 in (shape[-1], shape[-3])
-    remedy = "; drop the fourth channel, or give the Pillow image" if has_alpha else ""
-    raise InputError(f"{argument}: expected {_SHAPES}, with 3 channels or 1, got shape {shape}{remedy}")
+    ends = batch.shape[1], batch.shape[-1]
+    if 3 not in ends and 1 not in ends:
+        remedy = "; drop the fourth channel, or give the Pillow image" if 4 in ends else ""
+        raise InputError(f"{argument}: expected {_SHAPES}, with 3 channels or 1, got shape {shape}{remedy}")
+    channels = 3 if 3 in ends else 1
+    got = f"shape {shape}, which is ambiguous; give a tensor (3, H, W)"
+    check(choose or ends != (channels, channels), argument, _SHAPES, got)
+    channels_first = batch if ends[0] == channels else batch.movedim(-1, 1)
+    return channels_first.expand(-1, 3, -1, -1)
 
 
 def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
