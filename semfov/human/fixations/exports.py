@@ -283,13 +283,11 @@ def _viewings(rows: Sequence[Row]) -> list[Row]:
 def _of_one_eye(rows: Sequence[Row], eye: str | None) -> list[Row]:
     """Take the rows of an eye, of the right one in viewings of both; rows that name no eye, or both, stay."""
     sides = [_side(row.fields.pop("eye")) for row in rows]
-    trials_of_right_eye = set()
-    for row, side in zip(rows, sides, strict=True):
-        if side == "right":
-            trials_of_right_eye.add(row.fields["trial"])
+    trials = [row.fields["trial"] for row in rows]
+    trials_of_right_eye = {trial for trial, side in zip(trials, sides, strict=True) if side == "right"}
     rows_of_eye = []
-    for row, side in zip(rows, sides, strict=True):
-        usual_eye = "right" if row.fields["trial"] in trials_of_right_eye else "left"
+    for row, trial, side in zip(rows, trials, sides, strict=True):
+        usual_eye = "right" if trial in trials_of_right_eye else "left"
         # Samples of both eyes would count each fixation twice.
         if side in ("", eye or usual_eye):
             rows_of_eye.append(row)
