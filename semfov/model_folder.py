@@ -18,7 +18,7 @@ from semfov.gaze.policies import Policy
 from semfov.gaze.saliency.fixation_density import FixationDensity
 from semfov.io.compatibility import NETWORKS
 from semfov.io.files import inside
-from semfov.io.manifest import PARTS, Manifest
+from semfov.io.manifest import PARTS, Manifest, Part
 from semfov.io.pretrained import fit_command
 from semfov.io.storage import kind_of_file
 from semfov.observation.foveal import FovealObservationModel
@@ -34,6 +34,7 @@ KINDS: dict[str, type[_FolderModel]] = {
     "windows": GlimpseEvidence,
 }
 """Classes of the parts that are models."""
+_NONE = Part(file=None, sha256=None, used=False, why="not fitted")
 
 
 def is_model_file(name: str | PathLike[str]) -> bool:
@@ -111,15 +112,18 @@ class ModelFolder:
         self.path = Path(path)
         self.manifest = Manifest.read(self.path)
 
+    def _part(self, name: str) -> Part:
+        """Find what the manifest says of a part; one that it does not list is none."""
+        return self.manifest.parts.get(lookup(name, PARTS, "part"), _NONE)
+
     def file(self, part: str) -> Path | None:
         """File of a part, whether the agent uses it or not; None if there is none."""
-        entry = self.manifest.parts.get(lookup(part, PARTS, "part"))
-        return None if entry is None or entry.file is None else inside(self.path, entry.file)
+        file = self._part(part).file
+        return None if file is None else inside(self.path, file)
 
     def used(self, part: str) -> bool:
         """Whether the agent uses a part."""
-        entry = self.manifest.parts.get(lookup(part, PARTS, "part"))
-        return entry is not None and entry.used
+        return self._part(part).used
 
     def detector_source(
         self, detector: str | PathLike[str] | None = None, weights: str | PathLike[str] | None = None
@@ -138,15 +142,17 @@ class ModelFolder:
         """
         record = self.manifest.detector
         options = dict(record["options"])
-        place = record.get("weights_file")
+        weights_place = record.get("weights_file")
         if weights is not None:
             options["weights"] = os.fspath(weights)
-        elif place is not None:
-            options["weights"] = str(_find_file(place, self.path))
+        elif weights_place is not None:
+            options["weights"] = str(_find_file(weights_place, self.path))
         if detector is not None:
             return os.fspath(detector), options
         place = record.get("model_file")
-        return (record["model"] if place is None else str(_find_file(place, self.path))), options
+        if place is not None:
+            return str(_find_file(place, self.path)), options
+        return record["model"], options
 
     def load_detector(
         self,
