@@ -69,22 +69,21 @@ class OnnxDetector(Detector):
         head: str,
         classes: Sequence[str],
         *,
-        name: str = "onnx",
-        input_size: tuple[int, int] | None = None,
-        stride: int | None = None,
-        preprocessing: Preprocessing | None = None,
-        logits: bool = False,
-        background: BackgroundPolicy | None = None,
-        digest: str = "",
+        name: str,
+        input_size: Canvas,
+        stride: int | None,
+        preprocessing: Preprocessing,
+        logits: bool,
+        background: BackgroundPolicy | None,
+        digest: str,
     ) -> None:
-        kind = HEADS[lookup(head, HEADS, "head")]
+        kind = HEADS[head]
         names, places = named_outputs(classes)
-        preprocessing = _usual_preprocessing(head, session) if preprocessing is None else preprocessing
         _check_bytes_alone(session, preprocessing)
         super().__init__(
             name,
             names,
-            _canvas_size(session, input_size),
+            input_size,
             background=kind.background if background is None else background,
             fill=preprocessing.fill,
             stride=stride,
