@@ -40,11 +40,11 @@ class Convolution(nn.Conv2d):
         out_channels: int,
         size: int,
         *,
-        stride: int = 1,
-        padding: int = 0,
-        groups: int = 1,
-        activation: str = "linear",
-        normalised: bool = False,
+        stride: int,
+        padding: int,
+        groups: int,
+        activation: str,
+        normalised: bool,
     ) -> None:
         super().__init__(in_channels, out_channels, size, stride, padding, groups=groups)
         self.activation = activation
@@ -94,7 +94,7 @@ class MaxPool(nn.Module):
 class Route(nn.Module):
     """The channels of earlier layers, concatenated, or of one of `groups` equal parts of each."""
 
-    def __init__(self, groups: int = 1, group: int = 0) -> None:
+    def __init__(self, groups: int, group: int) -> None:
         super().__init__()
         self.groups = groups
         self.group = group
@@ -120,7 +120,7 @@ class Shortcut(nn.Module):
 class Head(nn.Identity):
     """A yolo layer: it returns its map unchanged, and holds the settings for decoding it; anchors `(width, height)`."""
 
-    def __init__(self, anchors: tuple[tuple[float, float], ...], classes: int, scale: float = 1.0) -> None:
+    def __init__(self, anchors: tuple[tuple[float, float], ...], classes: int, scale: float) -> None:
         super().__init__()
         self.anchors = anchors
         self.classes = classes
