@@ -95,14 +95,15 @@ def fit_presence(searches: BeliefsOfSearches, shares: Tensor, bounds: Bounds) ->
     known = of_class.repeat(len(counted))
     times = torch.full_like(known, 1 / len(counted))  # all looks of a search are one case
     slopes = torch.zeros(2)
-    kept = [0, 1]  # numbers of the facts that count
+    numbers = [0, 1]  # of the facts that count
     while True:
-        offset, *weights = logistic_regression(facts[:, kept], answers, times=times, known=known, ridge=_RIDGE)
-        if not weights or min(weights) >= 0:
+        offset, *weights = logistic_regression(facts[:, numbers], answers, times=times, known=known, ridge=_RIDGE)
+        least = min(weights, default=0.0)
+        if least >= 0:
             break
         # A surer cell, or a higher score, must not speak against the class: few searches may say so by chance.
-        del kept[weights.index(min(weights))]
-    slopes[kept] = torch.tensor(weights)
+        del numbers[weights.index(least)]
+    slopes[numbers] = torch.tensor(weights)
     centre = _fit_cells(searches, of_class)
     presence = Presence(torch.tensor(offset), slopes, shares, centre=centre).requires_grad_(False)
     presence.thresholds = thresholds_of_searches(presence, searches, bounds)
@@ -120,13 +121,13 @@ def _fit_cells(searches: BeliefsOfSearches, of_class: Tensor) -> Tensor:
         Offset and slope of the log odds, `(2,)`; the slope is at least `_LEAST_SLOPE`.
     """
     counted = torch.tensor(searches.counted) - 1
-    each = torch.full_like(searches.place[counted].double(), 1 / len(counted))  # all looks of a search are one case
+    share = torch.full_like(searches.place[counted].double(), 1 / len(counted))  # all looks of a search are one case
     log_odds = torch.stack(
         [searches.facts[0, counted].double(), log_odds_of_cells(searches.hit_chance[counted]).double()]
     )
     answers = torch.stack([searches.holds[counted], searches.hits[counted]])
     # The chance of a hit is that of a search that goes on.
-    times = torch.stack([each, each * ~searches.on_target[counted]])
+    times = torch.stack([share, share * ~searches.on_target[counted]])
     known = of_class.expand_as(log_odds).flatten()
     regression = partial(logistic_regression, right=answers.flatten(), times=times.flatten(), ridge=_RIDGE)
     offset, slope = regression(log_odds.flatten()[:, None], known=known)
