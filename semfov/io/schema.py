@@ -189,16 +189,9 @@ class Text(Json):
 
     def check(self, name: str, value: object, sizes: _Sizes) -> None:
         is_option = isinstance(value, str) and (self.options is None or value in self.options)
-        check(is_option, name, self._expected(), excerpt(value))
+        expected = "text" if self.options is None else f"one of {', '.join(self.options)}"
+        check(is_option, name, expected, excerpt(value))
         check(is_plain(cast(str, value)), name, "text without control characters", excerpt(value))
-
-    def _expected(self) -> str:
-        """Write in words which text is allowed."""
-        if self.options is None:
-            return "text"
-        if not self.options:
-            return "no text"
-        return f"one of {', '.join(self.options)}"
 
 
 @dataclass(frozen=True)
