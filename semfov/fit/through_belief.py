@@ -59,8 +59,8 @@ def landing_loss(observer: SemanticSearch, searched: AnnotatedLooks, order: Tens
 
 def _mean(losses: Iterable[Tensor | None]) -> Tensor | None:
     """Average the losses that are there; None where none is."""
-    known = [loss for loss in losses if loss is not None]
-    return torch.stack(known).mean() if known else None
+    numbers = [loss for loss in losses if loss is not None]
+    return torch.stack(numbers).mean() if numbers else None
 
 
 @torch.no_grad()

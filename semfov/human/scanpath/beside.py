@@ -279,10 +279,10 @@ def _averaged(
     others: Sequence[_Points],
 ) -> float:
     """Average a score of what a scanpath and each of the others are converted to, those of which something is left."""
-    one = convert(points)
-    if not len(one):
+    ours = convert(points)
+    if not len(ours):
         return float("nan")
-    return _mean([score(one, other) for other in map(convert, others) if len(other)])
+    return _mean([score(ours, theirs) for theirs in map(convert, others) if len(theirs)])
 
 
 def _mean(values: Sequence[float]) -> float:
