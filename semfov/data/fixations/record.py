@@ -318,7 +318,20 @@ class Fixations:
     @property
     def inside(self) -> NDArray[np.bool_]:
         """Whether each fixation is inside the frame, `(n,)` boolean."""
-        return np.asarray(((self.points >= -0.5) & (self.points < np.array(self.size) - 0.5)).all(1))
+        return inside_frame(self.points, np.array(self.size))
+
+
+def inside_frame(points: _Values, sides: NDArray[np.number]) -> NDArray[np.bool_]:
+    """Tell which points lie inside a frame, whose pixels have their centres at integers.
+
+    Args:
+        points: `(n, 2)`.
+        sides: width and height of the frame, `(2,)`, or of the frame of each point, `(n, 2)`.
+
+    Returns:
+        `(n,)` boolean.
+    """
+    return np.asarray(((points >= -0.5) & (points < sides - 0.5)).all(1))
 
 
 def bare_name(picture: str) -> str:

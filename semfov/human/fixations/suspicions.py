@@ -8,7 +8,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.data.fixations.record import Fixations, Letterbox, bare_name
+from semfov.data.fixations.record import Fixations, Letterbox, bare_name, inside_frame
 from semfov.errors import check
 
 _Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ def _joined(fixations: Sequence[Fixations]) -> tuple[_Array, _Array]:
 
 def _outside(points: _Array, sides: _Array) -> NDArray[np.bool_]:
     """Tell whether points lie outside their frame, `(n,)`."""
-    return np.asarray(~((points >= -0.5) & (points < sides - 0.5)).all(1))
+    return ~inside_frame(points, sides)
 
 
 def _show_borders(points: _Array, sides: _Array) -> bool:

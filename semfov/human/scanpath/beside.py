@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.data.fixations import Fixations
-from semfov.data.fixations.record import bare_name
+from semfov.data.fixations.record import bare_name, inside_frame
 from semfov.errors import check
 from semfov.human.fixations.reading import check_usual_frame, read_fixations
 from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
@@ -233,7 +233,7 @@ class _Measures:
 
     def _inside(self, points: _Points) -> _Points:
         """Select the points inside the picture."""
-        return points[Fixations("", "", points, self.size).inside]
+        return points[inside_frame(points, np.array(self.size))]
 
     def _words(self, points: _Points) -> list[int]:
         """List the cells of the points inside the picture."""
