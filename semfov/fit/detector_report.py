@@ -65,7 +65,10 @@ def curves_table(head: list[str], curves: Mapping[str, FloatArray], numbers: Seq
     Returns:
         The head, and a row for each curve.
     """
-    return [head, *([name, *(mean_percent(curve[:, n]) for n in numbers)] for name, curve in curves.items())]
+    rows = [head]
+    for name, curve in curves.items():
+        rows.append([name, *(mean_percent(curve[:, n]) for n in numbers)])
+    return rows
 
 
 def curves_figure(curves: Mapping[str, FloatArray]) -> Any:

@@ -55,14 +55,19 @@ class BeliefsOfSearches:
     def __len__(self) -> int:
         return len(self.there)
 
+    def _columns(self) -> list[Tensor]:
+        """List the tensors, whose last side are the searches, in the order of the attributes."""
+        return [getattr(self, field.name) for field in fields(self)]
+
     def __getitem__(self, chosen: Tensor) -> "BeliefsOfSearches":
         """Select searches."""
-        return BeliefsOfSearches(*(getattr(self, field.name)[..., chosen] for field in fields(self)))
+        return BeliefsOfSearches(*(column[..., chosen] for column in self._columns()))
 
     @classmethod
     def join(cls, parts: Sequence["BeliefsOfSearches"]) -> "BeliefsOfSearches":
         """Put the searches of several photographs together."""
-        return cls(*(torch.cat([getattr(part, field.name) for part in parts], -1) for field in fields(cls)))
+        columns = zip(*(part._columns() for part in parts), strict=True)
+        return cls(*(torch.cat(of_parts, -1) for of_parts in columns))
 
     @property
     def counted(self) -> list[int]:

@@ -99,7 +99,9 @@ class Samples:
     @classmethod
     def join(cls, sets: "list[Samples]") -> "Samples":
         """Concatenate several sets of samples in order."""
-        joined = {name: torch.cat([getattr(samples, name) for samples in sets]) for name in _NAMES}
+        joined = {}
+        for name in _NAMES:
+            joined[name] = torch.cat([getattr(samples, name) for samples in sets])
         # Looks are numbered through all sets.
         looks = torch.tensor([len(samples.scenes) for samples in sets])
         detections = torch.tensor([len(samples) for samples in sets])

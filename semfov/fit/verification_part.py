@@ -1,6 +1,6 @@
 """The part of a model folder that verifies targets by closer looks, fitted to held-out photographs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -104,8 +104,12 @@ def _scores(searches: Sequence[VerifiedSearch], ends: Sequence[SearchEnd]) -> Fl
     for search, end in zip(searches, ends, strict=True):
         scores = by_picture.setdefault(search.picture, {}).setdefault(search.present, [])
         scores.append(_score(end))
-    means = [[np.mean(scores) for scores in kinds.values()] for kinds in by_picture.values()]
-    return np.array([np.mean(of_kinds) for of_kinds in means])
+    return np.array([_mean_of_means(kinds.values()) for kinds in by_picture.values()])
+
+
+def _mean_of_means(kinds: Iterable[Sequence[int]]) -> float:
+    """Average scores of several kinds, each of which has the same weight."""
+    return float(np.mean([np.mean(scores) for scores in kinds]))
 
 
 def _score(end: SearchEnd) -> int:

@@ -168,7 +168,8 @@ def shipped_model(kind: type[Pretrained], name: str, detector: str, model: str) 
     ending = name.removeprefix(detector)
     stems = sorted(path.stem.removesuffix(ending) for path in kind.shipped.glob(f"*{ending}.safetensors"))
     # Without an ending there are those of other purposes among them.
-    names = [stem for stem in stems if not any(stem.startswith(f"{other}-") for other in stems)]
+    beginnings = tuple(f"{stem}-" for stem in stems)
+    names = [stem for stem in stems if not stem.startswith(beginnings)]
     raise InputError(
         f"detector: no {kind.title} is shipped for {detector!r}, only for {', '.join(names)}; without a fit use "
         f"ActivePerception.raw, or fit all models to it with `{fit_command(model)}` or semfov.fit_detector, and load "
