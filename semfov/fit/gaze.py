@@ -225,7 +225,9 @@ def fit_oculomotor(
 def _events_on(events: Events, corner: tuple[int, int], size: tuple[int, int], generator: torch.Generator) -> Events:
     """Draw events on every second row and column of cells; padding before all their fixations is cut off."""
     columns = cells_of(size)[1]
-    is_on = (events.cell // columns % _EVERY == corner[0]) & (events.cell % columns % _EVERY == corner[1])
+    row = events.cell // columns
+    column = events.cell % columns
+    is_on = (row % _EVERY == corner[0]) & (column % _EVERY == corner[1])
     numbers = is_on.nonzero()[:, 0]
     drawn = events.some(numbers[torch.randperm(len(numbers), generator=generator)[:_EVENTS]])
     if not len(drawn.cell):

@@ -182,15 +182,14 @@ def _aligned(cost: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             cheapest = min(total[i, j], total[i, j + 1], total[i + 1, j])
             total[i + 1, j + 1] = cost[i, j] + cheapest
 
-    i = rows - 1
-    j = columns - 1
-    path = [(i, j)]
-    while (i, j) != (0, 0):
-        # `total` has one more row and column in front: its entry (i, j) belongs to the pair (i - 1, j - 1).
-        total_before = {(i - 1, j - 1): total[i, j], (i - 1, j): total[i, j + 1], (i, j - 1): total[i + 1, j]}
-        i, j = min(total_before, key=lambda pair: total_before[pair])
-        path.append((i, j))
-    first, second = np.array(path).T
+    place = (rows, columns)  # in `total`
+    path = [place]
+    while place != (1, 1):
+        i, j = place
+        place = min([(i - 1, j - 1), (i - 1, j), (i, j - 1)], key=total.__getitem__)
+        path.append(place)
+    # `total` has one more row and column in front: its entry (i, j) belongs to the pair (i - 1, j - 1).
+    first, second = np.array(path).T - 1
     return first, second
 
 
