@@ -282,18 +282,16 @@ def _unpack(tensors: Mapping[str, Tensor], layers: Sequence[str]) -> FeatureMaps
 
 def _grouped(looks: Iterable[_ViewedPicture], seconds: float = _SECONDS, source: int = 0) -> list[Viewed]:
     """Collect the pictures of one data set with the scanpaths in them, by the size of the pictures."""
-    features_by_size: dict[tuple[Placement, tuple[int, int]], list[FeatureMaps]] = defaultdict(list)
-    people_by_size: dict[tuple[Placement, tuple[int, int]], list[tuple[Fixations, ...]]] = defaultdict(list)
+    by_size: dict[object, list[tuple[FeatureMaps, tuple[Fixations, ...]]]] = defaultdict(list)
     with torch.inference_mode():
         for features, people in looks:
-            key = (features.placement, features.canvas)
-            features_by_size[key].append(features)
             # Fixations may be in pixels of another frame than the picture's.
-            size = features.placement.size
-            people_by_size[key].append(tuple(scanpath.resized(size) for scanpath in people))
+            scanpaths = tuple(scanpath.resized(features.placement.size) for scanpath in people)
+            by_size[features.placement, features.canvas].append((features, scanpaths))
     groups = []
-    for key, features_of_pictures in features_by_size.items():
-        groups.append(Viewed(_joined(features_of_pictures), tuple(people_by_size[key]), seconds, source))
+    for pictures in by_size.values():
+        features_of_pictures, people_of_pictures = zip(*pictures, strict=True)
+        groups.append(Viewed(_joined(features_of_pictures), people_of_pictures, seconds, source))
     return groups
 
 
