@@ -1,6 +1,7 @@
 """Scores of models of where people look, on folds of the pictures that they were fitted without."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -120,12 +121,10 @@ class FoldStore:
         """Read the model of a fold, or fit and write it."""
         key = digest_of({**self.what, "name": name, **fold.what})
         path = self.folder / f"{name} {fold.title} model.safetensors"
-        try:
+        with suppress(SemfovError):  # whatever is wrong with the file, it can be fitted again
             model = FixationDensity.from_pretrained(path)
             if model.metadata.get("key") == key:
                 return model.requires_grad_(False)
-        except SemfovError:  # whatever is wrong with the file, it can be fitted again
-            pass
         model = fold.fit()
         model.metadata["key"] = key
         model.save(path)
