@@ -21,6 +21,19 @@ _MOST_CLASSES = 10**6
 _SCORES = "scores"  # name of the full score vectors in a library that can store further data with its boxes
 
 
+def greatest(values: Tensor, dimension: int) -> Tensor:
+    """Find the greatest of values from 0 along a dimension; 0 where there are none.
+
+    Args:
+        values: the values.
+        dimension: the dimension, which the result lacks.
+
+    Returns:
+        The greatest values.
+    """
+    return values.amax(dimension) if values.shape[dimension] else values.sum(dimension)
+
+
 def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
     """Make score vectors `(L, K+1)` of boxes with one class 1..K and its score (None: 1); the rest is background."""
     check_whole(classes, "classes", 1, _MOST_CLASSES)
@@ -91,14 +104,11 @@ class Detections:
 
     def _best_of_rows(self) -> Tensor:
         """Find the largest score of a class of each detection, `(..., L)`; 0 without classes, and for padding."""
-        classes = self.scores[..., 1:]
-        best = classes.amax(-1) if classes.shape[-1] else classes.sum(-1)
-        return best * self.mask
+        return greatest(self.scores[..., 1:], -1) * self.mask
 
     def _highest_of_rows(self) -> Tensor:
         """Find the highest score of each class among the detections, `(..., K+1)`; 0 without detections."""
-        scores = self.scores * self.mask[..., None]
-        return scores.amax(-2) if scores.shape[-2] else scores.sum(-2)
+        return greatest(self.scores * self.mask[..., None], -2)
 
     @property
     def count(self) -> Tensor:

@@ -28,7 +28,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.detection.detections import Detections
+from semfov.detection.detections import Detections, greatest
 from semfov.detection.placement import Placement
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates, score_vectors
 from semfov.errors import check, check_finite, check_number, check_whole, values_known
@@ -152,10 +152,10 @@ def _select_of_image(
     survivors = confident[remaining]
     if faint is None:  # as in windows, which find their hints themselves: only the vectors of survivors are read
         scores = score_vectors(candidates.take(image, index[survivors]), policy)
-        highest = _highest(scores)
+        highest = greatest(scores, 0)
     else:
         vectors = score_vectors(rows, policy)
-        highest = _highest(vectors)
+        highest = greatest(vectors, 0)
         scores = vectors.index_select(0, survivors)
     # Suppression ranks by confidence; the shares of a vector can rank otherwise.
     best_score = scores[:, 1:].detach().amax(-1)
@@ -165,11 +165,6 @@ def _select_of_image(
     confidence = confidence.index_select(0, remaining[order])
     mask = torch.ones_like(order, dtype=torch.bool)
     return Detections(boxes[None], scores[None], mask[None], confidence[None], highest[None])
-
-
-def _highest(vectors: Tensor) -> Tensor:
-    """Find the highest score of each class in vectors `(N, K+1)`, `(K+1,)`; 0 without any."""
-    return vectors.amax(0) if len(vectors) else vectors.sum(0)
 
 
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
