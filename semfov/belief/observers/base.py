@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from semfov.belief.belief import Belief, with_fields
+from semfov.belief.belief import Belief, DirichletBelief, with_fields
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
@@ -220,6 +220,24 @@ def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
             "observer"
         )
     return value
+
+
+def faded(belief: DirichletBelief, prior: float, keep: float) -> DirichletBelief:
+    """Discount the evidence of past looks in a belief: its parameters and its closest looks.
+
+    Args:
+        belief: the belief.
+        prior: β₀, as for `faded_parameters`.
+        keep: k, the share of the evidence to keep; 1 changes nothing.
+
+    Returns:
+        The faded belief.
+    """
+    if keep == 1:
+        return belief
+    return replace(
+        belief, beta=faded_parameters(belief.beta, prior, keep), closest=belief.closest + farther(keep)
+    )
 
 
 def faded_parameters(beta: Tensor, prior: float, keep: float) -> Tensor:

@@ -10,7 +10,7 @@ from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.fusion import RULES, fuse_scaled, scale_covering
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, cells_of_detections, likelihoods
-from semfov.belief.observers.base import Evidence, Observer, faded_parameters, farther, own
+from semfov.belief.observers.base import Evidence, Observer, faded, own
 from semfov.detection.detections import Detections
 from semfov.errors import check, lookup
 from semfov.observation.foveal import FovealObservationModel
@@ -144,11 +144,7 @@ class Semantic(Observer):
 
         The closest look counts as one from farther away.
         """
-        old = dirichlet_belief(belief)
-        if keep == 1:
-            return old
-        faded = faded_parameters(old.beta, self.prior, keep)
-        return replace(old, beta=faded, closest=old.closest + farther(keep))
+        return faded(dirichlet_belief(belief), self.prior, keep)
 
     def extra_repr(self) -> str:
         """Write prior, fusion rule, footprint and tempering."""

@@ -9,7 +9,7 @@ from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.fusion import RULES
 from semfov.belief.grid import Grid
 from semfov.belief.likelihood import cells_of_detections, likelihood_ratios
-from semfov.belief.observers.base import WEAK_PRIOR, Evidence, Observer, faded_parameters, farther, own
+from semfov.belief.observers.base import WEAK_PRIOR, Evidence, Observer, faded, own
 from semfov.detection.detections import Detections
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.precision import without_autocast
@@ -119,8 +119,4 @@ class SemanticMap(Observer):
 
         .. math:: \beta \leftarrow \beta_0 + k (\beta - \beta_0)
         """
-        old = dirichlet_belief(belief)
-        if keep == 1:
-            return old
-        faded = faded_parameters(old.beta, WEAK_PRIOR, keep)
-        return replace(old, beta=faded, closest=old.closest + farther(keep))
+        return faded(dirichlet_belief(belief), WEAK_PRIOR, keep)
