@@ -502,7 +502,7 @@ class _Recording:
         recorder: _Recorder,
         source: _Source,
         gaps: Counter[str],
-        white: White | None,
+        white: White | None = None,
     ) -> None:
         self._cv2 = cv2
         self._recorder = recorder
