@@ -497,12 +497,7 @@ class _Recording:
     """
 
     def __init__(
-        self,
-        cv2: ModuleType,
-        recorder: _Recorder,
-        source: _Source,
-        gaps: Counter[str],
-        white: White | None = None,
+        self, cv2: ModuleType, recorder: _Recorder, source: _Source, gaps: Counter[str], white: White | None = None
     ) -> None:
         self._cv2 = cv2
         self._recorder = recorder

@@ -235,9 +235,7 @@ def faded(belief: DirichletBelief, prior: float, keep: float) -> DirichletBelief
     """
     if keep == 1:
         return belief
-    return replace(
-        belief, beta=faded_parameters(belief.beta, prior, keep), closest=belief.closest + farther(keep)
-    )
+    return replace(belief, beta=faded_parameters(belief.beta, prior, keep), closest=belief.closest + farther(keep))
 
 
 def faded_parameters(beta: Tensor, prior: float, keep: float) -> Tensor:
