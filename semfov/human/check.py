@@ -262,7 +262,9 @@ class _Reading(NamedTuple):
             return _FileContent(_read_in_pictures(reader, path, arguments, self.sizes), has_frames=False)
 
 
-def _read_in_pictures(reader: _Reader, path: Path, arguments: dict[str, Any], sizes: _PictureSizes) -> list[Fixations]:
+def _read_in_pictures(
+    reader: _Reader, path: Path, arguments: Mapping[str, object], sizes: _PictureSizes
+) -> list[Fixations]:
     """Read the records of a file whose frames are its pictures; raises `DataError` where one cannot be opened."""
     try:
         return read_by(reader, path, {**arguments, "size": sizes})
