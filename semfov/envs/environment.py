@@ -130,7 +130,8 @@ class EpisodeEnv(gymnasium.Env[Arrays, object], EzPickle):
         """Go back to a saved state; all that follows is the same, bit by bit.
 
         Args:
-            state: a state of this environment, or of one with the same scenery and task. It can be restored again.
+            state: a state of this environment, or of one with the same scenery and task, also where the state was
+                pickled in another process. It can be restored again.
 
         Raises:
             InputError: it is the state of another environment.

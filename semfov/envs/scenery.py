@@ -1,6 +1,7 @@
 """The parts that environments share: scenes, the eye that looks at them, and the belief about them."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, lru_cache, partial
@@ -36,6 +37,7 @@ from semfov.runs.config import (
 )
 from semfov.runs.policy_looking import PolicyLooking
 from semfov.runs.protocols import Exploration, Trial, episodes_of, explorations_of
+from semfov.runs.scene_run import digest_of
 from semfov.runs.window_looking import WindowLooking, WindowLookingConfig, found_in
 from semfov.sensor.named import SensorName
 from semfov.zoom.eye import WindowEye
@@ -57,7 +59,7 @@ _VIEWS = 16  # number of pictures that are kept open for glimpses
 _DRAWS = 1000  # number of pictures that are drawn in search of one with objects to look for
 
 
-class _Surroundings(Generic[_Eye]):
+class _Surroundings(ABC, Generic[_Eye]):
     """Scenes, and an eye that looks at them: what environments of all kinds share.
 
     Args:
@@ -91,6 +93,22 @@ class _Surroundings(Generic[_Eye]):
         self.classes = ("background", *names)
         self.pixels = math.prod(eye.detector.input_size)
         self._chosen = None if targets is None else sorted({class_index(name, names, "targets") for name in targets})
+
+    @cached_property
+    def key(self) -> str:
+        """sha256 of scenes, settings and models: the same wherever they are opened again."""
+        return digest_of(
+            {
+                "scenes": self.pictures.fingerprint,
+                "shifts": self.shifts,
+                "targets": self._chosen,
+                **self._depends_on(),
+            }
+        )
+
+    @abstractmethod
+    def _depends_on(self) -> dict[str, object]:
+        """List the models and the settings that episodes depend on, beside scenes, targets and shifts."""
 
     def __reduce__(self) -> tuple[Callable[[], object], tuple[()]]:
         """Tell pickle that a copy opens the same scenes again."""
@@ -151,6 +169,9 @@ class Scenery(_Surroundings[Eye]):
             raise DataError(
                 "scenes: expected at least one with objects to look for, got none; change scenes or targets"
             )
+
+    def _depends_on(self) -> dict[str, object]:
+        return self._looking.depends_on()
 
     def _has_objects(self, scene: int) -> bool:
         """Whether a scene may be searched, or has anything to explore."""
@@ -329,6 +350,9 @@ class ZoomScenery(_Surroundings[WindowEye]):
         # Looks are kept for as long as an environment uses this scenery.
         self.looks_at = cache(looking.looks_at)
         self.episodes = cache(self._list)
+
+    def _depends_on(self) -> dict[str, object]:
+        return {"eye": self.eye.settings(), "evidence": self.evidence}
 
     @cached_property
     def windows(self) -> int:

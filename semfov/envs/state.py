@@ -15,9 +15,12 @@ from semfov.gaze.acquisition.base import Task
 class EnvState:
     """A state of an environment, from `save_state`, for `restore`.
 
+    A copy, also by `pickle`, has the key of the scenes in their place: a worker restores it in an environment of its
+    own, opened with the same settings, and no detector is loaded for it.
+
     Attributes:
         kind: the kind of environment: a single one, or several side by side.
-        scenery: the scenes, which are not copied.
+        scenery: the scenes; of a copy, their key.
         task: `search` or `exploration`.
         gazes: the episodes.
         randoms: copies of the generators of random numbers, one for each episode.
@@ -31,11 +34,22 @@ class EnvState:
     """
 
     kind: str
-    scenery: Scenery | ZoomScenery
+    scenery: Scenery | ZoomScenery | str
     task: Task
     gazes: SavedGazes
     randoms: tuple[np.random.Generator, ...]
     over: tuple[Any, ...]
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**vars(self), "scenery": self.scene_key()}
+
+    def scene_key(self) -> str:
+        """Tell the key of the scenes, which those that are opened again with the same settings have, too.
+
+        Returns:
+            64 hexadecimal digits.
+        """
+        return self.scenery if isinstance(self.scenery, str) else self.scenery.key
 
 
 def check_state(state: object, kind: str, scenery: Scenery | ZoomScenery, task: Task, count: int) -> None:
@@ -45,8 +59,11 @@ def check_state(state: object, kind: str, scenery: Scenery | ZoomScenery, task: 
         raise InputError(f"state: expected {expected}, got a {type(state).__name__}")
     if state.kind != kind:
         raise InputError(f"state: expected {expected}, a {kind}, got one of a {state.kind}")
-    if state.scenery is not scenery:
-        raise InputError(f"state: expected {expected}, got one of other scenes; share them by scenery=")
+    if state.scenery is not scenery and state.scene_key() != scenery.key:
+        raise InputError(
+            f"state: expected {expected}, got one of other scenes; open both environments with the same settings, or "
+            "share the scenes by scenery="
+        )
     got = (state.task, len(state.randoms))
     if got != (task, count):
         raise InputError(f"state: expected {expected} ({task}, episodes: {count}), got {got[0]}, episodes: {got[1]}")

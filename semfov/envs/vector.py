@@ -227,7 +227,8 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[np.generic]], E
         """Go back to a saved state; all that follows is the same, bit by bit.
 
         Args:
-            state: a state of this environment, or of one with the same scenery, task and number of episodes.
+            state: a state of this environment, or of one with the same scenery, task and number of episodes, also
+                where the state was pickled in another process.
 
         Raises:
             InputError: it is the state of another environment.

@@ -353,8 +353,35 @@ def test_states_of_other_environments_are_refused(sceneries, world):
     three = GazeVectorEnv("search", 3, sceneries["search"])
     two.reset(seed=0)
     refused(r"state: .*\(search, episodes: 3\), got search, episodes: 2", three.restore, two.save_state())
-    another = GazeSearch(open_scenery("search", **world))
-    refused("state: .* got one of other scenes", another.restore, env.save_state())
+    for other in ({"count": 1}, {"shifts": 5}, {"targets": ["person"]}, {"grid": (4, 5)}, {"seed": 1}):
+        another = GazeSearch(open_scenery("search", **world | other))
+        for state in (env.save_state(), pickle.loads(pickle.dumps(env.save_state()))):
+            refused("state: .* got one of other scenes; open both .* the same settings", another.restore, state)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_pickled_state_goes_on_in_another_process(sceneries, world, task, fresh, tmp_path):
+    """A planner gives each of its workers a state and an action; each has opened the same scenes itself."""
+    env = KINDS[task](sceneries[task], belief=True, render_mode="rgb_array")
+    env.reset(seed=2)
+    env.step(int(np.flatnonzero(env.action_masks())[0]))
+    (tmp_path / "state").write_bytes(pickle.dumps(env.save_state()))
+    cells = np.flatnonzero(env.action_masks())[:3]
+    code = f"""
+import pathlib, pickle
+from semfov.envs import {KINDS[task].__name__} as Kind
+if __name__ == "__main__":
+    env = Kind(count=2, grid=(5, 4), shifts=6, starts=3, cache={str(world["cache"])!r}, belief=True,
+               render_mode="rgb_array")
+    state = pickle.loads(pathlib.Path({str(tmp_path / "state")!r}).read_bytes())
+    for _ in range(2):
+        env.restore(state)
+        went = [env.step(cell) for cell in {cells.tolist()}] + [env.render(), env.reset()]
+    pathlib.Path({str(tmp_path / "went")!r}).write_bytes(pickle.dumps(went))
+"""
+    fresh(code)
+    went = pickle.loads((tmp_path / "went").read_bytes())
+    assert same(went, [*(env.step(int(cell)) for cell in cells), env.render(), env.reset()])
 
 
 def test_a_state_that_is_refused_changes_nothing(sceneries):

@@ -80,6 +80,20 @@ def test_a_restored_environment_goes_on_as_it_did(zoom_scenery, task, monkeypatc
         assert same(goes_on(), first)
 
 
+def test_a_pickled_state_goes_on_in_pictures_that_were_opened_again(zoom_scenery, cache):
+    env = ZoomEnv("search", zoom_scenery, belief=True)
+    env.reset(seed=1)
+    env.step([0.2, 0.3, 1.0])
+    pickled = pickle.dumps(env.save_state())
+    again = ZoomEnv("search", open_zoom_scenery(mosaics=1, tiles=(3, 2), passes=6, cache=cache), belief=True)
+    again.restore(pickle.loads(pickled))
+    actions = np.random.default_rng(0).random((2, 3))
+    assert same([again.step(each) for each in actions], [env.step(each) for each in actions])
+    for options in ({"mosaics": 1, "tiles": (2, 2), "passes": 6}, {"mosaics": 1, "tiles": (3, 2), "passes": 7}):
+        other = ZoomEnv("search", open_zoom_scenery(**options, cache=cache))
+        refused("state: .* other scenes", other.restore, pickle.loads(pickled))
+
+
 def shown_in(env):
     """What each look of the episode of an environment shows."""
     return [look.shown for look in env.gazes.looking.looks]
