@@ -19,7 +19,7 @@ def _by_word(rows: Mapping[str, str]) -> dict[str, str]:
 _VERBS = ("as", "draw", "exclude", "export", "hide", "ignore", "plot", "print", "return", "save", "show", "to", "write")
 """Verbs with which others' words begin."""
 
-_NEGATIONS = ("disable", "no", "not", "without")
+NEGATIONS = ("disable", "no", "not", "without")
 """Beginnings of words that ask for the opposite of what follows."""
 
 
@@ -36,7 +36,7 @@ def parts_of(word: str) -> list[str]:
         The parts of three letters or more; none of a word of one part, or of one that asks for the opposite.
     """
     words = word.split("_")
-    if words[0] in _NEGATIONS:
+    if words[0] in NEGATIONS:
         return []
     ends = ["_".join(words[first:]) for first in range(1, len(words))]
     beginnings = ["_".join(words[:count]) for count in range(len(words) - 1, 0, -1)]
@@ -47,7 +47,7 @@ def parts_of(word: str) -> list[str]:
 OPTIONS = _by_word(
     {
         "score_threshold confirm threshold": ("conf confidence score threshold"),
-        "iou per_class": "iou iou_thres iou_threshold match_threshold nms nms_iou nms_threshold",
+        "iou": "iou iou_thres iou_threshold match_threshold nms nms_iou nms_threshold",
         "limit": "max_det max_detections max_objects topk",
         "input_size": "image_size img_size imgsz resolution",
         "min_gain": "expected_gain gain min_improvement tol tolerance",
@@ -139,13 +139,15 @@ COMMANDS = _by_word(
 )
 """Commands of ours by words of others."""
 
+_PAGE_OF_EXPORT = "the page of detectors in the documentation has the call, under Export"
+
 _ADVICE = _by_word(
     {
         "the same command goes on where it stopped": "continue restart resume",
         "what is transparent in a picture is left out": "exclude ignore mask",
         "the default detector is in the package, others are read when they are named": "download install pull setup",
         "--print-config prints the settings, and --config FILE reads them": "configure dry_run settings",
-        "the page of detectors in the documentation has the call, under Export": "export onnx",
+        _PAGE_OF_EXPORT: "onnx",
         "save the page as a picture first": "screenshot url webpage",
         "figures have one style; --out FILE.json has what is to be drawn otherwise": (
             "font hide_boxes hide_conf hide_labels line show_boxes show_conf show_labels thickness"
@@ -154,6 +156,15 @@ _ADVICE = _by_word(
         "nothing is logged elsewhere; a tracker takes the file that --out writes": (
             "clearml comet mlflow tensorboard wandb"
         ),
+    }
+)
+
+_ADVICE_FOR_BOXES = _by_word(
+    {
+        "the detector leaves out what overlaps a better box; in Python semfov.load_detector(NAME, iou=…) says from which": (
+            "iou iou_thres iou_threshold match_threshold nms nms_iou nms_threshold"
+        ),
+        "boxes of all classes suppress each other, unless --per-class is given": "agnostic agnostic_nms class_agnostic",
     }
 )
 
@@ -192,14 +203,18 @@ _ADVICE_FOR_GAZE = _by_word(
     }
 )
 
-ADVICE = {**_ADVICE, **_ADVICE_FOR_OBJECTS, **_ADVICE_FOR_GAZE}
+ADVICE = {**_ADVICE, **_ADVICE_FOR_OBJECTS, **_ADVICE_FOR_GAZE, "export": _PAGE_OF_EXPORT}
 """What to do in place of an option or a command that others have, and `semfov` has not."""
 
 ADVICE_OF = {
-    **{command: {**_ADVICE, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")},
-    "gaze": {**_ADVICE, **_ADVICE_FOR_GAZE},
+    **{
+        command: {**_ADVICE, **_ADVICE_FOR_BOXES, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")
+    },
+    "app": _ADVICE_FOR_BOXES,
+    "gaze": {**_ADVICE, **_ADVICE_FOR_BOXES, **_ADVICE_FOR_GAZE},
     "live": {
         **_ADVICE,
+        **_ADVICE_FOR_BOXES,
         **_by_word(
             {
                 "each frame is looked at; live.step in Python takes the frames that you choose": "skip stride",
@@ -207,14 +222,23 @@ ADVICE_OF = {
             }
         ),
     },
-    "compare": _by_word(
-        {
-            "--out FOLDER has compare.html, compare.csv and compare.png": "html page report",
-            "AP50 is compared over passes and seconds": "map map50 metric metrics",
-        }
-    ),
+    "compare": {
+        **_ADVICE_FOR_BOXES,
+        **_by_word(
+            {
+                "--out FOLDER has compare.html, compare.csv and compare.png": "html page report",
+                "AP50 is compared over passes and seconds": "map map50 metric metrics",
+            }
+        ),
+    },
 }
 """The same for the options of each command."""
+
+FROM_YOLO = "supervision.DetectionDataset.from_yolo(…).as_coco(annotations_path=…) writes them in COCO's format"
+"""How labels of YOLO become annotations in COCO's format."""
+
+SWITCHED_OFF = {"closer": "--closer 0", "draw": "--draw none"}
+"""How a command is told not to do what an option is for, where leaving the option out does not say it."""
 
 _LOOKING = ("search", "find_all", "explore")
 

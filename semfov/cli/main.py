@@ -22,8 +22,10 @@ from semfov.words import (
     ADVICE_OF,
     COMMANDS,
     FORMER,
+    NEGATIONS,
     OPTIONS,
     SHORT,
+    SWITCHED_OFF,
     dashed,
     meant_options,
     note_of_former,
@@ -317,22 +319,42 @@ def _means_positional(option: str, positional: str) -> bool:
 def _meant_instead(command: str, option: str) -> str | None:
     """Say which option is meant by an unknown one, or which subcommands have it; None where neither is known."""
     unknown = f"unknown option --{dashed(option)}"
-    remedy = _remedy(command, option)
+    remedy = _remedy(command, option) or _switched_off(command, option)
     if remedy:
         return f"{unknown}; {remedy}"
-    having = [f"`semfov {name}`" for name in _LOOKING if option in _option_names(name)]
+    having = _having(option)
     if having:
-        return f"{unknown}; it is one of {' and '.join(having)}"
+        return f"{unknown}; it is one of {having}"
     if option in OPTIONS or get_close_matches(option, _option_names(command), cutoff=0.7):
         return None  # the parser names the similar one, if there is one
     remedies = filter(None, (_remedy(command, part) for part in parts_of(option)))
     return next((f"{unknown}; {remedy}" for remedy in remedies), None)
 
 
+def _switched_off(command: str, option: str) -> str | None:
+    """Say how to ask for the opposite of an option, as `--no-closer` does elsewhere; None for all other words."""
+    negation, _, positive = option.partition("_")
+    if negation not in NEGATIONS or not positive:
+        return None
+    defaults = {field.name: field.default for field in fields(_options_of(command))}
+    if positive in defaults and positive in SWITCHED_OFF:
+        return f"use {SWITCHED_OFF[positive]}"
+    if defaults.get(positive) is False:
+        return f"leave --{dashed(positive)} out"
+    having = _having(positive)
+    return f"--{dashed(positive)} is one of {having}" if having else ADVICE_OF.get(command, {}).get(positive)
+
+
+def _having(option: str) -> str:
+    """List the subcommands that have an option; empty if none has."""
+    return " and ".join(f"`semfov {name}`" for name in _LOOKING if option in _option_names(name))
+
+
 def _remedy(command: str, word: str) -> str | None:
     """Say which option of a subcommand others call by a word, or what to do instead; None if it is not listed."""
+    advice = ADVICE_OF.get(command, {}).get(word)
     meant = meant_options(word, _option_names(command))
-    return f"did you mean --{dashed(meant[0])}?" if meant else ADVICE_OF.get(command, {}).get(word)
+    return advice or (f"did you mean --{dashed(meant[0])}?" if meant else None)
 
 
 _RENAME = "give them these names in its first line (`semfov check` takes --columns x=THEIRS,y=THEIRS, too)"

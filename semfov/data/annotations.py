@@ -13,6 +13,7 @@ from semfov.data.scene import Annotation
 from semfov.errors import DataError, check_data
 from semfov.io.files import read_json, sha256
 from semfov.io.schema import excerpt, is_number, is_plain
+from semfov.words import FROM_YOLO
 
 Id = int | str
 """The id of an image or of a category."""
@@ -73,9 +74,7 @@ def annotation_of(entries: Sequence[Entry], labels: Mapping[Id, int], size: tupl
     return Annotation(boxes, numbers, crowd, size)
 
 
-_OF_YOLO = (
-    "labels of YOLO; supervision.DetectionDataset.from_yolo(…).as_coco(annotations_path=…) writes them in this format"
-)
+_OF_YOLO = f"labels of YOLO; {FROM_YOLO}"
 _OF_LABEL_STUDIO = "tasks of Label Studio, whose menu Export also offers COCO"
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import yaml
 
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.io.ranges import CheckedSettings
 from semfov.runs.setting_types import FlagType, ListType, SettingType, next_value, setting_types
 from semfov.runs.settings import Settings, load_yaml
-from semfov.words import FORMER, dashed, note_of_former
+from semfov.words import FORMER, FROM_YOLO, dashed, note_of_former
 
 
 def usual_form(arguments: Sequence[str], config: type[Settings], options: Container[str]) -> list[str]:
@@ -48,6 +48,8 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         if option in options:
             kind = types.get(option[2:], _NO_SETTING)
             _check_once(option, kind, usual)
+            parts = [name.removeprefix(f"{option[2:]}.") for name in types if name.startswith(f"{option[2:]}.")]
+            _check_group(word, parts, words)
             usual += _with_value(word, kind, words)
         elif word.startswith("-") and word != "-":
             # An item of a dictionary, as `--sensor.settings.fovea`, is no option of its own, but has a value.
@@ -100,6 +102,34 @@ def _with_value(word: str, kind: SettingType, words: deque[str]) -> list[str]:
         return [f"{option}={kind.in_brackets(value)}"]
     value = next_value(words)
     return [option] if value is None else [option, value]
+
+
+def _check_group(word: str, names: Sequence[str], words: Sequence[str]) -> None:
+    """Raise `InputError` for an option of a group of settings, `names`, whose value holds no settings of it.
+
+    The value may be a file, or be written as in one: `--data FILE.yaml`, `--data '{"limit": 3}'`.
+    """
+    option, has_value, value = word.partition("=")
+    text = value if has_value else next(iter(words), "")
+    if not names or text in ("", "null"):
+        return
+    group = _in_messages(_option_of(option))
+    settings = _settings_in(text)
+    top_names = {name.partition(".")[0] for name in names}
+    if isinstance(settings, dict) and all(str(key).partition(".")[0] in top_names for key in settings):
+        return
+    is_of_yolo = isinstance(settings, dict) and "names" in settings
+    given = f"a data set of YOLO; {FROM_YOLO}" if is_of_yolo else repr(text)
+    examples = ", ".join(f"--{group}.{name}" for name in names[:2])
+    raise InputError(f"{group}: expected {examples} and others, or a file of them, got {given}")
+
+
+def _settings_in(text: str) -> object:
+    """Read the settings in a file, or in a text that is none; None where there are none."""
+    try:
+        return load_yaml(Path(text).read_text(encoding="utf-8") if Path(text).is_file() else text)
+    except (OSError, ValueError, yaml.YAMLError):  # ValueError: text that is no UTF-8, or a date that there is not
+        return None
 
 
 def _value_of(word: str, kind: SettingType, words: deque[str]) -> str | None:

@@ -131,7 +131,19 @@ WRONG_USE = {
     "search --target cup --conf 0.5": "unknown option --conf; did you mean --confirm?",
     "gaze a.jpg --target cup": "unknown option --target; it is one of `semfov search` and `semfov find`",
     "search --xyz": "unknown option --xyz; --help-all lists all options",
-    "find --iou 0.5": "unknown option --iou; did you mean --per-class?",
+    "find --iou 0.5": "unknown option --iou; the detector leaves out what overlaps a better box; in Python semfov.load_",
+    "find --nms": "unknown option --nms; the detector leaves out what overlaps a better box; in Python",
+    "find --no-nms": "unknown option --no-nms; the detector leaves out what overlaps a better box; in Python",
+    "compare . --nms-threshold 0.5": "unknown option --nms-threshold; the detector leaves out what overlaps",
+    "find --agnostic-nms": "boxes of all classes suppress each other, unless --per-class is given",
+    "find --export a.csv": "unknown option --export; did you mean --out?",
+    "search --target cup --no-closer": "unknown option --no-closer; use --closer 0\n",
+    "find --no-closer": "unknown option --no-closer; --closer is one of `semfov search` and `semfov live`\n",
+    "find --no-recursive": "unknown option --no-recursive; leave --recursive out\n",
+    "search --target cup --disable-draw": "unknown option --disable-draw; use --draw none\n",
+    "fit my.onnx --data coco.yaml": "data: expected --data.root, --data.annotations and others, or a file of them",
+    "fit my.onnx --data FOLDER": "data: expected --data.root, --data.annotations and others, or a file of them",
+    "fit my.onnx --gaze people.csv": "gaze: expected --gaze.fixations, --gaze.pictures and others, or a file of them",
     "find --oat 3": "unknown option --oat; --help-all lists all options",
     "search --target": "--target: expected a value, got none",
     "search --passes many --target cup": "passes: expected a whole number from 1 to 1,000,000, got 'many'",
@@ -270,6 +282,30 @@ def test_a_file_that_has_a_setting_by_two_names_is_refused(text, tmp_path, capsy
         main(["find", "--config", str(tmp_path / "settings.yaml")])
     assert stopped.value.code == 2
     assert "error: score_threshold: expected once, got it again as 'score_threshold'" in capsys.readouterr().err
+
+
+def test_the_file_of_a_yolo_data_set_is_refused_with_what_converts_it(tmp_path, capsys):
+    path = tmp_path / "coco.yaml"
+    for names in ("names: [person]", "names:\n  0: person"):
+        path.write_text(f"path: coco\ntrain: images/train\nval: images/val\n{names}\n")
+        with pytest.raises(SystemExit) as stopped:
+            main(["fit", "mine.onnx", "--data", str(path)])
+        assert stopped.value.code == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: data: expected --data.root, --data.annotations and others")
+        assert "supervision.DetectionDataset.from_yolo(" in error
+        assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["limit: 3\n", '{"limit": 3}', "limit: null\n"])
+def test_a_group_of_settings_may_stand_in_a_file_of_its_own(text, tmp_path, capsys):
+    path = tmp_path / "data.yaml"
+    path.write_text(text)
+    values = ["--data", str(path)] if text.endswith("\n") else [f"--data={text}"]
+    with pytest.raises(SystemExit) as stopped:
+        main(["fit", "mine.onnx", *values, "--print-config"])
+    assert stopped.value.code == 0
+    assert ("limit: null" if "null" in text else "limit: 3") in capsys.readouterr().out
 
 
 def test_detectors_are_listed_with_licence_and_models(capsys):
