@@ -161,7 +161,7 @@ _ADVICE = _by_word(
 
 _ADVICE_FOR_BOXES = _by_word(
     {
-        "the detector leaves out what overlaps a better box; in Python semfov.load_detector(NAME, iou=…) says from which": (
+        "the detector leaves out what overlaps a better box; in Python semfov.load_detector(NAME, iou=…) says when": (
             "iou iou_thres iou_threshold match_threshold nms nms_iou nms_threshold"
         ),
         "boxes of all classes suppress each other, unless --per-class is given": "agnostic agnostic_nms class_agnostic",

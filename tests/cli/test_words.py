@@ -131,7 +131,7 @@ WRONG_USE = {
     "search --target cup --conf 0.5": "unknown option --conf; did you mean --confirm?",
     "gaze a.jpg --target cup": "unknown option --target; it is one of `semfov search` and `semfov find`",
     "search --xyz": "unknown option --xyz; --help-all lists all options",
-    "find --iou 0.5": "unknown option --iou; the detector leaves out what overlaps a better box; in Python semfov.load_",
+    "find --iou 0.5": "unknown option --iou; the detector leaves out what overlaps a better box; in Python semfov.load",
     "find --nms": "unknown option --nms; the detector leaves out what overlaps a better box; in Python",
     "find --no-nms": "unknown option --no-nms; the detector leaves out what overlaps a better box; in Python",
     "compare . --nms-threshold 0.5": "unknown option --nms-threshold; the detector leaves out what overlaps",
