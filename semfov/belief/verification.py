@@ -13,6 +13,7 @@ from semfov.io.pretrained import PretrainedForEye, fit_command
 from semfov.io.schema import Field, Schema
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
+from semfov.observation.precision import without_autocast
 from semfov.observation.thresholds import THRESHOLDS, DecidingModule, Thresholds, thresholds_of, thresholds_record
 
 CLOSER_FEATURES = 7  # number of features of a closer look (`closer_features`)
@@ -74,7 +75,8 @@ class Verification(DecidingModule, PretrainedForEye):
         Returns:
             `(..., 2)`, log odds that the target is at the place, and that the image holds it.
         """
-        return self.linear(features)
+        with without_autocast(features):
+            return self.linear(features)
 
     def check_searching(self, searching: FovealObservationModel) -> None:
         """Check that it was fitted to probabilities of cells such as those of a search.

@@ -21,3 +21,17 @@ def without_autocast(like: Tensor) -> AbstractContextManager[object]:
     kind = like.device.type
     is_on = torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)
     return torch.autocast(kind, enabled=False) if is_on else nullcontext()
+
+
+def product(left: Tensor, right: Tensor) -> Tensor:
+    """Multiply matrices, or a matrix and a vector, with the precision of the factors (`without_autocast`).
+
+    Args:
+        left: the first factor.
+        right: the second factor.
+
+    Returns:
+        `left @ right`.
+    """
+    with without_autocast(left):
+        return left @ right

@@ -11,6 +11,7 @@ from tests.small import GRID, detections, look, model, observing, rand, search_m
 class TestVerification(GraphTester):
     batched = (0,)
     differentiable = (0,)
+    autocast = 0.0
 
     def make(self):
         return Verification()

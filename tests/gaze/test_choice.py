@@ -121,6 +121,18 @@ def test_a_hard_fixation_has_the_gradient_of_the_soft_one(visited, dtype):
     assert gradients[0].abs().max() > 0.1
 
 
+@pytest.mark.parametrize("hard", [True, False])
+def test_mixed_precision_does_not_round_soft_fixations_to_eight_bits(visited, hard):
+    """Which would be a pixel or two in a picture of 640."""
+    logits = torch.randn(3, CELLS, generator=torch.Generator().manual_seed(0))
+    centres, noise = GRID.centres, torch.full((3, CELLS), 0.5)
+    exact = soft_fixation(logits, visited, centres, noise, hard=hard)
+    with torch.autocast("cpu", torch.bfloat16):
+        point, cell = soft_fixation(logits, visited, centres, noise, hard=hard)
+    assert torch.equal(point, exact[0])
+    assert torch.equal(cell, exact[1])
+
+
 def test_soft_fixations_have_gradients_and_at_low_temperature_are_cell_centres(visited):
     torch.manual_seed(0)
     centres, noise = GRID.centres.double(), torch.rand(3, CELLS).double()

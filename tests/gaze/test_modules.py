@@ -13,6 +13,7 @@ class AcquisitionTester(GraphTester):
 
     batched = (0, 1)
     one_trace = False
+    autocast = 0.0
 
     def inputs(self):
         return memory()
@@ -46,22 +47,8 @@ def functions(target, model, values):
     }
 
 
-LOOKAHEADS = (
-    "KLDivergence",
-    "BayesianSurprise",
-    "NegativeEntropy",
-    "TwoPeaks",
-    "UpperConfidenceBound",
-    "ProbabilityOfImprovement",
-    "ExpectedAccuracy",
-)
-"""Functions that subtract nearly equal values."""
-AUTOCAST = {"PredictedTargetPosterior": 0.05, "PlaceInformation": 0.05, **dict.fromkeys(LOOKAHEADS, 0.1)}
-
 for name, make in functions(2, model, rand(len(GRID))).items():
-    (tester,) = made = make_testers(AcquisitionTester, {name: make})
-    made[tester].autocast = AUTOCAST.get(name, AcquisitionTester.autocast)
-    globals().update(made)
+    globals().update(make_testers(AcquisitionTester, {name: make}))
 globals().update(make_testers(AcquisitionTester, {"EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID)}))
 
 
@@ -137,7 +124,7 @@ class TestPictureLikeness(GraphTester):
 class TestOculomotorBias(GraphTester):
     batched = (0,)
     differentiable = (0, 1)
-    autocast = 0.05
+    autocast = 0.0
 
     def make(self):
         bias = saliency.OculomotorBias()

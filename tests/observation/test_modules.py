@@ -26,6 +26,7 @@ class TestFoldedObservationModel(TestFovealObservationModel):
 class TestPresence(GraphTester):
     batched = (0,)
     differentiable = (0,)
+    autocast = 0.0
 
     def make(self):
         return Presence(torch.tensor(-0.4), torch.tensor([0.7, 0.2]), torch.tensor([0.2, 0.5, 0.8]))

@@ -396,6 +396,15 @@ def test_the_spread_covers_four_of_five_pictures():
     assert fit_spread({("scattered", 8): few})[0] == pytest.approx(SPREAD)
 
 
+def test_mixed_precision_does_not_round_the_facts_of_a_certainty():
+    generator = torch.Generator().manual_seed(0)
+    facts = 5 * torch.randn(9, len(FACTS), generator=generator)
+    certainty = Certainty(-1.0, tuple(torch.randn(len(FACTS), generator=generator).tolist()))
+    exact = certainty.probability(facts)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(certainty.probability(facts), exact)
+
+
 def test_the_spread_is_fitted_on_the_numbers_of_records():
     eye = WindowEye(Tiles(name="bright"))
     mosaics = Mosaics(EmbeddedScenes(("person", "dog", "boat"), count=3), 4, 4, tile=(96, 72), count=1)
