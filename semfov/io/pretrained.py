@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
-from semfov.errors import DataError, InputError, check, lookup, reason_of
+from semfov.errors import DataError, InputError, check, lookup, printable, reason_of
 from semfov.io.compatibility import Settings, check_grid, check_same_detector, check_sensor
 from semfov.io.files import JsonObject
 from semfov.io.schema import Json, Object, Schema, Text
@@ -34,6 +34,7 @@ class Pretrained(StatedModule):
         title: what the module is, in words.
         shipped: folder of the models that are shipped with the package.
         schema: requirements of a file.
+        data: options of `semfov fit` that name what the module is fitted to.
         metadata: JSON values kept with the model.
     """
 
@@ -41,6 +42,7 @@ class Pretrained(StatedModule):
     title: ClassVar[str]
     shipped: ClassVar[Path]
     schema: ClassVar[Schema]
+    data: ClassVar[str] = "--data.root PHOTOS --data.annotations instances.json"
     metadata: JsonObject
 
     @abstractmethod
@@ -105,8 +107,10 @@ class Pretrained(StatedModule):
                 cls._check_content(tensors, record)
                 model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
-            reason = reason_of(error)
-            raise DataError(f"{path}: not a complete {cls.title} ({reason})") from None
+            # Its checksum is right, so that the file is as it was written.
+            command = fit_command(_detector_of(record), cls.data)
+            again = f"if another version of semfov wrote it, fit it again: {command}"
+            raise DataError(f"{path}: not a complete {cls.title} ({reason_of(error)}); {again}") from None
         return model.eval()
 
     @classmethod
@@ -135,17 +139,26 @@ class PretrainedForEye(Pretrained):
         check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
 
 
-def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
+def fit_command(model: str = "MODEL", data: str = Pretrained.data, out: str = "mymodels") -> str:
     """Write the command that fits all models to a detector.
 
     Args:
         model: the detector.
+        data: options that name what they are fitted to.
         out: folder of the models.
 
     Returns:
         The command.
     """
-    return f"semfov fit {model} --data.root PHOTOS --data.annotations instances.json --out {out}"
+    return f"semfov fit {model} {data} --out {out}"
+
+
+def _detector_of(record: JsonObject) -> str:
+    """Find the name of the detector of a model in its record, which may lack it."""
+    try:
+        return printable(str(record["metadata"]["detector"]["name"]))
+    except (KeyError, TypeError):
+        return "MODEL"
 
 
 def shipped_model(kind: type[Pretrained], name: str, detector: str, model: str) -> str:

@@ -387,7 +387,11 @@ def test_thresholds_of_places_are_saved_with_the_evidence(tmp_path):
     assert GlimpseEvidence.from_pretrained(tmp_path / "without.safetensors").places is None
     old = tensors | {"verification.linear.weight": torch.zeros(2, 7), "verification.linear.bias": torch.zeros(2)}
     write_file(tmp_path / "old.safetensors", old, record)
-    unusable("not a complete model of evidence", GlimpseEvidence.from_pretrained, tmp_path / "old.safetensors")
+    again = "another version of semfov wrote it, fit it again: semfov fit {} --data.root PHOTOS --data.annotations"
+    for metadata, detector in ({}, "MODEL"), ({"detector": {"name": "mine"}}, "mine"):
+        write_file(tmp_path / "old.safetensors", old, record | {"metadata": metadata})
+        message = f"not a complete model of evidence .*; if {again.format(detector)}"
+        unusable(message, GlimpseEvidence.from_pretrained, tmp_path / "old.safetensors")
 
 
 SIZE = (192, 144)

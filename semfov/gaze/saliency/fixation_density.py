@@ -70,6 +70,7 @@ class FixationDensity(Pretrained):
     kind: ClassVar[str] = "fixation-density"
     title: ClassVar[str] = "model of where people look"
     shipped: ClassVar[Path] = Path(__file__).parent.parent / "models" / "fixations"
+    data: ClassVar[str] = "--gaze.fixations people.csv --gaze.pictures PHOTOS"
     schema: ClassVar[Schema] = Schema(
         {
             "read": Field(("U", "C"), _HALF),
