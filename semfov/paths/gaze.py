@@ -251,7 +251,7 @@ class GazePrediction(OtherWords):
     def _viewers(self, fixations: int) -> list[Fixations]:
         """Draw viewers whose first fixations stand for those of all people; the same ones at each call."""
         generator = torch.Generator().manual_seed(0)
-        start = drawn_starts(self.model, self.size, _VIEWERS, generator)
+        start = drawn_starts(self.model, self._log(), self.size, _VIEWERS, generator)
         paths = self.model.sample(self.terms, self.size[::-1], start, fixations, generator)
         return [Fixations(self.name, f"viewer {n}", path.double().numpy(), self.size) for n, path in enumerate(paths)]
 
@@ -322,7 +322,8 @@ class GazePrediction(OtherWords):
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.
 
-        First fixations, durations and pauses are drawn from the distributions of the people of the fit.
+        Durations and pauses are drawn from the distributions of the people of the fit, and first fixations from the
+        product of theirs and the density of the picture.
 
         Args:
             people: number of viewers.
@@ -338,7 +339,7 @@ class GazePrediction(OtherWords):
         check_whole(people, "people", 1, 10_000)
         check_number(seconds, "seconds", 0.1, 60.0)
         generator = torch.Generator().manual_seed(seed)
-        start = drawn_starts(self.model, self.size, people, generator)
+        start = drawn_starts(self.model, self._log(), self.size, people, generator)
         durations, lengths = drawn_durations(self.model, people, seconds, generator)
         paths = self.model.sample(self.terms, self.size[::-1], start, int(lengths.max()), generator)
         viewers = []

@@ -74,11 +74,22 @@ def visits_of(viewers: Sequence[Fixations], area: Area, pause: float) -> AreaVis
     return AreaVisits(len(first) / len(viewers), digits(float(np.median(first))) if first else None)
 
 
-def drawn_starts(model: FixationDensity, size: tuple[int, int], people: int, generator: torch.Generator) -> Tensor:
-    """Draw the first fixation of each viewer, within two standard deviations and the picture.
+def drawn_starts(
+    model: FixationDensity,
+    log_density: Tensor,
+    size: tuple[int, int],
+    people: int,
+    generator: torch.Generator,
+) -> Tensor:
+    r"""Draw the first fixation of each viewer: near the middle, and there where people look in this picture.
+
+    .. math:: p_1(u) \propto p(u) \, e^{-z(u)^2 / 2}
+
+    z is the distance from the mean of first fixations, in their standard deviations along each side.
 
     Args:
-        model: has the distribution.
+        model: has mean and deviations.
+        log_density: `(rows, columns)`, :math:`\ln p` in the cells of the picture, but for a constant.
         size: `(width, height)` of the picture in pixels.
         people: number of viewers.
         generator: of the draws.
@@ -86,12 +97,24 @@ def drawn_starts(model: FixationDensity, size: tuple[int, int], people: int, gen
     Returns:
         `(people, 2)`, in pixels.
     """
+    rows, columns = log_density.shape
+    mean, spread = model.start.cpu().double()  # (2,) both, shares of the sides
+    x = (_centres(columns) - mean[0]) / spread[0]
+    y = (_centres(rows) - mean[1]) / spread[1]
+    square = x.square() + y[:, None].square()
+    share = (log_density.cpu().double() - square / 2).flatten().softmax(0)
+    cell = share.multinomial(people, replacement=True, generator=generator)
+    corner = torch.stack([cell % columns, cell // columns], 1)  # (people, 2)
+    within_cell = torch.rand(people, 2, generator=generator)
     side = torch.tensor(size)  # (2,)
-    drawn = torch.randn(people, 2, generator=generator).clamp(-2, 2)
-    mean, spread = model.start.cpu().float()  # (2,) both, shares of the sides
-    start = (mean + spread * drawn).clamp(0, 1) * side - 0.5
+    start = (corner + within_cell) * (side / torch.tensor([columns, rows])) - 0.5
     # The right and the lower edge of a picture belong to none of its pixels.
-    return torch.minimum(start.clamp(min=-0.5), side - 0.5 - 1e-3)
+    return torch.minimum(start, side - 0.5 - 1e-3)
+
+
+def _centres(cells: int) -> Tensor:
+    """Compute the centres of the cells along a side, as shares of it, `(cells,)`."""
+    return (torch.arange(cells, dtype=torch.float64) + 0.5) / cells
 
 
 def drawn_durations(
