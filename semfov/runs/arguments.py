@@ -228,6 +228,8 @@ def _unknown_argument(text: str, options: Iterable[str], help_option: str) -> st
     option = next((word.partition("=")[0] for word in text.split() if word.startswith("-")), None)
     if option is None:
         return f"unexpected argument {text!r}; put a name with spaces in quotes, and commas in a list"
+    if Path(option).exists():
+        return f"unknown option {option}; write the file of this name as ./{option}"
     names = [dashed(name[2:]) for name in options]
     matches = get_close_matches(dashed(option.lstrip("-")), names, n=1, cutoff=0.7)
     remedy = f"did you mean --{matches[0]}?" if matches else f"{help_option} lists all options"

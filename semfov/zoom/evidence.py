@@ -16,6 +16,7 @@ from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import Settings, check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
+from semfov.observation.precision import without_autocast
 from semfov.observation.presence import SHARES
 from semfov.observation.thresholds import THRESHOLDS, DecidingModule, Thresholds, thresholds_of, thresholds_record
 from semfov.zoom.certainty import Certainty
@@ -80,7 +81,9 @@ class PhotographEvidence(nn.Module):
         Returns:
             Log odds, `(...)`.
         """
-        return self.whole(torch.stack([best.logit(1e-4), self.usual[target - 1]], -1))[..., 0]
+        facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1)
+        with without_autocast(facts):
+            return self.whole(facts)[..., 0]
 
     @staticmethod
     def shapes() -> dict[str, tuple[int | str, ...]]:
@@ -252,7 +255,9 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         Returns:
             Log odds, `(...)`.
         """
-        return self.whole(self.presence_facts(best, expected))[..., 0]
+        facts = self.presence_facts(best, expected)
+        with without_autocast(facts):
+            return self.whole(facts)[..., 0]
 
     @staticmethod
     def presence_facts(best: Tensor, expected: Tensor) -> Tensor:

@@ -297,6 +297,15 @@ def test_the_file_of_a_yolo_data_set_is_refused_with_what_converts_it(tmp_path, 
         assert error.count("\n") == 1
 
 
+def test_a_file_whose_name_begins_with_a_dash_is_no_option(tmp_path, monkeypatch, capsys):
+    (tmp_path / "-a.jpg").touch()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(["find", "-a.jpg"])
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err == "error: unknown option -a.jpg; write the file of this name as ./-a.jpg\n"
+
+
 @pytest.mark.parametrize("text", ["limit: 3\n", '{"limit": 3}', "limit: null\n"])
 def test_a_group_of_settings_may_stand_in_a_file_of_its_own(text, tmp_path, capsys):
     path = tmp_path / "data.yaml"

@@ -396,6 +396,16 @@ def test_the_spread_covers_four_of_five_pictures():
     assert fit_spread({("scattered", 8): few})[0] == pytest.approx(SPREAD)
 
 
+def test_mixed_precision_does_not_round_whether_a_picture_holds_a_class():
+    evidence = GlimpseEvidence.from_pretrained("yolox-nano").requires_grad_(False)
+    best = torch.rand(50, generator=torch.Generator().manual_seed(0))
+    target = torch.arange(1, 51)
+    exact = evidence.presence(best, 3 * best), evidence.photograph.presence(best, target)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(evidence.presence(best, 3 * best), exact[0])
+        assert torch.equal(evidence.photograph.presence(best, target), exact[1])
+
+
 def test_mixed_precision_does_not_round_the_facts_of_a_certainty():
     generator = torch.Generator().manual_seed(0)
     facts = 5 * torch.randn(9, len(FACTS), generator=generator)
