@@ -301,7 +301,7 @@ def _text(name: str, prediction: GazePrediction, paths: Sequence[Fixations], are
         lines.append(f"  {area_name}: {percent(area.share)} of all fixations, {area.visits}")
     places = []
     for number, peak in enumerate(prediction.peaks(), 1):
-        places.append(f"{number}. ({peak['x']:.0f}, {peak['y']:.0f}) {100 * peak['share']:.0f} %")
+        places.append(f"{number}. ({peak['x']:z.0f}, {peak['y']:z.0f}) {100 * peak['share']:.0f} %")
     lines.append(f"  most fixations: {'; '.join(places)}")
     mean = sum(map(len, paths)) / len(paths)
     lines.append(f"  {len(paths)} viewers drawn, {mean:.1f} fixations each")

@@ -308,7 +308,7 @@ def _moment_line(moment: Moment) -> str:
     belief = moment.belief_map(len(moment) - 1)
     most_likely = ""
     if belief is None:
-        place = f"({row['x']:.0f}, {row['y']:.0f}) × {row['magnification']:.2f}"
+        place = f"({row['x']:z.0f}, {row['y']:z.0f}) × {row['magnification']:.2f}"
     else:
         highest_row, highest_column = divmod(row["highest_cell"], belief[0].columns)
         place = f"cell ({row['column']}, {row['row']})"

@@ -80,7 +80,7 @@ def _place_text(record: Record, decision: Decision) -> str:
     text = ""
     if record.found_at is not None:
         x, y = record.found_at
-        text = f" at ({x:.0f}, {y:.0f})"
+        text = f" at ({x:z.0f}, {y:z.0f})"
     if decision.box is not None:
         text += f", box {box_text(decision.box.tolist())}"
     return text
@@ -100,7 +100,7 @@ def _objects_lines(record: Record) -> list[str]:
 def _object_line(row: Values) -> str:
     """Write the line of an object, a row of `Record.object_rows`."""
     corners = row["x1"], row["y1"], row["x2"], row["y2"]
-    line = f"  {row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}), box {box_text(corners)}"
+    line = f"  {row['class']} {row['score']:.2f} at ({row['x']:z.0f}, {row['y']:z.0f}), box {box_text(corners)}"
     return f"{line}, confirmed" if row["confirmed"] else line
 
 
@@ -118,7 +118,7 @@ def _regions_lines(record: Record) -> list[str]:
     for name, count in cells.most_common():
         x, y = best[name].place
         chance = f"p up to {best[name].probability:.2f}"
-        lines.append(f"  map: {name} in {amount(count, 'cell')}, {chance} around ({x:.0f}, {y:.0f})")
+        lines.append(f"  map: {name} in {amount(count, 'cell')}, {chance} around ({x:z.0f}, {y:z.0f})")
     return lines
 
 
@@ -149,7 +149,7 @@ def _look_row(record: Record, look: RecordedLook) -> list[str]:
     x, y = look.fixation
     return [
         str(look.number),
-        f"({x:.0f}, {y:.0f})",
+        f"({x:z.0f}, {y:z.0f})",
         "the whole picture" if record.is_whole(look.region) else box_text(look.region),
         detections_in_words(look.detections, record.classes, target=record.target),
         "" if look.value is None else f"{look.value:.3f}",

@@ -81,7 +81,7 @@ class Record(Conversion):
         names = []
         for row in rows[:_NAMED]:
             confirmed = " (confirmed)" if row["confirmed"] else ""
-            names.append(f"{row['class']} {row['score']:.2f} at ({row['x']:.0f}, {row['y']:.0f}){confirmed}")
+            names.append(f"{row['class']} {row['score']:.2f} at ({row['x']:z.0f}, {row['y']:z.0f}){confirmed}")
         if len(rows) > _NAMED:
             names.append(f"and {len(rows) - _NAMED} more")
         objects = f"objects from {self.words.threshold}: {', '.join(names) or 'none'}"

@@ -534,7 +534,7 @@ class GazePrediction(OtherWords):
 
     def describe(self) -> str:
         """Describe the prediction in one line."""
-        first = ", then ".join(f"({place['x']:.0f}, {place['y']:.0f})" for place in self.first_fixations())
+        first = ", then ".join(f"({place['x']:z.0f}, {place['y']:z.0f})" for place in self.first_fixations())
         limit = ""
         if self.seen is not None:
             limit = f", after {amount(self.seen, 'fixation')} seen by the fovea"
@@ -543,7 +543,7 @@ class GazePrediction(OtherWords):
     def __str__(self) -> str:
         """Return the description, and the places where most fixations are expected."""
         lines = [
-            f"  {number}. ({peak['x']:.0f}, {peak['y']:.0f}): {percent(peak['share'])} of all fixations"
+            f"  {number}. ({peak['x']:z.0f}, {peak['y']:z.0f}): {percent(peak['share'])} of all fixations"
             for number, peak in enumerate(self.peaks(), 1)
         ]
         if self.caution is not None:

@@ -60,7 +60,7 @@ class RecordedLook(OtherWords):
         x, y = self.fixation
         count = int(confident_detections(self.detections).count)
         detections = f"{amount(count, 'detection')} from score {CONFIDENT:g} on"
-        return f"{type(self).__name__} {self.number} at ({x:.0f}, {y:.0f}), box {box_text(self.region)}: {detections}"
+        return f"{type(self).__name__} {self.number} at ({x:z.0f}, {y:z.0f}), box {box_text(self.region)}: {detections}"
 
 
 def finite_or_none(value: float | None) -> float | None:

@@ -199,7 +199,7 @@ class WindowWords(Words):
         looks = []
         for look in self.record:
             x, y = look.fixation
-            looks.append(f"({x:.0f}, {y:.0f}) × {look.more['magnification']:.2f}")
+            looks.append(f"({x:z.0f}, {y:z.0f}) × {look.more['magnification']:.2f}")
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
         width, height = self.record.size
         return [f"looks at (x, y) × magnification: {', '.join(path)} of {width} × {height} px"]

@@ -247,7 +247,7 @@ def _place_rows(places: Sequence[Mapping[str, float]]) -> list[tuple[str, str, s
     """Write places as rows of a table, numbered in their order."""
     rows = []
     for number, place in enumerate(places, 1):
-        rows.append((str(number), f"{place['x']:.0f}, {place['y']:.0f}", percent(place["share"])))
+        rows.append((str(number), f"{place['x']:z.0f}, {place['y']:z.0f}", percent(place["share"])))
     return rows
 
 

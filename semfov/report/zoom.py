@@ -174,7 +174,7 @@ def _where_in_words(path: Record, look: RecordedLook, magnification: float, pose
     if pose is not None:
         return f": {pose}"
     x, y = look.fixation
-    return f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}"
+    return f" at ({x:z.0f}, {y:z.0f}), magnification {magnification:.2g}"
 
 
 def _warmed_up(path: Record) -> bool:

@@ -468,3 +468,9 @@ def test_a_large_picture_is_predicted_from_a_reduced_copy(tmp_path, monkeypatch)
     for whole, prediction in zip(expected, [agent.gaze(path), agent.gaze(path, seen=seen)], strict=True):
         assert prediction.size == (width, height)
         assert 0.5 * (prediction.cells - whole.cells).abs().sum() < 0.15
+
+
+def test_a_picture_of_one_pixel_has_no_place_at_minus_zero():
+    text = str(ActivePerception.recommended().gaze(np.zeros((1, 1, 3), np.uint8)))
+    assert "look first at (0, 0)" in text
+    assert "-0" not in text
