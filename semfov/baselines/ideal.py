@@ -10,7 +10,7 @@ from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation import FovealObservationModel, visibility
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 
 # Where nothing is visible the answer is a guess: with this signal each of n equal cells is right with 1/n.
 _LEAST_SIGNAL = 1e-4
@@ -71,7 +71,7 @@ class EntropyLimit(_SignalSearch):
 
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
         """Compute the sum, in nats."""
-        return product(signal.square(), place[..., None])[..., 0] / 2
+        return exact_product(signal.square(), place[..., None])[..., 0] / 2
 
 
 class CorrectLocalisation(_SignalSearch):
@@ -145,5 +145,5 @@ def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> 
     beaten = torch.special.ndtr((lead[..., None] + response) / d_of_other)
     # No cell competes with itself.
     itself = torch.eye(place.shape[-1], dtype=torch.bool, device=place.device)[..., None]
-    right = product(torch.where(itself, 1.0, beaten).prod(-2), weight)
+    right = exact_product(torch.where(itself, 1.0, beaten).prod(-2), weight)
     return (place * right).sum(-1)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check_shape
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 
 
 def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:
@@ -37,7 +37,7 @@ def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:
     """
     check_shape(ratio, "ratio", None, None, miss.shape[-1])
     check_shape(weight, "weight", *ratio.shape[:2], miss.shape[-2])
-    detected = product(weight.mT, ratio[..., 1:])
+    detected = exact_product(weight.mT, ratio[..., 1:])
     background = torch.ones_like(miss[..., :1])
     return torch.cat([background, miss[..., 1:] + detected], -1)
 

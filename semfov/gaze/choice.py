@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, values_known
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 
 _Noise = Callable[[int, Tensor], Tensor]
 """Maps the number of a gaze shift and the numbers of A episodes `(A,)` to random numbers `(A, X·Y)` in [0, 1)."""
@@ -231,7 +231,7 @@ def soft_fixation(
     weights = (perturbed / temperature).softmax(-1)
     cell = weights.argmax(-1)
     centres = centres.to(weights)
-    soft = product(weights, centres)
+    soft = exact_product(weights, centres)
     if not hard:
         return soft, cell
     # The value is the centre, and the gradient is that of the soft point.

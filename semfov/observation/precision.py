@@ -23,7 +23,7 @@ def without_autocast(like: Tensor) -> AbstractContextManager[object]:
     return torch.autocast(kind, enabled=False) if is_on else nullcontext()
 
 
-def product(left: Tensor, right: Tensor) -> Tensor:
+def exact_product(left: Tensor, right: Tensor) -> Tensor:
     """Multiply matrices, or a matrix and a vector, with the precision of the factors (`without_autocast`).
 
     Args:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_tensor
 from semfov.io.schema import Field
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 from semfov.observation.thresholds import DecidingModule, Thresholds
 
 SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
@@ -154,7 +154,7 @@ class Presence(DecidingModule):
         Returns:
             `(...)`, differentiable in the facts and the three numbers.
         """
-        return self.offset.to(facts) + product(facts, self.slopes.to(facts))
+        return self.offset.to(facts) + exact_product(facts, self.slopes.to(facts))
 
     def detach(self) -> "Presence":
         """Copy the module with numbers that are constants, through which no gradient flows.

@@ -8,7 +8,7 @@ from typing import Self
 from torch import Tensor
 
 from semfov.errors import check
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 
 FACTS = (
     "score",
@@ -110,7 +110,7 @@ class Certainty:
         Returns:
             `(M,)`.
         """
-        return (self.offset + product(facts, facts.new_tensor(self.weights))).sigmoid()
+        return (self.offset + exact_product(facts, facts.new_tensor(self.weights))).sigmoid()
 
     def unseen(self, expected: tuple[float, float], *, promised: float, discoveries: float) -> tuple[float, float]:
         """Estimate how many objects further looks would show, n.

@@ -53,6 +53,7 @@ OPTIONS = {
 
 PASSED_ON = {
     "recommended": {*signature(ActivePerception.recommended).parameters, *loader_options()},
+    "load_detector": {*loader_options()},
     "run": {setting.name for setting in fields(FindOptions)},
 }
 """Options of calls that pass them on."""

@@ -12,7 +12,7 @@ from semfov.belief.likelihood import cells_of_detections, likelihood_ratios
 from semfov.belief.observers.base import WEAK_PRIOR, Evidence, Observer, faded, own
 from semfov.detection.detections import Detections
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class SemanticMap(Observer):
         """Sum what the detections in each cell say, the same for every target."""
         ratio = likelihood_ratios(detections, fixation, grid, self.model)
         covered = cells_of_detections(detections, grid).to(ratio)
-        ratio_of_cells = product(covered.mT, ratio)  # (B, X·Y, K+1)
+        ratio_of_cells = exact_product(covered.mT, ratio)  # (B, X·Y, K+1)
         return CellEvidence(ratio_of_cells, grid.distance(fixation).to(ratio))
 
     def log_likelihood(self, ratio: Tensor) -> Tensor:

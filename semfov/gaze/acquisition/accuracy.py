@@ -9,7 +9,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import acuity
 from semfov.gaze.acquisition.lookahead import at_levels
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 
 _CORRECTED = 0.3  # c, by least squares 0.32 in explorations of photographs
 
@@ -67,7 +67,7 @@ class ExpectedAccuracy(AcquisitionFunction):
         dirichlet = dirichlet_belief(belief)
         check_shape(dirichlet.beta, "beta", self.levels.shape[-1], None)
         objects = dirichlet.probabilities[..., 1:]
-        detected = product(objects, self.named.to(objects))
+        detected = exact_product(objects, self.named.to(objects))
         missed = (objects[..., None] * self.miss.to(objects)).amax(-2)
         gain = (detected + missed - objects.amax(-1, keepdim=True)).clamp(min=0)
         return at_levels(gain, self.levels).sum(-2)

@@ -13,7 +13,7 @@ from semfov.belief.grid import Grid
 from semfov.errors import InputError, check, check_shape, check_whole, values_known
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 from semfov.threads import one_thread_if_small
 
 _BLOCK = 1 << 16  # elements that are worked on at once, which stay in the processor's cache
@@ -108,7 +108,7 @@ def _expected_looks(mean: Tensor, expected: Tensor) -> Tensor:
     table = expected.to(mean).flatten(1)  # (K+1, N (K+1))
 
     def scores_of(maps: Tensor) -> Tensor:
-        return product(maps, table)
+        return exact_product(maps, table)
 
     scores = scores_of(mean) if mean.ndim == 2 else one_by_one(scores_of, mean.flatten(0, -3))
     return scores.view(*mean.shape[:-1], *expected.shape[1:])
@@ -116,7 +116,7 @@ def _expected_looks(mean: Tensor, expected: Tensor) -> Tensor:
 
 def _outlook(beta: Tensor, total: Tensor, mean: Tensor, likelihood: Tensor) -> Outlook:
     """Make the belief after looks with these likelihoods, `(..., X·Y, N, K+1)`."""
-    scale = product(mean[..., None, :], likelihood.mT).mT  # Σ_k p_k λ_k
+    scale = exact_product(mean[..., None, :], likelihood.mT).mT  # Σ_k p_k λ_k
     return Outlook(beta, total, mean, likelihood, scale)
 
 

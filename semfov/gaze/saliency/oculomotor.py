@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
-from semfov.observation.precision import product
+from semfov.observation.precision import exact_product
 
 _LENGTHS = (0.0, 0.015, 0.03, 0.05, 0.075, 0.105, 0.145, 0.2, 0.27, 0.36, 0.5, 0.7, 1.0)
 """Distances, in longer sides of the picture, between which the tables are interpolated."""
@@ -83,7 +83,7 @@ class OculomotorBias(nn.Module):
         direction = saccade / length[..., None].clamp(min=1e-9)
         tables = torch.cat([self.saccade, self.turn])
         # A table that is interpolated linearly is its first value and the shares of its steps that were passed.
-        by_length = tables[:, :1] + product(tables.diff(dim=1), _passed(_LENGTHS, length))  # (B, tables, N)
+        by_length = tables[:, :1] + exact_product(tables.diff(dim=1), _passed(_LENGTHS, length))  # (B, tables, N)
         by_angle = torch.stack([*_of_direction(direction), *_of_turn(direction, last - before)], -2)
         return by_length.mul(by_angle).sum(-2)
 
@@ -111,7 +111,7 @@ class OculomotorBias(nn.Module):
         fixated_by_interval = fixated[..., None].expand(-1, -1, intervals).flatten(1)
         weights = steps * fixated_by_interval
         passed = _passed(_NEAR, distance).flatten(1, 2)  # (B, fixations · intervals, N)
-        by_distance = product(weights[:, None], passed)[:, 0]
+        by_distance = exact_product(weights[:, None], passed)[:, 0]
         at_fixations = (tables[:, 0] * fixated).sum(1)
         return bias + by_distance + at_fixations[:, None]
 
