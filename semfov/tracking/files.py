@@ -13,6 +13,7 @@ from semfov.tracking.tracks import TRAIL, Tracks
 _PREFIX = "track_"
 _KINEMATICS = {"place": (2,), "velocity": (2,), "covariance": (2, 2)}
 _COLUMNS = {
+    "rest_place": (2,),
     "speed": (),
     "log_size": (2,),
     "size_variance": (),

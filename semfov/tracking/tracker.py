@@ -195,11 +195,9 @@ class Tracker:
         lasting = np.log1p(-model.loss) * seconds
         chance = lasting - np.logaddexp(0, -tracks.shown_odds)
         later = replace(
-            tracks,
-            kinematics=tracks.kinematics.after(seconds, model.acceleration * tracks.sides**2),
+            tracks.after(seconds, model.acceleration * tracks.sides**2),
             size_variance=tracks.size_variance + model.growth * seconds,
             shown_odds=chance - np.log(-np.expm1(chance)),
-            unseen=tracks.unseen + seconds,
         )
         later = later[later.log_odds > np.log(model.least / (1 - model.least))]
         return later if motion.is_still else later.carried(motion)
@@ -270,9 +268,11 @@ class Tracker:
         log_size = _log_size(seen.boxes[columns])
         gain = tracks.size_variance / (tracks.size_variance + self.model.size**2)
         evidence = self.model.evidence(seen.scores[columns])
+        kinematics = tracks.kinematics.measured(_centres(seen.boxes[columns]), noise[columns])
         updated = replace(
             tracks,
-            kinematics=tracks.kinematics.measured(_centres(seen.boxes[columns]), noise[columns]),
+            kinematics=kinematics,
+            rest_place=kinematics.place,
             log_size=tracks.log_size + gain[:, None] * (log_size - tracks.log_size),
             size_variance=np.maximum(tracks.size_variance * (1 - gain), self._least_size_variance(seen)[columns]),
             shown_odds=np.maximum(tracks.shown_odds, evidence),
@@ -295,6 +295,7 @@ class Tracker:
             track_ids=self._last + 1 + np.arange(count),
             labels=seen.labels[is_new],
             kinematics=Kinematics.at(_centres(boxes), noise[is_new], speed),
+            rest_place=_centres(boxes),
             speed=speed,
             log_size=log_size,
             size_variance=np.maximum(self.model.size**2, self._least_size_variance(seen)[is_new]),

@@ -30,6 +30,8 @@ class Tracks:
         track_ids: `(N,)`, numbers from 1 that stay with the objects.
         labels: `(N,)`, classes 1..K.
         kinematics: their places and velocities.
+        rest_place: `(N, 2)`, where they were in the last look that showed each, or in a later frame in which it moved
+            last, carried along with the camera.
         speed: `(N,)`, standard deviation of each coordinate of a velocity before it is known, in pixels a second.
         log_size: `(N, 2)`, logarithms of width and height in pixels.
         size_variance: `(N,)`, variance of these.
@@ -47,6 +49,7 @@ class Tracks:
     track_ids: NDArray[np.int64]
     labels: NDArray[np.int64]
     kinematics: Kinematics
+    rest_place: Floats
     speed: Floats
     log_size: Floats
     size_variance: Floats
@@ -74,6 +77,7 @@ class Tracks:
             track_ids=numbers,
             labels=numbers,
             kinematics=kinematics,
+            rest_place=np.zeros((0, 2)),
             speed=nothing,
             log_size=np.zeros((0, 2)),
             size_variance=nothing,
@@ -108,9 +112,8 @@ class Tracks:
 
     @property
     def place(self) -> Floats:
-        """Where they are, `(N, 2)` in pixels: those that stand still are where they were seen last."""
-        way = self.unseen[:, None] * self.kinematics.velocity
-        return np.where(self.moves[:, None], self.kinematics.place, self.kinematics.place - way)
+        """Where they are, `(N, 2)` in pixels: those that stand still are where they came to rest."""
+        return np.where(self.moves[:, None], self.kinematics.place, self.rest_place)
 
     @property
     def corners(self) -> Floats:
@@ -233,6 +236,19 @@ class Tracks:
                 columns[name] = column.with_rows(rows, theirs)
         return Tracks(**columns)
 
+    def after(self, seconds: float, acceleration: Floats) -> "Tracks":
+        """Predict where the objects are some seconds later.
+
+        Args:
+            seconds: time since the last frame.
+            acceleration: `(N,)`, density of the noise of the velocity (`Kinematics.after`).
+
+        Returns:
+            The objects then; those that stand still stay where they are.
+        """
+        later = replace(self, kinematics=self.kinematics.after(seconds, acceleration), unseen=self.unseen + seconds)
+        return replace(later, rest_place=later.place)
+
     def carried(self, motion: Motion) -> "Tracks":
         """Carry the objects along with the camera.
 
@@ -248,6 +264,7 @@ class Tracks:
         return replace(
             ahead,
             kinematics=ahead.kinematics.carried(motion),
+            rest_place=motion.points(torch.from_numpy(ahead.rest_place)).numpy(),
             speed=ahead.speed * scale,
             magnification=ahead.magnification / scale,
             log_size=ahead.log_size + np.log(scale)[:, None],

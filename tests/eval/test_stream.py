@@ -284,6 +284,7 @@ def tracks_at(*boxes, odds=2.0, variance=1.0):
         track_ids=1 + np.arange(count),
         labels=np.ones(count, int),
         kinematics=moving,
+        rest_place=moving.place,
         speed=np.full(count, 50.0),
         log_size=np.log(corners[:, 2:] - corners[:, :2]),
         shown_odds=np.full(count, odds),
