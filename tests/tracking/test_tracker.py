@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov.motion import CameraStep, Motion
-from semfov.motion.patches import PatchFlow
+from semfov.motion.patches import FollowedPatches, PatchFlow
 from semfov.tracking import Seen, Tracker, TrackingModel
 from semfov.tracking.gain import value_of_windows
 from semfov.zoom.lattice import Lattice
@@ -270,13 +270,12 @@ def test_a_window_is_worth_the_objects_that_it_puts_right():
     """By the definition: each object whose box lies in a window, one by one."""
     lattice, tracker = Lattice.over((1600, 1200), (400, 400)), Tracker()
     tracker.see(look(box_at(100, 200), box_at(900, 640), box_at(1500, 1100), region=(0, 0, 1600, 1200)))
-    tracker.follow(1.0)
+    tracker.follow(np.log(2) / 0.75)  # half of the evidence of the look is left
     tracks = tracker.tracks
     for level in range(1, lattice.levels):
-        values = value_of_windows(tracks, tracker.model, lattice, level)
-        gains = (
-            tracks.existence * tracker.model.detects(tracks.sides * lattice.magnifications[level]) * (1 - tracks.fits)
-        )
+        values = value_of_windows(tracks, tracker.model, lattice, level, rate=0.75)
+        shown = tracker.model.detects(tracks.sides * lattice.magnifications[level])
+        gains = tracks.existence * shown * (1 - tracks.fits * 0.5)
         across, down = lattice.places(level)
         actions = torch.tensor([[level, x, y] for y in range(down) for x in range(across)])
         windows, boxes = lattice.boxes(actions)[:, None], tracks.boxes[None]
@@ -284,6 +283,46 @@ def test_a_window_is_worth_the_objects_that_it_puts_right():
         expected = (holds * torch.from_numpy(gains)).sum(-1).view(down, across)
         np.testing.assert_allclose(values, expected.numpy(), atol=1e-5)
         assert values.max() > 0
+
+
+def test_an_object_that_stands_is_looked_at_again_though_its_box_fits():
+    """Flow keeps the boxes of two objects that stand, of which the second was shown last."""
+    tracker, lattice = Tracker(), Lattice.over((1600, 1200), (400, 400))
+    for x in (100, 1400):
+        for _ in range(2):
+            tracker.see(look(box_at(x, 200), region=(x - 100.0, 0.0, x + 200.0, 1200.0)))
+            for _ in range(12):
+                tracker.follow(FRAME, flow=Standing())
+    assert tracker.tracks.fits.min() > 0.98
+    values = value_of_windows(tracker.tracks, tracker.model, lattice, 1, rate=0.75)
+    assert values[:, 0].max() > 1.5 * values[:, -1].max() > 0.1
+
+
+class Standing(PatchFlow):
+    """A flow that follows each box to where it was."""
+
+    def follow(self, boxes, expected):
+        centres = (boxes[:, :2] + boxes[:, 2:]) / 2
+        return FollowedPatches(centres, np.ones(len(boxes), bool), np.zeros(len(boxes)))
+
+
+def test_an_object_that_stands_stays_where_it_was_seen_whatever_flow_says():
+    """Flow is off by some tenths of a pixel in each frame, to and fro, for ten seconds without a look."""
+    tracker, random = Tracker(), np.random.default_rng(1)
+
+    class Trembling(Standing):
+        def follow(self, boxes, expected):
+            still = super().follow(boxes, expected)
+            return still._replace(places=still.places + random.normal(0, 0.3, still.places.shape))
+
+    tracker.see(look(box_at(300, 200)))
+    for _ in range(25):
+        tracker.follow(FRAME, flow=Standing())
+    assert not tracker.tracks.moves.any()
+    before = tracker.tracks.boxes
+    for _ in range(250):
+        tracker.follow(FRAME, flow=Trembling())
+        torch.testing.assert_close(tracker.tracks.boxes, before, atol=1e-3, rtol=0)
 
 
 def test_objects_of_a_disturbance_are_none_of_the_scene():
