@@ -2,8 +2,10 @@
 
 import warnings
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from semfov.data.large import ArrayPicture
 from semfov.errors import InputError, check
 from semfov.motion import CameraMotion, CameraStep, KnownPoses, Motion
 from semfov.motion.patches import PatchFlow
@@ -14,15 +16,22 @@ class StreamCamera:
     """How the camera moves between frames: by the poses that are given, or estimated from the frames.
 
     The first frame decides: with a pose `_poses` is made, and without one `_estimate`, where the camera is followed.
+    Either way `flow` follows objects. It takes all of a frame, so that with poses no picture is shown to it that is read
+    window by window.
 
     Args:
         follows: whether its motion is estimated from the frames, where no poses are given.
+
+    Attributes:
+        flow: follows objects that move on their own, from the first frame on; None where the camera's motion is not
+            known, and without OpenCV.
     """
 
     def __init__(self, *, follows: bool) -> None:
         self._follows = follows
         self._estimate: CameraMotion | None = None
         self._poses: KnownPoses | None = None
+        self.flow: PatchFlow | None = None
         self._is_first = True  # whether no frame was seen
 
     @property
@@ -30,26 +39,41 @@ class StreamCamera:
         """Whether its motion is known at all, from the first frame on."""
         return self._estimate is not None or self._poses is not None
 
-    @property
-    def flow(self) -> PatchFlow | None:
-        """What follows objects that move on their own; None where the camera's motion is not estimated."""
-        return None if self._estimate is None else self._estimate.flow
-
     def step(self, view: WindowView, pose: Motion | ArrayLike | None) -> CameraStep | None:
         """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
         is_pose_expected = self._is_first or (self._poses is None) == (pose is None)
         check(is_pose_expected, "pose", "a pose of each frame, or of none", pose)
-        # Without OpenCV a warning is given, which does not concern a camera whose poses are known.
-        if self._is_first and pose is None and self._follows:
-            self._estimate = _camera_motion()
+        if self._is_first:
+            self._begin(view, is_pose_known=pose is not None)
         self._is_first = False
-        if pose is not None:
-            self._poses = self._poses or KnownPoses()
+        if pose is not None and self._poses is not None:
+            if self.flow is not None:
+                self.flow.step(_pixels(view))
             return self._poses.step(pose)
-        if self._estimate is None:
-            return None
-        width, height = view.picture.size
-        return self._estimate.step(view.picture.pixels((0, 0, width, height)))
+        return None if self._estimate is None else self._estimate.step(_pixels(view))
+
+    def _begin(self, view: WindowView, *, is_pose_known: bool) -> None:
+        """Make what tells the motion of the camera, and what follows objects."""
+        if is_pose_known:
+            self._poses = KnownPoses()
+            self.flow = _patch_flow() if isinstance(view.picture, ArrayPicture) else None
+        elif self._follows:
+            self._estimate = _camera_motion()
+            self.flow = None if self._estimate is None else self._estimate.flow
+
+
+def _pixels(view: WindowView) -> NDArray[np.uint8]:
+    """Read all of a frame, `(h, w, 3)` bytes."""
+    width, height = view.picture.size
+    return view.picture.pixels((0, 0, width, height))
+
+
+def _patch_flow() -> PatchFlow | None:
+    """Make what follows objects; without OpenCV nothing does, and no warning, as known poses need none."""
+    try:
+        return PatchFlow()
+    except InputError:
+        return None
 
 
 def _camera_motion() -> CameraMotion | None:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from semfov.errors import needing
 from semfov.motion.agreement import agreement, blocks_of_rival, largest_change
 from semfov.motion.flow import LEAST_CORNERS, corners_stay, flow_between, rival_between
-from semfov.motion.frames import GreyFrame
+from semfov.motion.frames import GreyFrame, in_grey
 from semfov.motion.motion import Motion
 from semfov.motion.patches import PatchFlow
 from semfov.motion.residual import coarse_shift, share_off, whole_shift
@@ -185,8 +185,9 @@ class CameraMotion:
         Returns:
             The motion since the last frame; none for the first frame, and where the two do not fit together.
         """
-        present = GreyFrame(self._cv2, frame)
-        self.flow.step(present.fine, present.fine_ratio)
+        grey = in_grey(self._cv2, frame)
+        self.flow.step(grey)
+        present = GreyFrame(self._cv2, grey)
         last = self._last
         self._last = present
         if last is None or self._key is None:

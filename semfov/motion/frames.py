@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LONGER = 480  # most pixels of the longer side of the reduced frames
-_FINE_LONGER = 960  # the same of those that are less reduced
 _CORNERS = 150  # most corners that are followed
 _QUALITY = 0.01  # least quality of a corner, as a share of the best one's
 _APART = 8  # least distance between two corners, in reduced pixels
@@ -28,16 +27,11 @@ class GreyFrame:
     Attributes:
         grey: `(h, w)` bytes.
         ratio: `(x, y)`, pixels of the frame for one of the reduced one.
-        fine: the frame less reduced, for what is small in it, `(H, W)` bytes.
-        fine_ratio: `(x, y)`, pixels of the frame for one of these.
     """
 
     def __init__(self, cv2: ModuleType, frame: NDArray[np.uint8]) -> None:
         self._cv2 = cv2
-        # A third of the values is left to average where the frame is grey first.
-        full = np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
-        self.grey, self.ratio = _reduced(cv2, full, _LONGER)
-        self.fine, self.fine_ratio = _reduced(cv2, full, _FINE_LONGER)
+        self.grey, self.ratio = reduced_grey(cv2, frame, _LONGER)
 
     @cached_property
     def corners(self) -> NDArray[np.float32]:
@@ -98,17 +92,26 @@ class GreyFrame:
         return [np.array([across[beyond][n], down[beyond][n]], np.float64) for n in order]
 
 
-def _reduced(cv2: ModuleType, full: NDArray[np.uint8], longer: int) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """Reduce a frame by whole pixels.
+def in_grey(cv2: ModuleType, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Convert a frame `(h, w, 3)` to grey, `(h, w)` bytes; a grey one stays as it is."""
+    return frame if frame.ndim == 2 else np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def reduced_grey(
+    cv2: ModuleType, frame: NDArray[np.uint8], longer: int
+) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """Reduce a frame by whole pixels, and to grey.
 
     Args:
         cv2: OpenCV.
-        full: `(h, w)` bytes.
+        frame: `(h, w, 3)` bytes, or `(h, w)` of a grey one.
         longer: most pixels of the longer side of the copy.
 
     Returns:
         The copy, and `(x, y)`, pixels of the frame for one of it.
     """
+    # A third of the values is left to average where the frame is grey first.
+    full = in_grey(cv2, frame)
     height, width = full.shape
     factor = max(1, math.ceil(max(width, height) / longer))
     size = max(1, width // factor), max(1, height // factor)

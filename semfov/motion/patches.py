@@ -7,6 +7,7 @@
 All tiles have one size, so that one call of the flow follows small objects and large ones, and each by its whole box.
 """
 
+from functools import cached_property
 from types import ModuleType
 from typing import NamedTuple
 
@@ -14,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.errors import needing
+from semfov.motion.frames import reduced_grey
 
 _Bytes = NDArray[np.uint8]
 _Floats = NDArray[np.float64]
 _Points = NDArray[np.float32]
 
+_LONGER = 960  # most pixels of the longer side of the copies of frames in which patches are followed
 _TILE = 32  # side of a tile in its own pixels
 _AT_ONCE = 512  # most tiles one below the other: OpenCV resamples to less than 32,767 rows
 _SURROUNDINGS = 2  # sides of a tile in those of its box
@@ -49,6 +52,27 @@ class FollowedPatches(NamedTuple):
     changes: _Floats
 
 
+class _Copy(NamedTuple):
+    """A frame reduced in size and to grey, `(h, w)` bytes, and `(x, y)`, pixels of the frame for one of it."""
+
+    grey: _Bytes
+    ratio: _Floats
+
+
+class _Frame:
+    """A frame, whose copy is made when a patch is followed: no other frame takes its time."""
+
+    def __init__(self, cv2: ModuleType, pixels: _Bytes) -> None:
+        self._cv2 = cv2
+        self._pixels = pixels
+
+    @cached_property
+    def copy(self) -> _Copy:
+        """The frame, reduced."""
+        grey, ratio = reduced_grey(self._cv2, self._pixels, _LONGER)
+        return _Copy(grey, np.array(ratio))
+
+
 class PatchFlow:
     """Follows the boxes of objects from one frame to the next by pyramidal Lucas–Kanade flow (Bouguet, 2001).
 
@@ -66,20 +90,17 @@ class PatchFlow:
         with needing("OpenCV", "motion of objects", "opencv-python-headless"):
             import cv2
         self._cv2: ModuleType = cv2
-        self._before: _Bytes | None = None
-        self._present: _Bytes | None = None
-        self._ratio = np.ones(2)
+        self._before: _Frame | None = None
+        self._present: _Frame | None = None
 
-    def step(self, grey: _Bytes, ratio: tuple[float, float] = (1.0, 1.0)) -> None:
-        """Take the next frame.
+    def step(self, frame: _Bytes) -> None:
+        """Take the next frame, which must stay as it is until the one after the next is taken.
 
         Args:
-            grey: `(h, w)` bytes, the frame or a reduced copy.
-            ratio: `(x, y)`, pixels of the frame for one of the copy.
+            frame: `(h, w, 3)` bytes, or `(h, w)` of a grey one.
         """
         self._before = self._present
-        self._present = grey
-        self._ratio = np.array(ratio)
+        self._present = _Frame(self._cv2, frame)
 
     def follow(self, boxes: _Floats, expected: _Floats) -> FollowedPatches:
         """Follow boxes from the frame before into the present one.
@@ -93,26 +114,33 @@ class PatchFlow:
         """
         places = expected.copy()
         changes = np.full(len(boxes), np.inf)
-        if self._before is None or self._present is None or self._before.shape != self._present.shape:
+        if self._before is None or self._present is None or not len(boxes):
             return FollowedPatches(places, np.isfinite(changes), changes)
-        centres = (boxes[:, :2] + boxes[:, 2:]) / 2 / self._ratio
-        sides = (boxes[:, 2:] - boxes[:, :2]) / self._ratio
-        guesses = expected / self._ratio
-        size = np.array(self._present.shape[::-1])
+        before = self._before.copy
+        present = self._present.copy
+        if before.grey.shape != present.grey.shape:
+            return FollowedPatches(places, np.isfinite(changes), changes)
+        ratio = present.ratio
+        centres = (boxes[:, :2] + boxes[:, 2:]) / 2 / ratio
+        sides = (boxes[:, 2:] - boxes[:, :2]) / ratio
+        guesses = expected / ratio
+        size = np.array(present.grey.shape[::-1])
         is_whole = _lie_inside(centres, sides, size) & _lie_inside(guesses, sides, size)
         rows = np.flatnonzero(is_whole & (sides >= _SMALLEST).all(-1))
         for start in range(0, len(rows), _AT_ONCE):
             part = rows[start : start + _AT_ONCE]
-            ends, changes[part] = self._flow(centres[part], sides[part], guesses[part])
+            ends, changes[part] = self._flow(before.grey, present.grey, centres[part], sides[part], guesses[part])
             is_followed = np.isfinite(changes[part])
-            places[part[is_followed]] = (ends * self._ratio)[is_followed]
+            places[part[is_followed]] = (ends * ratio)[is_followed]
         return FollowedPatches(places, np.isfinite(changes), changes)
 
-    def _flow(self, centres: _Floats, sides: _Floats, guesses: _Floats) -> tuple[_Floats, _Floats]:
+    def _flow(
+        self, before: _Bytes, present: _Bytes, centres: _Floats, sides: _Floats, guesses: _Floats
+    ) -> tuple[_Floats, _Floats]:
         """Follow boxes that both frames show, in their pixels; returns their centres and changes, infinite for none."""
         steps = sides * (_SURROUNDINGS / _TILE)  # pixels of the frame for one of a tile
-        first = self._tiles(self._before, centres, steps)
-        second = self._tiles(self._present, guesses, steps)
+        first = self._tiles(before, centres, steps)
+        second = self._tiles(present, guesses, steps)
         # The middles of the tiles, one below the other: where boxes are, and where they are expected.
         middles = np.full((len(sides), 2), (_TILE - 1) / 2, np.float32)
         middles[:, 1] += _TILE * np.arange(len(sides))
@@ -126,7 +154,7 @@ class PatchFlow:
         are_followed = is_found & is_found_back & is_near & is_same & (contrast >= _LEAST_CONTRAST)
         return guesses + shifts * steps, np.where(are_followed, share, np.inf)
 
-    def _tiles(self, frame: _Bytes | None, centres: _Floats, steps: _Floats) -> _Bytes:
+    def _tiles(self, frame: _Bytes, centres: _Floats, steps: _Floats) -> _Bytes:
         """Resample parts of a frame, with some of its pixels for one of a tile `(N, 2)`, to tiles, `(32 N, 32)`."""
         count = len(centres)
         offsets = np.arange(_TILE) - (_TILE - 1) / 2

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semfov.motion.frames import reduced_grey
 from semfov.motion.patches import PatchFlow
 from tests.motion.test_camera import scene
 
@@ -40,10 +41,10 @@ def paste(frame, patch, x, y):
     frame[y : y + high, x : x + wide] = patch
 
 
-def followed(pair, boxes=BOXES, expected=CENTRES + GROUND_SHIFT, ratio=(1.0, 1.0)):
+def followed(pair, boxes=BOXES, expected=CENTRES + GROUND_SHIFT):
     flow = PatchFlow()
     for frame in pair:
-        flow.step(frame, ratio)
+        flow.step(frame)
     return flow.follow(boxes, expected)
 
 
@@ -55,11 +56,32 @@ def test_each_patch_is_followed_to_within_a_pixel(seed):
 
 
 def test_places_are_those_of_the_frame_where_a_reduced_copy_is_followed():
-    pair = [cv2.resize(frame, (260, 180), interpolation=cv2.INTER_AREA) for frame in frames(SHIFTS)]
-    found = followed(pair, ratio=(2.0, 2.0))
-    errors = np.abs(found.places - (CENTRES + GROUND_SHIFT + SHIFTS)).max(-1)
+    """Frames larger than 960 px are reduced."""
+    pair = [cv2.resize(frame, (1560, 1080), interpolation=cv2.INTER_LINEAR) for frame in frames(SHIFTS)]
+    found = followed(pair, 3 * BOXES, 3 * (CENTRES + GROUND_SHIFT))
+    errors = np.abs(found.places - 3 * (CENTRES + GROUND_SHIFT + SHIFTS)).max(-1)
     assert found.are_followed.sum() >= len(PLACES) - 1
-    assert errors[found.are_followed].max() < 1
+    assert errors[found.are_followed].max() < 2
+
+
+def test_frames_in_colour_are_followed_as_grey_ones():
+    pair = frames(SHIFTS)
+    grey = followed(pair)
+    coloured = followed([cv2.cvtColor(frame, cv2.COLOR_GRAY2RGB) for frame in pair])
+    np.testing.assert_allclose(coloured.places, grey.places, atol=0.01)
+
+
+def test_a_frame_takes_no_time_where_nothing_is_followed(monkeypatch):
+    """Neither its copy nor that of the next frame is made, until a box is followed into it."""
+    reduced = []
+    monkeypatch.setattr(
+        "semfov.motion.patches.reduced_grey", lambda *parts: reduced.append(len(parts)) or reduced_grey(*parts)
+    )
+    flow = PatchFlow()
+    for number, frame in enumerate([*frames(SHIFTS), frames(SHIFTS)[0]]):
+        flow.step(frame)
+        flow.follow(BOXES if number == 2 else BOXES[:0], CENTRES if number == 2 else CENTRES[:0])
+        assert len(reduced) == (2 if number == 2 else 0)
 
 
 def test_a_patch_that_stays_has_not_changed():

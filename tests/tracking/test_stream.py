@@ -1,10 +1,12 @@
 """Tracks of an agent's stream: numbers, files of MOTChallenge, Supervision, and drawings."""
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
 from semfov import WindowEye, ZoomAgent
+from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 from semfov.paths import WindowMoment
 from semfov.settings import StreamSettings
@@ -107,3 +109,28 @@ def test_several_passes_at_a_frame_are_looks_without_time_between_them():
     # A trail has one place of each frame.
     known = (~torch.from_numpy(moment.tracks.trail[..., 0]).isnan()).sum(-1)
     assert int(known.max()) <= 6
+
+
+def textured_frames(count, camera_step):
+    """A red square with texture that moves by 5 and 3 px a frame in a scene over which the camera moves."""
+    ground = scene(2, side=1100) // 2 + 40
+    square = np.zeros((48, 48, 3), np.uint8)
+    square[..., 0] = np.kron(np.random.default_rng(3).integers(190, 256, (6, 6)), np.ones((8, 8)))
+    for number in range(count):
+        view = ground.copy()
+        x, y = 400 + 5 * number, 420 + 3 * number
+        view[y : y + 48, x : x + 48] = square
+        left, top = 20 + number * camera_step[0], 20 + number * camera_step[1]
+        yield view[top : top + 768, left : left + 1024], Motion.similarity(shift=(20 - left, 20 - top))
+
+
+@pytest.mark.parametrize("is_pose_given", [False, True])
+def test_an_object_is_followed_by_flow_with_known_poses_too(is_pose_given):
+    """After two frames its velocity is known as well as flow tells it: two detections tell it half as well."""
+    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2)).eval()
+    episode = agent.stream(None, (RED,), StreamSettings(), follows=True)
+    for frame, pose in textured_frames(2, (4, 2)):
+        moment = episode.step(frame, pose=pose if is_pose_given else None)
+    (velocity,) = moment.tracks.velocities.tolist()
+    assert velocity == pytest.approx([5 / 0.04, 3 / 0.04], abs=40)
+    assert moment.tracks.kinematics.covariance[0, 1, 1] ** 0.5 < 30
