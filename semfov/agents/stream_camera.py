@@ -16,8 +16,8 @@ class StreamCamera:
     """How the camera moves between frames: by the poses that are given, or estimated from the frames.
 
     The first frame decides: with a pose `_poses` is made, and without one `_estimate`, where the camera is followed.
-    Either way `flow` follows objects. It takes all of a frame, so that with poses no picture is shown to it that is read
-    window by window.
+    Either way `flow` follows objects. It reads all of a frame, so that with poses it is shown those alone that are in
+    memory.
 
     Args:
         follows: whether its motion is estimated from the frames, where no poses are given.
