@@ -23,7 +23,7 @@ OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 GO_ON, FOUND, ABSENT, UNDECIDED = range(len(OUTCOMES))
 
 _NEARLY = 0.9  # share of the largest probability of any cell from which on a fixated cell counts as the target's
-_ABSENT = 0.5  # presence below which the target of a search without a find is absent
+EVEN_CHANCE = 0.5  # presence below which the target of a search without a find is absent
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def settle(presence: Tensor, located: Tensor, hit_chance: Tensor, thresholds: Th
         `(A,)`, numbers of `OUTCOMES`, `GO_ON` for a search that goes on.
     """
     is_found = (presence >= thresholds.confirm) & located
-    without_find = torch.where(presence < _ABSENT, ABSENT, UNDECIDED)
+    without_find = torch.where(presence < EVEN_CHANCE, ABSENT, UNDECIDED)
     unfound = torch.where(hit_chance < thresholds.stop_below, without_find, GO_ON)
     return torch.where(is_found, FOUND, unfound)
 
@@ -255,7 +255,7 @@ def final_outcome(places: Sequence[float], presence: float, confirm: float) -> i
     """
     if places and max(places) >= confirm:
         return FOUND
-    return ABSENT if presence < _ABSENT else UNDECIDED
+    return ABSENT if presence < EVEN_CHANCE else UNDECIDED
 
 
 def check_thresholds(confirm: float | None, stop_below: float | None, closer: int | None = None) -> None:

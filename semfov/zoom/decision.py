@@ -1,6 +1,8 @@
 """Decisions of a search by windows: the facts about its looks, and the outcome after each and after closer looks."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -19,6 +21,7 @@ from semfov.decision import (
     Verifier,
     settle,
 )
+from semfov.decision.rule import EVEN_CHANCE
 from semfov.decision.state import DecisionState
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
@@ -274,6 +277,40 @@ class DecisionsByScore(WindowDecisions):
         return highest, box
 
 
+class LastingAbsence:
+    """Keeps a stream's decision `absent` while the windows that have shown nothing are looked at anew.
+
+    A window is free for another look when half of what it showed is left, so that the search goes on, and `absent`
+    would come and go before a scene in which nothing changes. It stays for as long as a look counts, unless the picture
+    rather holds the target, or the camera has lost the scene.
+    """
+
+    def __init__(self, forgetting: Forgetting | None) -> None:
+        fades = forgetting is not None and forgetting.rate > 0
+        self._longest = forgetting.span if forgetting is not None and fades else 0.0
+        self._age = math.inf  # seconds since the target was absent
+
+    def wait(self, passed: float) -> None:
+        """Let seconds pass."""
+        self._age += passed
+
+    def end(self) -> None:
+        """Let it end, as the scene is another one."""
+        self._age = math.inf
+
+    def see(self, decision: Decision | None) -> None:
+        """Take the decision after a look."""
+        if decision is None or decision.outcome == "found" or decision.probability >= EVEN_CHANCE:
+            self._age = math.inf
+        elif decision.outcome == "absent":
+            self._age = 0.0
+
+    def kept(self, decision: Decision) -> Decision:
+        """Make a decision that is open `absent` where it was so a short time ago."""
+        is_open = decision.outcome == "undecided" and decision.probability < EVEN_CHANCE
+        return replace(decision, outcome="absent") if is_open and self._age < self._longest else decision
+
+
 class DecisionsByPresence(WindowDecisions):
     """Decisions of a search by its evidence, without closer looks (`semfov.decision.settle`).
 
@@ -282,7 +319,10 @@ class DecisionsByPresence(WindowDecisions):
     Invariant: `_presence` is that of the present `_facts`, or None; what changes these clears it.
     """
 
-    def __init__(self, facts: SearchFacts, thresholds: Thresholds, prior: Prior) -> None:
+    def __init__(
+        self, facts: SearchFacts, thresholds: Thresholds, prior: Prior, forgetting: Forgetting | None = None
+    ) -> None:
+        self._absence = LastingAbsence(forgetting)
         self.thresholds = thresholds
         self.prior = prior
         self.criterion = f"p is {thresholds.confirm:g} and a detection shows the target"
@@ -301,6 +341,8 @@ class DecisionsByPresence(WindowDecisions):
         if not self._goes_on():
             # With one pass left no other look follows a closer one, so that less probable places are due, too.
             self._judge(step, number, last=step.next_value == 0 or room <= 1)
+        if self._facts.latest:
+            self._absence.see(self._latest_decision)
 
     def _telling(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook]) -> list[WindowLook]:
         """List the looks that tell of the picture; a closer look at a photograph tells of its place alone."""
@@ -321,13 +363,24 @@ class DecisionsByPresence(WindowDecisions):
 
     @property
     def decision(self) -> Decision | None:
+        decision = self._latest_decision
+        return None if decision is None else self._absence.kept(decision)
+
+    @property
+    def _latest_decision(self) -> Decision | None:
+        """The decision by the looks that count now."""
         if not self._facts.looks:
             return None
         outcome = OUTCOMES[self.outcome]
         box = self._facts.box if outcome == "found" else None
         return Decision(outcome, self.prior(self._fitted_presence()), None, box, confirm=self.thresholds.confirm)
 
+    def wait(self, passed: float) -> None:
+        self._absence.wait(passed)
+
     def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
+        if camera.motion is None:
+            self._absence.end()
         looks = [] if camera.motion is None or self._step is None else self._telling(self._step, kept)
         if looks:
             self._facts.see(looks)
@@ -352,7 +405,7 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def __init__(
         self, facts: SearchFacts, prior: Prior, verifier: PlaceVerifier[TargetFacts], places: CandidateBoxes
     ) -> None:
-        super().__init__(facts, verifier.thresholds, prior)
+        super().__init__(facts, verifier.thresholds, prior, places.forgetting)
         self.frame = facts.belief.lattice.size
         self.verifier = verifier
         self.places = places  # those of the verifier
@@ -392,17 +445,20 @@ class DecisionsByCloserLooks(DecisionsByPresence):
         self.outcome = self.verifier.outcome()
 
     @property
-    def decision(self) -> Decision | None:
-        return self.verifier.decision() if self.looks else super().decision
+    def _latest_decision(self) -> Decision | None:
+        return self.verifier.decision() if self.looks else super()._latest_decision
 
     def decision_if_ended_now(self) -> Decision | None:
-        return self.verifier.decision_if_ended_now() if self.looks else super().decision
+        return self.verifier.decision_if_ended_now() if self.looks else super().decision_if_ended_now()
 
     def wait(self, passed: float) -> None:
+        super().wait(passed)
         self.verifier.wait(passed)
 
     def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
         self.verifier.follow(camera, self.frame)
+        if camera.motion is None:
+            self._absence.end()
         candidate = self.candidate
         if candidate is not None and not bool(inside_frame(candidate.box, self.frame)):
             self.verifier.candidate = None  # a closer look would show another place
@@ -450,7 +506,7 @@ def decisions_of(
         most = settings.closer
     thresholds = (fitted or _DEFAULTS).changed(stop_below=settings.stop_below)
     if not most or of_places is None:
-        return DecisionsByPresence(facts, thresholds.changed(settings.confirm), prior)
+        return DecisionsByPresence(facts, thresholds.changed(settings.confirm), prior, forgetting)
     of_places = of_places.changed(settings.confirm, thresholds.stop_below)
     places: CandidateBoxes
     verifier: PlaceVerifier[TargetFacts]

@@ -11,7 +11,7 @@ import torch
 from semfov import Detections, WindowEye, ZoomAgent
 from semfov.belief.prior import Prior
 from semfov.belief.verification import Verification, closer_features
-from semfov.decision import OUTCOMES, Verifier
+from semfov.decision import OUTCOMES, Decision, Verifier
 from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
 from semfov.motion import CameraStep, Motion
@@ -21,11 +21,12 @@ from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.certainty import FACTS, Certainty
 from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, TargetFacts, closer_window, look_closely
-from semfov.zoom.decision import ObjectVerifier, SearchFacts
+from semfov.zoom.decision import LastingAbsence, ObjectVerifier, SearchFacts
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
 from semfov.zoom.objects import probable_objects
 from semfov.zoom.slices import ranked, raw, usual_slices
+from tests.motion.test_camera import scene
 from tests.refusals import refused, unusable
 from tests.small import Coloured
 
@@ -371,6 +372,56 @@ def test_a_place_of_a_stream_stays_as_probable_as_the_object_that_looks_show_the
     left = forgetting.share_left(0.9 * forgetting.span)
     odds = left * math.log(9) + (1 - left) * math.log(3 / 7)
     assert judge.decision().place == pytest.approx(1 / (1 + math.exp(-odds)), abs=1e-3)
+
+
+def still_stream(frames):
+    """What a search of a stream decides of each frame of a still picture without the target, whose looks fade soon."""
+    picture = np.repeat(scene(2, side=1100)[:768, :1024].mean(-1, keepdims=True) / 4 + 60, 3, -1).astype(np.uint8)
+    live = ZoomAgent(WindowEye(Sized()), evidence()).stream(1, (), StreamSettings(rate=2.0, stop_below=0.35))
+    return [live.step(picture).decision for _ in range(frames)]
+
+
+def test_a_still_picture_that_lacks_the_target_lacks_it_from_then_on():
+    """Windows are free for another look after .35 s, and a search might go on there."""
+    outcomes = [decision.outcome for decision in still_stream(40)]
+    first = outcomes.index("absent")
+    assert 0 < first < 20
+    assert set(outcomes[:first]) == {"undecided"}
+    assert set(outcomes[first:]) == {"absent"}
+
+
+ABSENT, OPEN, LIKELY = Decision("absent", 0.3), Decision("undecided", 0.4), Decision("undecided", 0.6)
+
+
+@pytest.mark.parametrize(
+    ("decisions", "seconds", "outcome"),
+    [
+        ((ABSENT,), 0.9, "absent"),
+        ((ABSENT, OPEN), 0.9, "absent"),
+        ((OPEN,), 0.0, "undecided"),
+        ((ABSENT,), 1.1, "undecided"),  # no look of that time counts any more
+        ((ABSENT, LIKELY), 0.0, "undecided"),
+        ((ABSENT, Decision("found", 0.9)), 0.0, "undecided"),
+    ],
+)
+def test_a_target_stays_absent_while_a_look_counts_unless_something_says_otherwise(decisions, seconds, outcome):
+    absence = LastingAbsence(Forgetting(math.log(2)))  # looks count for a second
+    for decision in decisions:
+        absence.see(decision)
+    absence.wait(seconds)
+    assert absence.kept(OPEN) == Decision(outcome, 0.4)
+    assert absence.kept(LIKELY) == LIKELY
+
+
+def test_an_absence_ends_with_its_scene_and_lasts_in_no_picture():
+    absence = LastingAbsence(Forgetting(1.0))
+    absence.see(ABSENT)
+    absence.end()
+    assert absence.kept(OPEN) == OPEN
+    for forgetting in (None, Forgetting()):
+        absence = LastingAbsence(forgetting)
+        absence.see(ABSENT)
+        assert absence.kept(OPEN) == OPEN
 
 
 def test_thresholds_of_places_are_saved_with_the_evidence(tmp_path):
