@@ -132,6 +132,22 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """Find what an earlier look shows of a candidate as closely as a closer look would; None where none does."""
         return None
 
+    def closer_magnification(self, candidate: CandidatePlace) -> float:
+        """Compute the magnification of a closer look at a candidate; 1 where all looks are alike."""
+        return 1.0
+
+    def places_exactly(self, box: Tensor, magnification: float) -> bool:
+        """Tell whether the last look places an object about as exactly as a closer look of some magnification did.
+
+        Args:
+            box: `(4,)`, where the object was.
+            magnification: of the closer look.
+
+        Returns:
+            Whether the look is as close, within an octave, and its border does not cut the object.
+        """
+        return True
+
     def shows_nothing_new(self, candidate: CandidatePlace) -> bool:
         """Tell whether no look shows more of a candidate than the one behind the probability of the picture."""
         return False

@@ -27,9 +27,10 @@ _FLOOR = 1e-6
 
 
 class _Verdict(NamedTuple):
-    """A closer look at a place, the seconds since then, and whether the present frame shows the place."""
+    """A closer look at a place, its magnification, the seconds since then, and whether the present frame shows it."""
 
     look: CloseUp
+    magnification: float
     age: float = 0
     in_view: bool = True
 
@@ -146,6 +147,9 @@ class PlaceVerifier(ABC, Generic[LookType]):
         box = follow_target(verdict.look.box, self.places.detections, verdict.look.target)
         if box is verdict.look.box:  # no detection shows it
             return verdict
+        fits = float(box_iou(box[None], verdict.look.box[None])) >= SAME_OBJECT_IOU
+        if fits and not self.places.places_exactly(verdict.look.box, verdict.magnification):
+            return verdict._replace(in_view=True)  # else the box would jump to and fro though its object stands
         look = replace(verdict.look, box=box, cell=self.places.cell(box))
         return verdict._replace(look=look, in_view=True)
 
@@ -169,7 +173,7 @@ class PlaceVerifier(ABC, Generic[LookType]):
         look = self.places.record(judgement.box, judgement.place, judgement.presence)
         # A place that was free to be examined again has a new verdict now.
         self.verdicts = [verdict for verdict in self.verdicts if not self._is_replaced(verdict, look)]
-        self.verdicts.append(_Verdict(look))
+        self.verdicts.append(_Verdict(look, self.places.closer_magnification(candidate)))
         self._judged = None
         self._choose()
         return look

@@ -30,6 +30,7 @@ MOST_IN_PHOTOGRAPH = 3
 
 _WHOLE = 0.9  # share of a picture from which on a window shows no more than the look at the whole
 
+_AS_CLOSE = 0.5  # share of the magnification of a closer look from which on a look places objects about as exactly
 _SMALLEST = 1e-4  # probability below which, and below 1 less it, one counts as this in log odds
 
 
@@ -77,6 +78,7 @@ class TargetFacts(NamedTuple):
         presence: probability that the picture holds the target.
         best: highest score of the target in any look.
         hit_chance: chance that the best remaining window shows the target.
+        window: that of the look; None if it does not matter.
     """
 
     detections: Detections
@@ -84,6 +86,7 @@ class TargetFacts(NamedTuple):
     presence: float
     best: float
     hit_chance: float
+    window: Window | None = None
 
 
 class _Scored(NamedTuple):
@@ -189,6 +192,22 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         """Find what the look at the window of a place showed; None where there was none."""
         look = self._shown.get(self._showing(candidate))
         return None if look is None else look.detections
+
+    def closer_magnification(self, candidate: CandidatePlace) -> float:
+        """Compute the magnification of the window of a closer look."""
+        return self._showing(candidate).fixation[2]
+
+    def places_exactly(self, box: Tensor, magnification: float) -> bool:
+        """Tell whether the last look is about as close as a closer look, and its border does not cut a box."""
+        window = self._look.window
+        if window is None:
+            return True
+        left, top, right, bottom = window.region(self._lattice)
+        width, height = self._lattice.size
+        x1, y1, x2, y2 = box.tolist()
+        is_inside_across = (x1 >= left or left <= 0) and (x2 <= right or right >= width)
+        is_inside_down = (y1 >= top or top <= 0) and (y2 <= bottom or bottom >= height)
+        return is_inside_across and is_inside_down and window.fixation[2] >= _AS_CLOSE * magnification
 
     def shows_nothing_new(self, candidate: CandidatePlace) -> bool:
         """Tell whether the look at the whole of this frame, which is kept, shows a candidate as closely as any look."""

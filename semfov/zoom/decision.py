@@ -419,7 +419,8 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""
         candidates = step.look.candidates
-        look = TargetFacts(candidates, number, self._fitted_presence(), self._facts.best, self._fitted_chance)
+        presence = self._fitted_presence()
+        look = TargetFacts(candidates, number, presence, self._facts.best, self._fitted_chance, step.look.window)
         self.verifier.see(look, last=last)
         self._examine_shown()
 

@@ -374,6 +374,49 @@ def test_a_place_of_a_stream_stays_as_probable_as_the_object_that_looks_show_the
     assert judge.decision().place == pytest.approx(1 / (1 + math.exp(-odds)), abs=1e-3)
 
 
+def found_box(shift, window):
+    """The box of an object that was found at `ONE`, after a look at a window that shows it shifted to the right."""
+    whole = replace(seen([ONE], [0.3]), window=Window.overview(LATTICE))
+    facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1), latest=True)
+    facts.add(whole)
+    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE, Forgetting(0.25)), AT, 9)
+    judge.see(TargetFacts(whole.detections, 1, facts.presence(), 0.3, 0.0, whole.window), last=True)
+    close = replace(seen([ONE], [0.9]), window=closer_window(LATTICE, judge.candidate.box))
+    facts.add(close)
+    judge.examine(close.detections)
+    judge.wait(0.04)
+    moved = seen([[ONE[0] + shift, ONE[1], ONE[2] + shift, ONE[3]]], [0.8])
+    judge.see(TargetFacts(moved.detections, 2, facts.presence(), facts.best, 0.0, window))
+    return (judge.decision().box - torch.tensor(ONE)).tolist()
+
+
+def test_a_found_object_is_moved_by_looks_that_place_it_as_exactly():
+    """Coarse looks, and windows whose border cuts it, move it only where its box fits no more."""
+    width = ONE[2] - ONE[0]
+    closest = LATTICE.levels - 1
+    across, down = LATTICE.places(closest)
+    close = [Window.on(LATTICE, (closest, x, y)) for y in range(down) for x in range(across)]
+    x1, _, x2, _ = ONE
+    holding, cutting = [], []
+    for window in close:
+        left, top, right, bottom = window.region(LATTICE)
+        if top <= ONE[1] and ONE[3] <= bottom:
+            (holding if left <= x1 and x2 <= right else cutting).append(window)
+    cutting = [window for window in cutting if x1 < window.region(LATTICE)[2] < x2 or x1 < window.region(LATTICE)[0] < x2]
+    assert holding
+    assert cutting
+    a_little, far = 0.2 * width, 0.4 * width  # overlaps of .67 and .43
+    for window, shift, expected in (
+        (Window.overview(LATTICE), a_little, 0.0),
+        (Window.overview(LATTICE), far, far),
+        (holding[0], a_little, a_little),
+        (cutting[0], a_little, 0.0),
+        (cutting[0], far, far),
+        (None, a_little, a_little),
+    ):
+        assert found_box(shift, window) == pytest.approx([expected, 0.0, expected, 0.0], abs=1e-3)
+
+
 def still_stream(frames):
     """What a search of a stream decides of each frame of a still picture without the target, whose looks fade soon."""
     picture = np.repeat(scene(2, side=1100)[:768, :1024].mean(-1, keepdims=True) / 4 + 60, 3, -1).astype(np.uint8)
