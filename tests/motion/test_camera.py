@@ -7,7 +7,7 @@ import torch
 
 from semfov.motion import CameraMotion, CameraStep, Motion
 from semfov.motion.agreement import blocks_of_rival
-from semfov.motion.frames import GreyFrame
+from semfov.motion.frames import GreyFrame, reduced_grey
 from semfov.motion.residual import coarse_shift, share_off, whole_shift
 
 WIDTH, HEIGHT = 640, 360
@@ -267,8 +267,9 @@ def test_reduced_frames_are_means_of_whole_pixels(size, grey, fine):
     """A rest at the right and below is left out, so that a pixel of the copy is as many of the frame everywhere."""
     pixels = np.random.default_rng(0).integers(0, 255, (*size, 3), np.uint8)
     frame = GreyFrame(cv2, pixels)
+    in_colour = reduced_grey(cv2, pixels, 960)
     whole = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float64)
-    for copy, ratio, factor in ((frame.grey, frame.ratio, grey), (frame.fine, frame.fine_ratio, fine)):
+    for copy, ratio, factor in ((frame.grey, frame.ratio, grey), (*in_colour, fine)):
         rows, columns = (side // factor for side in size)
         assert ratio == (factor, factor)
         blocks = whole[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
