@@ -181,9 +181,7 @@ class WindowSession:
     def _value_of_known(self, level: int) -> Cells:
         """Value windows of a level by the objects that are known, and may have moved."""
         assert self.tracker is not None
-        assert self.forgetting is not None
-        tracks = self.tracker.tracks
-        return value_of_windows(tracks, self.tracker.model, self.source.lattice, level, self.forgetting.rate)
+        return value_of_windows(self.tracker.tracks, self.tracker.model, self.source.lattice, level)
 
     def look(self) -> KeptLook | None:
         """Look at the next window, or closely at a place that seems to hold the target; None if no window is left."""

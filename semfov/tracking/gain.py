@@ -8,14 +8,12 @@ from semfov.tracking.tracks import Tracks
 from semfov.zoom.lattice import Lattice
 
 
-def value_of_windows(
-    tracks: Tracks, model: TrackingModel, lattice: Lattice, level: int, rate: float
-) -> NDArray[np.float32]:
+def value_of_windows(tracks: Tracks, model: TrackingModel, lattice: Lattice, level: int) -> NDArray[np.float32]:
     r"""Compute how many objects a look at each window of a level is expected to put right.
 
     An object is put right if it is there, the look shows it, and its box, or what is known of it, does not fit it any
     more. With the probability p that it is there, f that its box fits, and d that a look shows it, an object counts
-    t seconds after the last look that showed it for
+    t seconds after the last look that showed it, with a rate r (`TrackingModel.staleness`), for
 
     .. math:: p \, d \, \bigl(1 - f \, e^{-rt}\bigr)
 
@@ -27,7 +25,6 @@ def value_of_windows(
         model: what is assumed of looks.
         lattice: the windows.
         level: level of the windows.
-        rate: r, at which looks are forgotten, per second (`semfov.episode.Forgetting`).
 
     Returns:
         `(down, across)`, in objects.
@@ -35,7 +32,7 @@ def value_of_windows(
     across, down = lattice.places(level)
     values = np.zeros((down, across), np.float32)
     shown = model.detects(tracks.sides * lattice.magnifications[level])
-    gains = tracks.existence * shown * (1 - tracks.fits * np.exp(-rate * tracks.unseen))
+    gains = tracks.existence * shown * (1 - tracks.fits * np.exp(-model.staleness * tracks.unseen))
     # The first and the last window that hold a box: they start at a cell before it, and end at one after it.
     pitch = np.array(lattice.pitch)
     span = lattice.span(level)

@@ -46,6 +46,7 @@ class TrackingModel:
         score: :math:`e_1`.
         miss: w.
         again: :math:`\rho`.
+        staleness: rate at which what a look showed of an object counts less for the choice of looks, per second.
         loss: share of the objects that cease to be there in a second.
         least: probability below which an object is forgotten.
 
@@ -71,6 +72,7 @@ class TrackingModel:
     score: float = 1.2
     miss: float = 0.3
     again: float = 0.9
+    staleness: float = 0.25
     loss: float = 0.1
     least: float = 0.02
 

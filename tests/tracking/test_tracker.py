@@ -270,10 +270,10 @@ def test_a_window_is_worth_the_objects_that_it_puts_right():
     """By the definition: each object whose box lies in a window, one by one."""
     lattice, tracker = Lattice.over((1600, 1200), (400, 400)), Tracker()
     tracker.see(look(box_at(100, 200), box_at(900, 640), box_at(1500, 1100), region=(0, 0, 1600, 1200)))
-    tracker.follow(np.log(2) / 0.75)  # half of the evidence of the look is left
+    tracker.follow(np.log(2) / TrackingModel().staleness)  # half of the evidence of the look is left
     tracks = tracker.tracks
     for level in range(1, lattice.levels):
-        values = value_of_windows(tracks, tracker.model, lattice, level, rate=0.75)
+        values = value_of_windows(tracks, tracker.model, lattice, level)
         shown = tracker.model.detects(tracks.sides * lattice.magnifications[level])
         gains = tracks.existence * shown * (1 - tracks.fits * 0.5)
         across, down = lattice.places(level)
@@ -294,8 +294,8 @@ def test_an_object_that_stands_is_looked_at_again_though_its_box_fits():
             for _ in range(12):
                 tracker.follow(FRAME, flow=Standing())
     assert tracker.tracks.fits.min() > 0.98
-    values = value_of_windows(tracker.tracks, tracker.model, lattice, 1, rate=0.75)
-    assert values[:, 0].max() > 1.5 * values[:, -1].max() > 0.1
+    values = value_of_windows(tracker.tracks, tracker.model, lattice, 1)
+    assert values[:, 0].max() > 1.5 * values[:, -1].max() > 0.03
 
 
 class Standing(PatchFlow):
