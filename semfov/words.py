@@ -207,9 +207,7 @@ ADVICE = {**_ADVICE, **_ADVICE_FOR_OBJECTS, **_ADVICE_FOR_GAZE, "export": _PAGE_
 """What to do in place of an option or a command that others have, and `semfov` has not."""
 
 ADVICE_OF = {
-    **{
-        command: {**_ADVICE, **_ADVICE_FOR_BOXES, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")
-    },
+    **{command: {**_ADVICE, **_ADVICE_FOR_BOXES, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")},
     "app": _ADVICE_FOR_BOXES,
     "gaze": {**_ADVICE, **_ADVICE_FOR_BOXES, **_ADVICE_FOR_GAZE},
     "live": {

@@ -46,9 +46,9 @@ presence does (`settle`):
     >= confirm, without      presence, if a fixated      presence, if a detection    as a large picture
                              cell is nearly the most     shows the target
                              probable one
-    a closer look is due     at a cell from              at a box from the fitted    where the hit chance of
-                             Thresholds.place on, if a   confirm of presence on;     that place >= stop_below
-                             fixated cell is nearly the  at the last look from
+    a closer look is due     at a cell from              at an object that is        where the hit chance of
+                             Thresholds.place on, if a   likely, from LIKELY on; at  that place >= stop_below
+                             fixated cell is nearly the  the last look from
                              most probable one, or at    Thresholds.place on
                              the last look
     a closer look            tells of its place and of   is one more look: place     as a fovea, by windows
@@ -65,7 +65,7 @@ presence does (`settle`):
                              are made with the passes
                              that remain; it is over
     compared by, with        `Verifier.outcome` of       `ObjectVerifier.outcome`    `Verifier.outcome` of
-    closer looks             `CandidateCells`            of `CandidateBoxes`         `PhotographPlaces`
+    closer looks             `CandidateCells`            of `ObjectPlaces`           `PhotographPlaces`
     compared by, without     `decide`                    `settle`, called by         as a large picture
     closer looks                                         `DecisionsByPresence`
     outcome, if over         found with a place, or presence, from confirm on; else absent if presence < 1/2, else
@@ -74,7 +74,8 @@ presence does (`settle`):
     ending of the record     "decision" if it is over or found; else the limit, or "cells" / "shifts" of a fovea and
                              "windows" where none is left
 
-Candidate boxes and places are in `semfov.zoom.closer`, decisions by presence and by objects in `semfov.zoom.decision`.
+Places of large pictures are in `semfov.zoom.places`, those of photographs in `semfov.zoom.closer`, and decisions by
+windows in `semfov.zoom.decision`.
 
 Without fitted models no probability decides: a detection whose score is at least `confirm` is `found`
 (ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.
@@ -85,6 +86,7 @@ from semfov.decision.rule import (
     ABSENT,
     FOUND,
     GO_ON,
+    MOST_CLOSER,
     OUTCOMES,
     UNDECIDED,
     CloseUp,
@@ -103,7 +105,7 @@ from semfov.decision.rule import (
     place_known,
     settle,
 )
-from semfov.decision.verifier import MOST_CLOSER, Judgement, PlaceVerifier, Verifier
+from semfov.decision.verifier import Judgement, PlaceVerifier, Verifier
 
 __all__ = [
     "ABSENT",

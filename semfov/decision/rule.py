@@ -22,6 +22,9 @@ OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 
 GO_ON, FOUND, ABSENT, UNDECIDED = range(len(OUTCOMES))
 
+MOST_CLOSER = 2
+"""Number of closer looks after which a place is found that is probable enough; by default a search makes no more."""
+
 _NEARLY = 0.9  # share of the largest probability of any cell from which on a fixated cell counts as the target's
 EVEN_CHANCE = 0.5  # presence below which the target of a search without a find is absent
 
@@ -229,14 +232,18 @@ def most_evident_box(looks: Sequence[Detections], grid: Grid, target: int, cell:
     return box
 
 
-def found_at_once(places: Sequence[float], confirm: float) -> bool:
+def found_at_once(places: Sequence[float], confirm: float, made: int) -> bool:
     """Tell whether one place ends a search at once: it is sure, from halfway between `confirm` and 1 on.
+
+    After `MOST_CLOSER` closer looks it is one that is probable enough, from `confirm` on.
 
     Args:
         places: probabilities that the target is at each place, after closer looks.
         confirm: probability of a place from which on a search that is over has found its target.
+        made: number of closer looks.
     """
-    return bool(places) and max(places) >= (1 + confirm) / 2
+    least = confirm if made >= MOST_CLOSER else (1 + confirm) / 2
+    return bool(places) and max(places) >= least
 
 
 def final_outcome(places: Sequence[float], presence: float, confirm: float) -> int:

@@ -12,15 +12,21 @@ import torch
 from semfov.belief.verification import Verification, follow_target
 from semfov.data.inputs import FRAME
 from semfov.decision.candidates import CandidatePlace, CandidatePlaces, LookAt, LookType
-from semfov.decision.rule import FOUND, GO_ON, OUTCOMES, CloseUp, Decision, final_outcome, found_at_once
+from semfov.decision.rule import (
+    FOUND,
+    GO_ON,
+    MOST_CLOSER,
+    OUTCOMES,
+    CloseUp,
+    Decision,
+    final_outcome,
+    found_at_once,
+)
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_whole
 from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
-
-MOST_CLOSER = 2
-"""Number of closer looks after which a place is found that is probable enough; by default a search makes no more."""
 
 _SPANS = 2  # spans of `Forgetting` after which nothing is left of a verdict: a quarter of its evidence
 _FLOOR = 1e-6
@@ -259,9 +265,7 @@ class PlaceVerifier(ABC, Generic[LookType]):
         if self.places.exhaustive:
             return False
         places = [judged.probability for judged in judged_places]
-        if len(self._recent) >= MOST_CLOSER:
-            return bool(places) and max(places) >= self.thresholds.confirm
-        return found_at_once(places, self.thresholds.confirm)
+        return found_at_once(places, self.thresholds.confirm, len(self._recent))
 
     def _choose(self) -> None:
         """Choose the place that is to be looked at closely."""

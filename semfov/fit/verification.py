@@ -57,13 +57,16 @@ class VerifiedSearch(NamedTuple):
         """Return the end of the search at a threshold."""
         chances = [chance for chance, _ in self.places]
         for number, end in enumerate(self.ends, 1):
-            if found_at_once(chances[:number], confirm):
-                _, right = self.places[number - 1]
-                return SearchEnd(right, end)
+            if found_at_once(chances[:number], confirm, number):
+                return SearchEnd(self._is_surest_right(number), end)
         if final_outcome(chances, self.presence, confirm) != FOUND:
             return SearchEnd(None, self.looks)
-        _, right = self.places[chances.index(max(chances))]
-        return SearchEnd(right, self.looks)
+        return SearchEnd(self._is_surest_right(len(chances)), self.looks)
+
+    def _is_surest_right(self, number: int) -> bool:
+        """Tell whether the target is at the surest of the first places that were looked at closely."""
+        _, right = max(self.places[:number], key=lambda place: place[0])
+        return right
 
 
 class CloserLookSamples(NamedTuple):

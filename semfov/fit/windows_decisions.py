@@ -10,7 +10,6 @@ from torch import Tensor
 from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.data.scene import Annotation, Scenes
-from semfov.decision import MOST_CLOSER
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.thresholds import Bounds, choose_thresholds
 from semfov.fit.verification import VerifiedSearch, choose_confirm
@@ -24,10 +23,9 @@ from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes
 from semfov.runs.tables import table
 from semfov.runs.zoom_store import StoredWindowLooks
-from semfov.settings import DecisionSettings
-from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.places import SearchFacts
 
 _JUDGED = (1, 4, 8, 16)  # numbers of looks after which the probability of presence is evaluated
 
@@ -81,7 +79,7 @@ class MosaicSearch:
     def verified(self) -> VerifiedSearch:
         """Search again as an agent does, with its closer looks; a threshold `confirm` of 1 lets it make all of them."""
         names = tuple(map(str, range(self.model.classes + 1)))
-        task = WindowTask(Goal.of(names, self.target), self.model, DecisionSettings(closer=MOST_CLOSER))
+        task = WindowTask(Goal.of(names, self.target), self.model)
         path = WindowEpisode(task, self.source, EpisodeLimits(self.passes)).run()
         assert path.decision is not None
         closer = [(look, look.index) for look in path.closer if look.index is not None]

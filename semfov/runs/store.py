@@ -59,9 +59,7 @@ class DetectionStore(SceneStore):
 
     more: Mapping[str, Field] = {}  # names, shapes and ranges of the tensors that a look has besides its detections
 
-    def __init__(
-        self, folder: Path, what: Mapping[str, object], sources: Sequence[str], components: int
-    ) -> None:
+    def __init__(self, folder: Path, what: Mapping[str, object], sources: Sequence[str], components: int) -> None:
         fields = {
             "actions": Field(("N", self.width), torch.float64),
             "count": Field(("N",), torch.int64, low=0),

@@ -39,7 +39,7 @@ It is 2 where objects are there, or not, in pairs. Of people in photographs of t
 
 SEVERAL = 5  # the number of likely or clear objects from which on a detector reacts
 
-_LIKELY = 0.5  # probability from which on an object is likely
+LIKELY = 0.5  # probability from which on an object is likely
 _LIKELY_SHARE = 0.6  # share of the sum of all probabilities that likely objects have where a detector reacts
 
 
@@ -146,7 +146,7 @@ def reacts(chances: Tensor) -> bool:
     Returns:
         Whether it does.
     """
-    likely = chances[chances >= _LIKELY]
+    likely = chances[chances >= LIKELY]
     return len(likely) >= SEVERAL or float(likely.sum()) >= _LIKELY_SHARE * float(chances.sum())
 
 

@@ -17,7 +17,6 @@ from semfov.motion import CameraStep, LostScene, Motion
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
 from semfov.observation.thresholds import Thresholds
 from semfov.sensor.glimpse import CONTEXT, window_around
-from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
 
@@ -120,34 +119,20 @@ class _ShownWindow(NamedTuple):
     detections: Detections
 
 
-class CandidateBoxes(CandidatePlaces[TargetFacts]):
-    r"""Boxes that seem to hold the target: the detection with the highest score s that overlaps no examined place.
+class WindowPlaces(CandidatePlaces[TargetFacts]):
+    """Base of the places of a picture that is looked at by windows, and of the windows that show them closely.
 
-    .. math:: \operatorname{logit} p = \operatorname{logit} P + \operatorname{logit} s - \operatorname{logit} s^*
-
-    with the highest score :math:`s^*` of the search, which gives the probability P of the picture, both by the prior of
-    the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). In a stream scores fade, and
-    places are forgotten when half of the evidence is left (`semfov.episode.Forgetting`).
-
-    An object that fills the picture needs no closer look. Its place is judged, and the picture keeps its P, as the same
-    look says nothing new of it.
+    An object that fills the picture needs no closer look: the look at the whole shows it as closely.
 
     Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
-    that of the whole, unless other frames or a motion of the camera have followed. `_scored` has the boxes of the
-    target that looks have shown, where they lie in the present frame, and `_looks` the time of each of these looks,
-    with its number of boxes.
-
-    Invariant: `_scored` has the boxes of `_looks`, in their order. `_most_evident`, once it was computed, is that of
-    `_scored`, the examined places and the present time. What changes one of these calls `_change`.
+    that of the whole, unless other frames or a motion of the camera have followed.
     """
 
-    least = DETECTION_SCORE
-    """Score from which on a box seems to hold the target."""
+    _look: TargetFacts
 
     def __init__(
         self,
         target: int,
-        likely: float,
         lattice: Lattice,
         forgetting: Forgetting | None = None,
         prior: Prior | None = None,
@@ -155,29 +140,16 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
     ) -> None:
         super().__init__(forgetting, prior)
         self.target = target
-        self.likely = likely
         self._lattice = lattice
         self._window = window
         self._shown: dict[Window, _ShownWindow] = {}
-        self._scored = _Scored(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).bool())
-        self._lost_boxes: LostScene[_Scored] = LostScene()
-
-    _look: TargetFacts
 
     def see(self, look: TargetFacts) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
-        self._change()
         self._look = look
         self._next = look.next_index
         self.detections = look.detections
         self.presence = self.prior(look.presence)
-        scores = look.detections.scores[0, :, self.target]
-        of_target = look.detections.mask[0] & (scores >= self.least)
-        if bool(of_target.any()):
-            boxes = look.detections.boxes[0][of_target]
-            in_view = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-            self._looks.append((self._now, len(boxes)))
-            self._scored = self._scored.joined(_Scored(boxes, scores[of_target], in_view))
 
     def keep_whole(self, number: int, detections: Detections) -> None:
         """Keep what the look at the whole of the present frame shows: no closer look at what fills it is needed.
@@ -230,16 +202,95 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         self._index = shown.number
         return detections
 
+    def wait(self, passed: float = FRAME) -> None:
+        """Let seconds pass."""
+        super().wait(passed)
+        self._forget_windows()
+
+    def _forget_windows(self) -> None:
+        """Forget what windows of earlier frames showed, where the scene changes."""
+        if self.forgetting.rate:
+            self._shown.clear()
+
+    def follow(self, camera: CameraStep, size: tuple[int, int]) -> None:
+        """Carry examined places along with the camera, whose windows show others now."""
+        self._shown.clear()
+        super().follow(camera, size)
+
+
+class PhotographPlaces(WindowPlaces):
+    r"""Boxes of a photograph that seem to hold the target: the highest score s that overlaps no examined place.
+
+    .. math:: \operatorname{logit} p = \operatorname{logit} P + \operatorname{logit} s - \operatorname{logit} s^*
+
+    with the highest score :math:`s^*` of the search, which gives the probability P of the picture, both by the prior of
+    the fit; with another one a place keeps its share of P (`semfov.belief.prior.Prior`). All places, hints among them,
+    are examined at which the chance of a hit is large enough. It is :math:`v = p \, (1 - \max_i p_i)`, with those of
+    the closer looks so far. In a stream scores fade, and places are forgotten when half of the evidence is left
+    (`semfov.episode.Forgetting`).
+
+    The place of an object that fills the picture is judged, and the picture keeps its P, as the same look says nothing
+    new of it.
+
+    Private attributes: `_scored` has the boxes of the target that looks have shown, where they lie in the present
+    frame, and `_looks` the time of each of these looks, with its number of boxes.
+
+    Invariant: `_scored` has the boxes of `_looks`, in their order. `_most_evident`, once it was computed, is that of
+    `_scored`, the examined places and the present time. What changes one of these calls `_change`.
+    """
+
+    # As faint as hints begin, where a head has no limit of its own (`semfov.detection.detector.FAINT`).
+    least = 0.002
+    """Score from which on a box seems to hold the target."""
+
+    exhaustive = True
+
+    def __init__(
+        self,
+        target: int,
+        lattice: Lattice,
+        forgetting: Forgetting | None = None,
+        prior: Prior | None = None,
+        window: tuple[float, float] = USUAL_WINDOW,
+    ) -> None:
+        super().__init__(target, lattice, forgetting, prior, window)
+        self._scored = _Scored(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).bool())
+        self._lost_boxes: LostScene[_Scored] = LostScene()
+
+    def see(self, look: TargetFacts) -> None:
+        """Take in a look of the search. Looks before the first one that shows the target may be left out."""
+        self._change()
+        super().see(look)
+        scores = look.detections.scores[0, :, self.target]
+        of_target = look.detections.mask[0] & (scores >= self.least)
+        if bool(of_target.any()):
+            boxes = look.detections.boxes[0][of_target]
+            in_view = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+            self._looks.append((self._now, len(boxes)))
+            self._scored = self._scored.joined(_Scored(boxes, scores[of_target], in_view))
+
     @property
     def hit_chance(self) -> float:
-        """Chance that the best window that was not looked at shows the target."""
-        return self.prior.at_place(self._look.hit_chance, self._look.presence)
+        """Chance of a hit at the most evident place; below 0 if there is none."""
+        place = self._most_evident
+        # Below a `stop_below` of 0, too, so that a search without places is over.
+        return -1.0 if place is None else self._hit_chance_at(place)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
-        """Take the most evident box, if it is as likely as what is found, or at the end probable enough."""
+        """Take the most evident place, if the chance of a hit there is worth a pass."""
         place = self._most_evident
-        least = thresholds.place if last else self.likely
-        return None if place is None or place.probability < least else place
+        return None if place is None or self._hit_chance_at(place) < thresholds.stop_below else place
+
+    def telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
+        """Count the look, unless its window was looked at before; objects that were examined are left out."""
+        window = self._showing(candidate)
+        if window not in self._shown:
+            super().telling(candidate, detections)
+            self._shown[window] = _ShownWindow(self._next - 1, detections)
+        self._index = self._shown[window].number
+        others = detections.mask & ~self._are_examined(detections.boxes[0])
+        # Not a copy with another mask, whose highest scores would be those of what was examined, too.
+        return Detections(detections.boxes, detections.scores, others, detections.confidence * others)
 
     @cached_property
     def _most_evident(self) -> CandidatePlace | None:
@@ -270,22 +321,17 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         """Let seconds pass."""
         self._change()
         super().wait(passed)
-        self._forget_boxes()
-        self._forget_windows()
+        # The looks that are forgotten are the oldest.
+        self._scored = self._scored.last(sum(count for _, count in self._looks))
 
     def _forget_windows(self) -> None:
-        """Forget what windows of earlier frames showed, where the scene changes."""
+        """Forget what closer looks at earlier frames showed; the look at the whole is made anew in each frame."""
         if self.forgetting.rate:
-            self._shown.clear()
-
-    def _forget_boxes(self) -> None:
-        """Forget the boxes of looks that are forgotten, which are the oldest."""
-        self._scored = self._scored.last(sum(count for _, count in self._looks))
+            self._shown = {window: shown for window, shown in self._shown.items() if window.within is None}
 
     def follow(self, camera: CameraStep, size: tuple[int, int]) -> None:
         """Carry the boxes of the target along, too."""
         self._change()
-        self._shown.clear()
         super().follow(camera, size)
         scenes = self._lost_boxes.follow(
             [self._scored], camera, lambda scenes, motion: [boxes.moved(motion, size) for boxes in scenes]
@@ -324,56 +370,6 @@ class CandidateBoxes(CandidatePlaces[TargetFacts]):
         of_picture, of_score, of_best_score = logits
         chance = float((of_picture + of_score - of_best_score).sigmoid())
         return self.prior.at_place(chance, presence)
-
-
-class PhotographPlaces(CandidateBoxes):
-    r"""Places of a photograph, hints among them; all are examined at which the chance of a hit is large enough.
-
-    It is :math:`v = p \, (1 - \max_i p_i)`, with the probability p of the place and those of the closer looks so far.
-    """
-
-    # As faint as hints begin, where a head has no limit of its own (`semfov.detection.detector.FAINT`).
-    least = 0.002
-    exhaustive = True
-
-    def __init__(
-        self,
-        target: int,
-        lattice: Lattice,
-        forgetting: Forgetting | None = None,
-        window: tuple[float, float] = USUAL_WINDOW,
-        prior: Prior | None = None,
-    ) -> None:
-        # Places are due by their chance of a hit, so that none has to be likely before.
-        super().__init__(target, 0.0, lattice, forgetting, prior, window)
-
-    @property
-    def hit_chance(self) -> float:
-        """Chance of a hit at the most evident place; below 0 if there is none."""
-        place = self._most_evident
-        # Below a `stop_below` of 0, too, so that a search without places is over.
-        return -1.0 if place is None else self._hit_chance_at(place)
-
-    def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
-        """Take the most evident place, if the chance of a hit there is worth a pass."""
-        place = self._most_evident
-        return None if place is None or self._hit_chance_at(place) < thresholds.stop_below else place
-
-    def telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
-        """Count the look, unless its window was looked at before; objects that were examined are left out."""
-        window = self._showing(candidate)
-        if window not in self._shown:
-            super().telling(candidate, detections)
-            self._shown[window] = _ShownWindow(self._next - 1, detections)
-        self._index = self._shown[window].number
-        others = detections.mask & ~self._are_examined(detections.boxes[0])
-        # Not a copy with another mask, whose highest scores would be those of what was examined, too.
-        return Detections(detections.boxes, detections.scores, others, detections.confidence * others)
-
-    def _forget_windows(self) -> None:
-        """Forget what closer looks at earlier frames showed; the look at the whole is made anew in each frame."""
-        if self.forgetting.rate:
-            self._shown = {window: shown for window, shown in self._shown.items() if window.within is None}
 
     def _hit_chance_at(self, place: CandidatePlace) -> float:
         """Chance that a look at a place shows the target, if no closer look so far has."""

@@ -82,6 +82,7 @@ class PhotographEvidence(nn.Module):
             Log odds, `(...)`.
         """
         facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1)
+        facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1).to(self.whole.weight)
         with without_autocast(facts):
             return self.whole(facts)[..., 0]
 
@@ -250,12 +251,13 @@ class GlimpseEvidence(DecidingModule, Pretrained):
 
         Args:
             best: `(...)`, highest score of the class in any look.
-            expected: `(...)`, expected number of its objects (`semfov.zoom.decision.SearchFacts.expected`).
+            expected: `(...)`, expected number of its objects (`semfov.zoom.places.SearchFacts.expected`).
 
         Returns:
             Log odds, `(...)`.
         """
-        facts = self.presence_facts(best, expected)
+        # Scores have the precision of the detector, whatever that of the evidence is.
+        facts = self.presence_facts(best, expected).to(self.whole.weight)
         with without_autocast(facts):
             return self.whole(facts)[..., 0]
 

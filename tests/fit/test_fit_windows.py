@@ -14,7 +14,6 @@ from semfov.agents.episode import EpisodeLimits, Goal
 from semfov.agents.window_episode import WindowEpisode, WindowTask
 from semfov.data import Annotation, Scene
 from semfov.data.mosaics import Mosaics
-from semfov.decision import MOST_CLOSER
 from semfov.errors import DataError
 from semfov.fit.folder import FolderFit
 from semfov.fit.photographs import _explored, fit_photographs
@@ -34,7 +33,7 @@ from semfov.runs.looking import Looking
 from semfov.runs.progress import WholeBar
 from semfov.runs.window_looking import found_in
 from semfov.runs.zoom_store import StoredWindowLooks, WindowLookStore
-from semfov.settings import DecisionSettings, FindSettings
+from semfov.settings import FindSettings
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
@@ -222,7 +221,7 @@ def test_the_threshold_of_places_is_chosen_on_searches_that_end_as_those_of_the_
     verified = [sought.verified() for sought in searches]
     model.places = fitted
     for sought, each in zip(searches, verified, strict=True):
-        task = WindowTask(Goal.of(names, sought.target), model, DecisionSettings(closer=MOST_CLOSER))
+        task = WindowTask(Goal.of(names, sought.target), model)
         path = WindowEpisode(task, sought.source, EpisodeLimits(8)).run()
         right, count = each.found(fitted.confirm)
         assert (right is not None, count) == (path.decision.outcome == "found", path.passes)

@@ -11,20 +11,22 @@ import torch
 from semfov import Detections, WindowEye, ZoomAgent
 from semfov.belief.prior import Prior
 from semfov.belief.verification import Verification, closer_features
-from semfov.decision import OUTCOMES, Decision, Verifier
+from semfov.decision import OUTCOMES, CandidatePlace, Decision, Verifier
 from semfov.episode import Forgetting
 from semfov.io.storage import read, write_file
 from semfov.motion import CameraStep, Motion
+from semfov.observation.matching import box_iou
 from semfov.observation.thresholds import Thresholds
 from semfov.settings import FindSettings, SearchSettings, StreamSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.certainty import FACTS, Certainty
-from semfov.zoom.closer import CandidateBoxes, PhotographPlaces, TargetFacts, closer_window, look_closely
-from semfov.zoom.decision import LastingAbsence, ObjectVerifier, SearchFacts
+from semfov.zoom.closer import PhotographPlaces, TargetFacts, WindowPlaces, closer_window, look_closely
+from semfov.zoom.decision import LastingAbsence
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
 from semfov.zoom.objects import probable_objects
+from semfov.zoom.places import ObjectPlaces, ObjectVerifier, SearchFacts
 from semfov.zoom.slices import ranked, raw, usual_slices
 from tests.motion.test_camera import scene
 from tests.refusals import refused, unusable
@@ -127,11 +129,11 @@ def test_the_window_shows_the_box_with_its_surroundings_and_lies_in_the_picture(
 
 
 def test_the_strongest_detection_is_examined_first_and_each_place_once():
-    source = Scripted([0.9, 0.1, 0.5], side=27.0)  # boxes of closer looks overlap the others by less than half
-    candidates = CandidateBoxes(1, 0.0, LATTICE)
+    source = Scripted([0.9, 0.1, 0.5, 0.1], side=27.0)  # boxes of closer looks overlap the others by less than half
+    candidates = PhotographPlaces(1, LATTICE)
     looks = [
         seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540], [104.0, 100, 144, 140]], [0.6, 0.8, 0.55]),
-        seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]),
+        seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.001]),
     ]
     for number, look in enumerate(looks, 1):
         candidates.see(TargetFacts(look.detections, number, 0.9, 0.95, 0.5))
@@ -146,17 +148,69 @@ def test_the_strongest_detection_is_examined_first_and_each_place_once():
         assert features.tolist() == expected.tolist()
         assert box.tolist() == at.tolist()
         examined.append((candidate.evidence, *candidate.box[:2].tolist()))
-    # The others overlap examined places by half, or have a score below 0.1.
+    # The others overlap examined places by half, or are fainter than hints.
     assert [tuple(round(n, 4) for n in each) for each in examined] == [(0.8, 500, 500), (0.6, 100, 100)]
     assert source.windows == [
         closer_window(LATTICE, torch.tensor(b)) for b in ([500.0, 500, 540, 540], [100.0, 100, 140, 140])
     ]
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("share", [None, 0.1])
+def test_the_surest_object_is_looked_at_first_and_each_place_once(seed, share):
+    """Of the objects that an exploration of the same looks would list; the others overlap those by half."""
+    random = torch.Generator().manual_seed(seed)
+    certainty = some_certainty(seed)
+    facts = SearchFacts(ZoomBelief(LATTICE, evidence(certainty), 1))
+    for number in range(3):
+        corner = torch.rand(6, 2, generator=random) * 200
+        boxes = torch.cat([corner, corner + 40 + 40 * torch.rand(6, 2, generator=random)], 1)
+        look = seen(boxes.tolist(), torch.rand(6, generator=random).tolist())
+        facts.add(replace(look, window=Window.overview(LATTICE) if number == 0 else Window.on(LATTICE, (1, 0, 0))))
+    prior = Prior(0.5 if share is None else share, 0.5)
+    places = ObjectPlaces(facts, prior=prior)
+    presence = facts.presence()
+    places.see(TargetFacts(look.detections, 3, presence, facts.best, 0.0))
+    listed, _ = probable_objects([each.look for each in facts.looks], LATTICE, 1, certainty)
+    expected = []
+    for box, chance in zip(listed.boxes, listed.scores.tolist(), strict=True):
+        if not expected or float(box_iou(torch.stack([other for other, _ in expected]), box[None]).max()) < 0.5:
+            expected.append((box, prior.at_place(chance, presence)))
+    assert 3 < len(expected) < 18
+    for least in (0.2, 0.5):
+        # While looks are worth a pass the place has to be likely; after the last one another threshold counts.
+        sure = places.due(replace(AT, place=least), last=False)
+        assert (sure is not None) == (expected[0][1] >= 0.5)
+    for box, probability in expected:
+        place = places.due(replace(AT, place=0.0), last=True)
+        assert torch.equal(place.box, box)
+        assert place.probability == pytest.approx(probability, rel=1e-5)
+        assert places.due(replace(AT, place=probability + 1e-6), last=True) is None
+        places.dismiss(place, place.box)
+    assert places.due(replace(AT, place=0.0), last=True) is None
+
+
+class Listed(WindowPlaces):
+    """The boxes of the last look that were not examined, in their order, each as probable as the picture."""
+
+    likely = 0.7
+    hit_chance = property(lambda self: self._look.hit_chance)
+
+    def due(self, thresholds, *, last):
+        boxes = self._look.detections.boxes[0]
+        free = boxes[~self._are_examined(boxes)]
+        if not len(free) or self.presence < (thresholds.place if last else self.likely):
+            return None
+        return CandidatePlace(free[0], 0.8, self.presence)
+
+    def probability(self, look):
+        return self.presence
+
+
 def verifier(model, scores, most=2):
     """A verifier of the target in class 1."""
     looks = Scripted(scores)
-    return Verifier(model, CandidateBoxes(1, 0.7, LATTICE), AT, most), lambda box: look_closely(looks, box).detections
+    return Verifier(model, Listed(1, LATTICE), AT, most), lambda box: look_closely(looks, box).detections
 
 
 def look(number, presence, left, *boxes):
@@ -233,19 +287,25 @@ def test_a_search_looks_closely_before_it_finds(picture):
     assert (plain.decision.outcome, plain.decision.place, plain.closer) == ("found", None, ())
     path = agent.search(picture, "red")
     (look,) = path.closer
-    assert (path.decision.outcome, path.passes) == ("found", plain.passes + 1)
+    assert (path.decision.outcome, look.number) == ("found", path.passes)
     assert (look.index, path.decision.place) == (path.passes - 1, look.place)
     assert path.decision.probability == pytest.approx(max(look.place, look.presence))
-    # The look is a window around the box that the search without it would have found.
-    assert path.window_looks[look.index].window == closer_window(path.lattice, plain.decision.box)
+    # The look is a window around the surest object of the looks before it, as soon as it is likely.
+    known = [
+        probable_objects(path.window_looks[:number], path.lattice, 1, by("sharpest"))[0]
+        for number in range(1, path.passes)
+    ]
+    assert [float(objects.scores[:1].sum()) >= 0.5 for objects in known] == [*[False] * (len(known) - 1), True]
+    assert path.window_looks[look.index].window == closer_window(path.lattice, known[-1].boxes[0])
     assert path.decision.box.tolist() == look.box.tolist()
     x1, y1, x2, y2 = path.decision.box.tolist()
     assert max(x1, 640) < min(x2, 672)
     assert max(y1, 320) < min(y2, 352)
     assert path.why_it_ended() == "A closer look confirmed the target."
-    # It costs one of the passes.
-    short = agent.search(picture, "red", SearchSettings(passes=plain.passes))
-    assert (short.closer, short.decision.outcome) == ((), "undecided")
+    # It costs one of the passes: the last one goes to the place that is the most probable so far.
+    short = agent.search(picture, "red", SearchSettings(passes=path.passes - 1))
+    assert (short.passes, short.decision.outcome) == (path.passes - 1, "found")
+    assert [look.number for look in short.closer] == [short.passes]
     assert agent.search(picture, "red", SearchSettings(passes=1)).closer == ()
 
 
@@ -322,11 +382,13 @@ def test_a_closer_look_that_shows_nothing_lowers_the_probability_of_a_place(name
     assert float(after.scores) < float(before.scores)
 
 
-def test_where_no_look_shows_the_target_it_hardly_is():
+def test_a_place_where_looks_show_no_object_any_more_is_hardly_the_target():
+    """A stream has forgotten the looks that showed the candidate when the closer look is made."""
     facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1))
-    facts.add(replace(seen([ONE, OTHER], [0.5, 0.3]), window=Window.overview(LATTICE)))
-    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE), AT, 9)
-    judge.see(TargetFacts(seen([[700.0, 100, 740, 140]], [0.4]).detections, 1, 0.6, 0.5, 0.0))
+    facts.add(replace(seen([[700.0, 100, 740, 140]], [0.8]), window=Window.overview(LATTICE)))
+    judge = ObjectVerifier(ObjectPlaces(facts), AT, 9)
+    judge.see(TargetFacts(facts.looks[0].look.detections, 1, facts.presence(), 0.8, 0.0))
+    facts.see([replace(seen([ONE, OTHER], [0.5, 0.3]), window=Window.overview(LATTICE))])
     look = judge.examine(Detections.empty(1, 2))
     assert look.place == pytest.approx(0.001)
     assert look.box.tolist() == [700.0, 100, 740, 140]
@@ -339,7 +401,7 @@ def test_the_picture_is_as_probable_as_after_all_closer_looks():
     whole = replace(seen(boxes, [0.5, 0.49, 0.5]), window=Window.overview(LATTICE))
     facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1))
     facts.add(whole)
-    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE), replace(AT, place=0.0), 2)
+    judge = ObjectVerifier(ObjectPlaces(facts), replace(AT, place=0.0), 2)
     judge.see(TargetFacts(whole.detections, 1, facts.presence(), 0.5, 0.0))
     for score, count in ((0.3, 1.29), (0.1, 0.89)):
         box = judge.candidate.box
@@ -358,7 +420,7 @@ def test_a_place_of_a_stream_stays_as_probable_as_the_object_that_looks_show_the
     facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1), latest=True)
     facts.add(whole)
     forgetting = Forgetting(0.25)
-    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE, forgetting), AT, 9)
+    judge = ObjectVerifier(ObjectPlaces(facts, forgetting), AT, 9)
     judge.see(TargetFacts(whole.detections, 1, facts.presence(), 0.3, 0.0), last=True)
     close = replace(seen([ONE], [0.9]), window=closer_window(LATTICE, judge.candidate.box))
     facts.add(close)
@@ -379,7 +441,7 @@ def found_box(shift, window):
     whole = replace(seen([ONE], [0.3]), window=Window.overview(LATTICE))
     facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1), latest=True)
     facts.add(whole)
-    judge = ObjectVerifier(facts, CandidateBoxes(1, 0.0, LATTICE, Forgetting(0.25)), AT, 9)
+    judge = ObjectVerifier(ObjectPlaces(facts, Forgetting(0.25)), AT, 9)
     judge.see(TargetFacts(whole.detections, 1, facts.presence(), 0.3, 0.0, whole.window), last=True)
     close = replace(seen([ONE], [0.9]), window=closer_window(LATTICE, judge.candidate.box))
     facts.add(close)
@@ -993,8 +1055,8 @@ def test_an_object_that_fills_a_large_picture_needs_no_closer_look():
     facts.add(replace(seen(boxes[0].tolist(), [0.9, 0.89]), window=Window.overview(LATTICE)))
 
     def search(rate):
-        places = CandidateBoxes(1, 0.6, LATTICE, Forgetting(rate))
-        judge = ObjectVerifier(facts, places, Thresholds(0.999, 1e-4), most=9)
+        places = ObjectPlaces(facts, Forgetting(rate))
+        judge = ObjectVerifier(places, Thresholds(0.999, 1e-4), most=9)
         places.keep_whole(0, whole)
         judge.see(TargetFacts(whole, 3, 0.8, 0.9, 0.3))
         return judge, places

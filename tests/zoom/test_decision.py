@@ -28,11 +28,11 @@ from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import DISPERSION, FACTS, SPREAD, Certainty, number_of
-from semfov.zoom.decision import SearchFacts
 from semfov.zoom.episode import find_everything, look_for
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from semfov.zoom.object_facts import DetectedBoxes, object_facts
 from semfov.zoom.objects import merge, merge_with_facts, probable_objects, without_parts
+from semfov.zoom.places import SearchFacts
 from tests.refusals import refused
 from tests.small import Tiles, area, iou, shared
 
