@@ -947,6 +947,18 @@ def test_a_place_that_leaves_the_frame_counts_again_when_it_comes_back():
     assert decision.box.tolist() == pytest.approx(ONE, abs=1e-3)
 
 
+@pytest.mark.parametrize("large", [True, False])
+def test_evidence_in_double_precision_searches_alike(large, picture, photograph):
+    image, evidence_of = (picture, evidence) if large else (photograph, own_evidence)
+    one, other = (
+        ZoomAgent(WindowEye(Sized().eval()), model).search(image, "red", SearchSettings(passes=6))
+        for model in (evidence_of(), evidence_of().double())
+    )
+    assert [look.window for look in other.window_looks] == [look.window for look in one.window_looks]
+    assert other.decision.outcome == one.decision.outcome
+    assert other.decision.probability == pytest.approx(one.decision.probability, abs=1e-5)
+
+
 def panned(picture, lefts, width=512):
     """Frames of a camera that turns to the right over a picture, each with its pose."""
     for left in lefts:
