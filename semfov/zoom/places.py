@@ -124,6 +124,7 @@ class SearchFacts:
 
     @torch.no_grad()
     def _predicted_presence(self) -> float:
+        """Predict the presence by the evidence for a photograph, or for a larger picture."""
         best = torch.tensor(self.best)
         photograph = self.belief.photograph
         if photograph is not None:
@@ -188,7 +189,7 @@ class ObjectPlaces(WindowPlaces):
 
     def _with_prior(self, place: float) -> float:
         """Change the probability of a place from the prior of the fit."""
-        return self.prior.at_place(place, self.prior.inverse(self.presence))
+        return self.prior.at_place(place, self.facts.presence())
 
 
 class ObjectVerifier(PlaceVerifier[TargetFacts]):
@@ -204,18 +205,15 @@ class ObjectVerifier(PlaceVerifier[TargetFacts]):
 
     places: ObjectPlaces
 
-    def __init__(self, places: ObjectPlaces, thresholds: Thresholds, most: int) -> None:
-        super().__init__(places, thresholds, most)
-
     def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:
         places = self.places
         places.telling(candidate, detections)
         place, box = places.object_at(candidate.box)
-        presence = places.facts.presence()
         places.dismiss(candidate, box)
-        places.presence = places.prior(presence)
-        at_least = max(presence, place)
-        return Judgement(places.prior.at_place(place, at_least), places.prior(at_least), box)
+        prior = places.prior
+        presence = places.facts.presence()
+        places.presence = prior(presence)
+        return Judgement(prior.at_place(place, presence), prior(max(presence, place)), box)
 
     @property
     def presence(self) -> float:

@@ -332,9 +332,9 @@ def test_objects_that_move_or_leave_are_forgotten(agent):
 
 def test_a_found_target_is_lost_when_it_leaves(picture):
     agent = ZoomAgent(WindowEye(Sized()), evidence())
-    live = agent.stream(1, (), StreamSettings(rate=2.5), follows=False)
-    found = [live.step(picture).decision.outcome for _ in range(12)]
-    gone = [live.step(torch.zeros_like(picture)).decision for _ in range(20)]
+    live = agent.stream(1, (), StreamSettings(rate=1), follows=False)
+    found = [live.step(picture).decision.outcome for _ in range(16)]
+    gone = [live.step(torch.zeros_like(picture)).decision for _ in range(50)]
     assert "found" in found
     assert [decision.outcome for decision in gone[-5:]] != ["found"] * 5
     assert gone[-1].outcome != "found"
