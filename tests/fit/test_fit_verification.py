@@ -138,13 +138,17 @@ def test_the_decision_at_a_threshold_equals_a_walk_through_the_closer_looks(plac
     ends = tuple(range(2, 2 + len(places)))
     verified = searched(True, tuple(places), ends, 0.5, 9)
     expected = None, 9
-    best = 0.0
-    for (place, right), end in zip(places, ends, strict=True):
-        if place >= confirm + (1 - confirm) / 2:
-            expected = right, end
+    best, is_right = 0.0, None
+    for number, ((place, right), end) in enumerate(zip(places, ends, strict=True), 1):
+        if place > best:
+            best, is_right = place, right
+        is_sure = place >= confirm + (1 - confirm) / 2
+        # After two closer looks a place is found that is probable enough.
+        if is_sure or (number >= 2 and best >= confirm):
+            expected = is_right, end
             break
-        if place >= confirm and (place > best or (place == best and right)):
-            expected, best = (right, 9), place
+        if best >= confirm:
+            expected = is_right, 9
     assert verified.found(confirm) == expected
 
 
