@@ -294,13 +294,13 @@ def on_cpu(module: _Module) -> _Module:
     Returns:
         The copy; the module itself if all its tensors are on the CPU.
     """
-    elsewhere: dict[torch.dtype, list[Tensor]] = {}
-    # A tensor that two layers share is copied once.
-    for tensor in dict.fromkeys((*module.parameters(), *module.buffers())):
-        if tensor.device.type != "cpu":
-            elsewhere.setdefault(tensor.dtype, []).append(tensor)
-    if not elsewhere:
+    # Modules list a tensor that two layers share once.
+    tensors = [tensor for tensor in (*module.parameters(), *module.buffers()) if tensor.device.type != "cpu"]
+    if not tensors:
         return module
+    elsewhere: dict[torch.dtype, list[Tensor]] = {}
+    for tensor in tensors:
+        elsewhere.setdefault(tensor.dtype, []).append(tensor)
     copies: dict[int, Tensor] = {}
     for tensors in elsewhere.values():
         joined = torch.cat([tensor.detach().flatten() for tensor in tensors]).cpu()

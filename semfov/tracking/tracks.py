@@ -105,17 +105,17 @@ class Tracks:
         prior = np.log(_STANDING / (1 - _STANDING))
         return np.exp(-np.logaddexp(0, -(prior + by_looks)))
 
-    @property
+    @cached_property
     def moves(self) -> NDArray[np.bool_]:
         """Whether they rather move than stand still, `(N,)`."""
         return self.standing < 0.5
 
-    @property
+    @cached_property
     def place(self) -> Floats:
         """Where they are, `(N, 2)` in pixels: those that stand still are where they came to rest."""
         return np.where(self.moves[:, None], self.kinematics.place, self.rest_place)
 
-    @property
+    @cached_property
     def corners(self) -> Floats:
         """Their boxes, `(N, 4)` as an array."""
         half = np.exp(self.log_size) / 2
@@ -127,7 +127,7 @@ class Tracks:
         """Their boxes, `(N, 4)`, `(x1, y1, x2, y2)` in pixels."""
         return torch.from_numpy(self.corners).float()
 
-    @property
+    @cached_property
     def sides(self) -> Floats:
         """Roots of the areas of their boxes, `(N,)`, in pixels."""
         return np.exp(self.log_size.mean(-1))

@@ -125,7 +125,8 @@ class WindowPlaces(CandidatePlaces[TargetFacts]):
     An object that fills the picture needs no closer look: the look at the whole shows it as closely.
 
     Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
-    that of the whole, unless other frames or a motion of the camera have followed.
+    that of the whole, unless other frames or a motion of the camera have followed. `_latest_showing` has the box of the
+    place that was asked for last, and its window.
     """
 
     _look: TargetFacts
@@ -143,6 +144,7 @@ class WindowPlaces(CandidatePlaces[TargetFacts]):
         self._lattice = lattice
         self._window = window
         self._shown: dict[Window, _ShownWindow] = {}
+        self._latest_showing: tuple[Tensor, Window] | None = None
 
     def see(self, look: TargetFacts) -> None:
         """Take in a look of the search. Looks before the first one that shows the target may be left out."""
@@ -187,6 +189,12 @@ class WindowPlaces(CandidatePlaces[TargetFacts]):
         return window == Window.overview(self._lattice) and window in self._shown
 
     def _showing(self, candidate: CandidatePlace) -> Window:
+        """Find the window that shows a place closely, which is asked for several times in turn."""
+        if self._latest_showing is None or self._latest_showing[0] is not candidate.box:
+            self._latest_showing = candidate.box, self._window_showing(candidate)
+        return self._latest_showing[1]
+
+    def _window_showing(self, candidate: CandidatePlace) -> Window:
         """Choose the window of a closer look at a place, or the whole picture where it shows no more."""
         window = closer_window(self._lattice, candidate.box, self._window)
         x1, y1, x2, y2 = window.region(self._lattice)

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
@@ -126,7 +126,7 @@ class WindowLook:
     gist: Gist | None
     hints: Hints | None = None
 
-    @property
+    @cached_property
     def candidates(self) -> Detections:
         """What it shows of places that may hold a target: its detections, in a photograph all its hints."""
         if self.hints is None:
