@@ -680,6 +680,27 @@ def test_a_place_that_only_the_whole_shows_closely_is_examined_without_a_pass():
     assert places.record(box, 0.4, 0.5).index == 1
 
 
+def test_the_window_of_a_place_is_chosen_once(monkeypatch):
+    asked = []
+
+    def counted(lattice, box, window):
+        asked.append(box)
+        return closer_window(lattice, box, window)
+
+    monkeypatch.setattr("semfov.zoom.closer.closer_window", counted)
+    boxes = torch.tensor([[[10.0, 10, 30, 30], [150.0, 90, 170, 110]]])
+    found = Detections(boxes, torch.tensor([[[0, 0.5, 0], [0, 0.4, 0]]]), torch.ones(1, 2).bool())
+    places = PhotographPlaces(1, OVER)
+    places.see(TargetFacts(found, 1, 0.8, 0.5, 0.0))
+    for number in (1, 2):
+        place = places.due(Thresholds(1.0, 0.01), last=True)
+        assert places.shown_at(place) is None
+        assert not places.shows_nothing_new(place)
+        places.examine(place, found)
+        assert places.shown_at(place) is found
+        assert len(asked) == number
+
+
 @pytest.mark.parametrize("share", [0.5, 0.1])
 def test_a_place_that_fills_the_photograph_leaves_the_picture_its_probability(share):
     """No closer look at it is made, and what the look at the whole says is not counted a second time."""
