@@ -56,6 +56,12 @@ def reason_of(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
+def type_of(value: object) -> str:
+    """Name the type of a value with its article, such as `an int`, for a message."""
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"
+
+
 def check(condition: bool, argument: str, expected: str, got: object) -> None:
     """Raise `InputError` unless a condition holds.
 
@@ -166,8 +172,8 @@ def check_tensor(value: object, argument: str) -> None:
     """Raise `InputError` unless a value is a tensor; the message has the call that converts it."""
     if isinstance(value, Tensor):
         return
-    kind = "NumPy array" if type(value).__name__ == "ndarray" else type(value).__name__
-    check(False, argument, "a tensor", f"a {kind}; give torch.as_tensor({argument})")
+    kind = "a NumPy array" if type(value).__name__ == "ndarray" else type_of(value)
+    check(False, argument, "a tensor", f"{kind}; give torch.as_tensor({argument})")
 
 
 def check_whole(value: object, argument: str, low: int, high: int) -> None:

@@ -10,7 +10,7 @@ from semfov.belief.observers import AnyOf, Observer, SemanticSearch
 from semfov.belief.observers.any_of import TargetLike
 from semfov.belief.prior import Prior, PriorLike
 from semfov.data.classes import class_index
-from semfov.errors import check
+from semfov.errors import check, type_of
 from semfov.gaze.acquisition import AcquisitionFunction, TargetPosterior, Uniform
 from semfov.gaze.policies import Policy
 from semfov.observation.presence import EVEN
@@ -40,7 +40,7 @@ class Strategy(nn.Module):
     def __init__(self, observer: Observer, policy: Policy) -> None:
         super().__init__()
         for argument, part, kind in (("observer", observer, Observer), ("policy", policy, Policy)):
-            got = f"the class {part.__name__}" if isinstance(part, type) else f"a {type(part).__name__}"
+            got = f"the class {part.__name__}" if isinstance(part, type) else type_of(part)
             check(isinstance(part, kind), argument, f"an instance of a subclass of {kind.__name__}", got)
         self.observer = observer
         self.policy = policy

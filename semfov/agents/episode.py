@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from semfov.data.inputs import FRAME, ImageLike
 from semfov.decision import Decision
 from semfov.episode import Forgetting
-from semfov.errors import InputError, check, check_number, check_whole
+from semfov.errors import InputError, check, check_number, check_whole, type_of
 from semfov.motion import Motion
 from semfov.paths import Ending, Moment, Record, RecordedLook
 from semfov.settings import MOST_PASSES, LookSettings, OnLook
@@ -162,7 +162,7 @@ class Episode(ABC, Generic[_Record_co]):
 
     def moment(self) -> Moment:
         """Make the record of the present frame of a stream."""
-        raise InputError(f"frame: expected an episode that takes frames, got a {type(self).__name__}")
+        raise InputError(f"frame: expected an episode that takes frames, got {type_of(self)}")
 
     def describe(self) -> str:
         """Describe what is done in a few words."""

@@ -17,7 +17,7 @@ from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
 from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
-from semfov.errors import InputError, SemfovError, check, lookup
+from semfov.errors import InputError, SemfovError, check, lookup, type_of
 from semfov.eye import MOST_FLOATS
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.head.camera import PanTiltCamera, open_scene
@@ -128,7 +128,7 @@ class OpenedPicture:
             DataError: the file cannot be read.
         """
         remedy = "a scene is looked at by search, find_all and explore"
-        check(not self.scene, "picture", "a flat picture for a fovea", f"a {type(self.source).__name__}; {remedy}")
+        check(not self.scene, "picture", "a flat picture for a fovea", f"{type_of(self.source)}; {remedy}")
         if not self._is_read_by_windows():
             source = cast(ImageLike, self.source)
             return as_image(source, like=like, argument="picture", color=self.color, white=self.white)[None]

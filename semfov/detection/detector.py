@@ -14,7 +14,16 @@ from semfov.detection.placement import Placement, letterbox
 from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import HALVES, BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
-from semfov.errors import InputError, check, check_pixels, check_whole, checked_keywords, devices_here, reason_of
+from semfov.errors import (
+    InputError,
+    check,
+    check_pixels,
+    check_whole,
+    checked_keywords,
+    devices_here,
+    reason_of,
+    type_of,
+)
 from semfov.io.state import StatedModule
 
 FAINT = 0.002  # confidence from which on a candidate is a hint, unless the head has another one
@@ -332,7 +341,7 @@ def check_images(images: Tensor) -> None:
         InputError: they have another shape or dtype, or other numbers.
     """
     is_tensor = isinstance(images, Tensor)
-    check(is_tensor, "images", "a batch of tensors", f"a {type(images).__name__}; give semfov.as_image(picture)[None]")
+    check(is_tensor, "images", "a batch of tensors", f"{type_of(images)}; give semfov.as_image(picture)[None]")
     has_shape = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0
     expected = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
     got = f"{images.dtype} of shape {tuple(images.shape)}"

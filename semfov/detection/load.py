@@ -22,7 +22,7 @@ from semfov.detection.transformers import TransformersDetector
 from semfov.detection.ultralytics import UltralyticsDetector
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import Runtime, YoloV3
-from semfov.errors import DataError, InputError, check, check_device, check_is_device, check_options, lookup
+from semfov.errors import DataError, InputError, check, check_device, check_is_device, check_options, lookup, type_of
 from semfov.io.files import check_regular, read_text
 
 _EXPORTED = re.compile(r"(yolo(v?([5-9]|1\d|26)|world|-nas|e-)[a-z0-9_-]*|rt-?detr[a-z0-9_-]*)")
@@ -98,7 +98,7 @@ def load_detector(model: DetectorLike, **options: Any) -> Detector:
     if isinstance(model, str | PathLike):
         name = _detector_name(model)
         return _load(_loader_of(name), name, name, options)
-    return _load(_wrapper_of(model), model, f"a {type(model).__name__}", options)
+    return _load(_wrapper_of(model), model, type_of(model), options)
 
 
 def _loader_of(name: str) -> _Loader:
@@ -322,7 +322,7 @@ def given_names(classes: object) -> tuple[str, ...]:
             numbers = [str(number) for number in classes]
             raise InputError(f"classes: expected {expected}, or by numbers from 0, got numbers {numbers[:5]}")
         return tuple(names)
-    check(not isinstance(classes, Set), "classes", expected, f"a {type(classes).__name__}, which has no order")
+    check(not isinstance(classes, Set), "classes", expected, f"{type_of(classes)}, which has no order")
     return tuple(cast(Iterable[str], classes))
 
 

@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 
 from semfov.detection.detections import Detections
 from semfov.envs.scenery import Scenery, ZoomScenery
-from semfov.errors import InputError, check, check_number, check_whole
+from semfov.errors import InputError, check, check_number, check_whole, type_of
 from semfov.gaze.acquisition.base import Task
 
 Arrays = dict[str, Any]
@@ -324,7 +324,7 @@ class Gazes(ABC, Generic[_Episode]):
 
 def check_options_of_reset(options: object) -> None:
     """Raise `InputError` unless the options of a reset are a dictionary, or None."""
-    check(options is None or isinstance(options, Mapping), "options", "a dictionary", f"a {type(options).__name__}")
+    check(options is None or isinstance(options, Mapping), "options", "a dictionary", type_of(options))
 
 
 def scene_number(value: object, scenery: Scenery | ZoomScenery) -> int:

@@ -22,7 +22,7 @@ from semfov.data.pictures import Pictures
 from semfov.data.sources import PHOTOGRAPHS
 from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode import StoredLooks
-from semfov.errors import DataError, InputError, check, check_options, check_whole
+from semfov.errors import DataError, InputError, check, check_options, check_whole, type_of
 from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import Task
 from semfov.metrics.episodes import answers_of
@@ -564,7 +564,7 @@ def scenery_or_open(
     expected = f"no options of `{opener.__name__}` beside it"
     check(scenery is None or not options, "scenery", expected, ", ".join(options))
     if scenery is not None:
-        check(hasattr(scenery, "classes"), "scenery", f"what `{opener.__name__}` makes", f"a {type(scenery).__name__}")
+        check(hasattr(scenery, "classes"), "scenery", f"what `{opener.__name__}` makes", type_of(scenery))
         return scenery
     known_options = signature(opener).parameters.keys() - {"task"}
     check_options(options, known_options, f"`{opener.__name__}`")

@@ -7,7 +7,7 @@ import numpy as np
 
 from semfov.envs.gazes import SavedGazes
 from semfov.envs.scenery import Scenery, ZoomScenery
-from semfov.errors import InputError
+from semfov.errors import InputError, type_of
 from semfov.gaze.acquisition.base import Task
 
 
@@ -56,7 +56,7 @@ def check_state(state: object, kind: str, scenery: Scenery | ZoomScenery, task: 
     """Raise `InputError` unless a state is one of a kind of environment with these scenes, this task and episodes."""
     expected = "what `save_state` of this environment gave"
     if not isinstance(state, EnvState):
-        raise InputError(f"state: expected {expected}, got a {type(state).__name__}")
+        raise InputError(f"state: expected {expected}, got {type_of(state)}")
     if state.kind != kind:
         raise InputError(f"state: expected {expected}, a {kind}, got one of a {state.kind}")
     if state.scenery is not scenery and state.scene_key() != scenery.key:

@@ -6,7 +6,7 @@ from typing import get_args
 from torch import Tensor, nn
 
 from semfov.belief import Grid
-from semfov.errors import InputError, check, lookup
+from semfov.errors import InputError, check, lookup, type_of
 from semfov.gaze.acquisition.base import FUNCTIONS, AcquisitionFunction, Task
 from semfov.gaze.acquisition.lookahead import DrawnLooks
 from semfov.observation.foveal import FovealObservationModel
@@ -76,7 +76,7 @@ class Policy(nn.Module):
         if "model" not in self.function.takes:
             return None
         if not isinstance(model, FovealObservationModel):
-            got = "none" if model is None else f"a {type(model).__name__}"
+            got = "none" if model is None else type_of(model)
             raise InputError(f"policy {self.name!r}: expected an observation model, got {got}")
         return model
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large
 from semfov.data.windowed import LargePicture, resized
-from semfov.errors import DataError, InputError, check, check_number
+from semfov.errors import DataError, InputError, check, check_number, type_of
 from semfov.head.scenes import Flat, Panorama, Sphere, World, check_fields, check_limits
 from semfov.head.speeds import Speeds
 from semfov.sensor.sphere import Camera, panorama_directions
@@ -194,7 +194,7 @@ def open_scene(scene: SceneLike, color: Color = "rgb") -> World:
     ('Panorama', 'Flat')
     """
     if isinstance(scene, World):
-        check(color == "rgb", "color", f"rgb for a {type(scene).__name__}, which was made with its own color", color)
+        check(color == "rgb", "color", f"rgb for {type_of(scene)}, which was made with its own color", color)
         return scene
     if hasattr(scene, "look_at"):
         return _CameraScene(cast(PanTiltCamera, scene), color)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.errors import InputError, check_where_to
+from semfov.errors import InputError, check_where_to, type_of
 
 EXTRA_STATE = "_extra_state"
 """Name of the settings of a module in its state."""
@@ -54,7 +54,7 @@ class StatedModule(MovableModule):
         for name, value in json.loads(json.dumps(self._stated())).items():  # as JSON, where tuples are lists
             if theirs.get(name, value) != value:
                 raise InputError(
-                    f"state_dict: expected the state of a {type(self).__name__} with {name} {value!r:.200}, got one "
+                    f"state_dict: expected the state of {type_of(self)} with {name} {value!r:.200}, got one "
                     f"with {theirs[name]!r:.200}; make the module with these settings"
                 )
         self._load_fitted_values(theirs)

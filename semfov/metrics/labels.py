@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.errors import InputError, check, reason_of, values_known
+from semfov.errors import InputError, check, reason_of, type_of, values_known
 
 
 def as_numbers(values: object, argument: str) -> Tensor:
@@ -70,7 +70,7 @@ def as_labels(labels: Iterable[object], argument: str, *, least: int = 0) -> lis
     Raises:
         InputError: they are in no row, too few, NaN, or nothing that can be compared.
     """
-    check(hasattr(labels, "__iter__"), argument, "labels in a row", f"a {type(labels).__name__}")
+    check(hasattr(labels, "__iter__"), argument, "labels in a row", type_of(labels))
     if isinstance(labels, Tensor | np.ndarray):
         check(labels.ndim == 1, argument, "labels in a row", f"shape {tuple(np.shape(labels))}")
         values = labels.tolist()
@@ -93,7 +93,7 @@ def _plain(label: Any) -> Hashable:
     value = label.item() if is_scalar else label
     # A tensor has a hash, but equals itself alone.
     is_comparable = _has_hash(value) and not isinstance(value, Tensor | None)
-    got = f"a {type(label).__name__} of shape {tuple(np.shape(label))}"
+    got = f"{type_of(label)} of shape {tuple(np.shape(label))}"
     check(is_comparable, "labels", "names or numbers", got)
     return value
 

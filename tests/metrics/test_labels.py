@@ -139,7 +139,7 @@ def test_numbers_of_other_kinds_are_refused_by_name():
         (lambda: area_under_roc(SCORE, present[None]), r"present: expected one outcome for each score \(5,\)"),
         (lambda: area_under_roc(torch.tensor(SCORE) + 1j, present), "score: expected real numbers, got complex"),
         (lambda: calibration(square, torch.eye(2)), "labels: expected 2 numbers, one for each row"),
-        (lambda: edit_distance(3, 4), "ours: expected labels in a row, got a int"),
+        (lambda: edit_distance(3, 4), "ours: expected labels in a row, got an int"),
         (lambda: nss(np.ones((2, 2)) + 1j, [0], [0]), "maps: expected real numbers.*complex128"),
         (lambda: auc(np.ones((2, 2)), ["left"], [0]), "x, y: expected real numbers"),
         (lambda: information_gain([[1, 2], [3]], [[1, 2]], [0], [0]), "density: expected real numbers in rows of one"),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from semfov.data.sources import PHOTOGRAPHS, VIDEOS
-from semfov.errors import DataError, check, check_data
+from semfov.errors import DataError, check, check_data, type_of
 from semfov.human.fixations.encodings import read_recording
 from semfov.human.fixations.smi import Events, has_events
 from semfov.io.files import reading
@@ -155,7 +155,7 @@ def table_of(source: str | PathLike[str] | DataFrame) -> Table:
     expected = (
         "a file, or a pandas.DataFrame (pandas.DataFrame(source) makes one of lists, source.to_pandas() of Polars)"
     )
-    check(is_frame, "source", expected, f"a {type(source).__name__}")
+    check(is_frame, "source", expected, type_of(source))
     return _table_of_frame(source)
 
 

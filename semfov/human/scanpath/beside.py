@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semfov.data.fixations import Fixations
 from semfov.data.fixations.record import bare_name, inside_frame
-from semfov.errors import check
+from semfov.errors import check, type_of
 from semfov.human.fixations.reading import check_usual_frame, read_fixations
 from semfov.human.fixations.suspicions import check_viewed, warn_of_frames
 from semfov.human.scanpath.alignment import dynamic_time_warping, multimatch, scanmatch, time_delay_embedding
@@ -192,7 +192,7 @@ def _as_fixations(people: Fixations | Record | Sequence[Fixations | Record], pic
     viewed = []
     for entry in entries:
         fixations = entry.as_fixations(entry.source or name) if isinstance(entry, Record) else entry
-        got = f"a {type(fixations).__name__}"
+        got = type_of(fixations)
         check(isinstance(fixations, Fixations), "people", "fixations, records of an agent, or a file", got)
         viewed.append(fixations)
     return viewed
