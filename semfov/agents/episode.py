@@ -294,18 +294,18 @@ def on_cpu(module: _Module) -> _Module:
     Returns:
         The copy; the module itself if all its tensors are on the CPU.
     """
-    # Modules list a tensor that two layers share once.
-    tensors = [tensor for tensor in (*module.parameters(), *module.buffers()) if tensor.device.type != "cpu"]
-    if not tensors:
-        return module
     elsewhere: dict[torch.dtype, list[Tensor]] = {}
-    for tensor in tensors:
-        elsewhere.setdefault(tensor.dtype, []).append(tensor)
+    # Modules list a tensor once that two layers share.
+    for tensor in (*module.parameters(), *module.buffers()):
+        if tensor.device.type != "cpu":
+            elsewhere.setdefault(tensor.dtype, []).append(tensor)
+    if not elsewhere:
+        return module
     copies: dict[int, Tensor] = {}
-    for tensors in elsewhere.values():
-        joined = torch.cat([tensor.detach().flatten() for tensor in tensors]).cpu()
-        parts = joined.split([tensor.numel() for tensor in tensors])
-        for tensor, part in zip(tensors, parts, strict=True):
+    for of_one_dtype in elsewhere.values():
+        joined = torch.cat([tensor.detach().flatten() for tensor in of_one_dtype]).cpu()
+        parts = joined.split([tensor.numel() for tensor in of_one_dtype])
+        for tensor, part in zip(of_one_dtype, parts, strict=True):
             copies[id(tensor)] = _shaped_as(tensor, part)
     return _with_tensors(module, copies, {})
 

@@ -321,10 +321,19 @@ class Outcome(ABC):
         if not self.is_doubtful:
             return None
         places = [(look.box, look.place) for look in self.closer]
-        if not places:
-            candidates = self.candidates.of(self.sought)
-            places = list(zip(candidates.boxes, candidates.scores.tolist(), strict=True))
+        # A score does not compare with the probability of a place that was looked at closely.
+        if not places or self.unseen is not None:
+            others = self._candidates_not_examined()
+            places += zip(others.boxes, others.scores.tolist(), strict=True)
         return max(places, key=lambda place: place[1], default=None)
+
+    def _candidates_not_examined(self) -> Objects:
+        """Select the candidates of the targets at which no closer look was made."""
+        candidates = self.candidates.of(self.sought)
+        if not self.closer:
+            return candidates
+        examined = torch.stack([look.box for look in self.closer]).to(candidates.boxes)
+        return candidates[(box_iou(candidates.boxes, examined) < SAME_OBJECT_IOU).all(1)]
 
     @property
     def _confirmed_places(self) -> list[_ConfirmedPlace]:

@@ -115,6 +115,19 @@ def test_an_undecided_search_names_its_best_place_and_whose_probability_it_has()
     assert small.with_looks(replace(path, closer=()), detections=[look(), look()]).words.best_place == ""
 
 
+def test_a_refuted_place_is_not_the_best_where_another_is_more_probable():
+    """That of a candidate that was not looked at closely, if its score is a probability; the refuted one's is not."""
+    seen = look((LEFT, 1, 0.9), (RIGHT, 1, 0.45))
+    path = scanpath(seen, look(), target=1, decision=Decision("undecided", 0.7))
+    shifted = torch.tensor([LEFT[0] + 2.0, *LEFT[1:]])  # the closer look has a box of its own
+    refuted = replace(path, closer=(CloseUp(0, 1, 0, shifted, 0.001, 0.6),))
+    assert refuted.place_probability == pytest.approx(0.001)
+    by_probability = replace(refuted, unseen=(0.0, 0.0))
+    box, probability = by_probability.best_place
+    assert (box.tolist(), probability) == (RIGHT, pytest.approx(0.45))
+    assert by_probability.place_probability == pytest.approx(0.45)
+
+
 def test_looks_tell_the_target_first_and_count_detections_from_one_score_on():
     """However faint it is; what is fainter than 0.1 is told and counted nowhere else."""
     seen = look((LEFT, 2, 0.8), (RIGHT, 2, 0.5), (shifted(RIGHT, 4), 2, 0.3), (shifted(LEFT, 4), 1, 0.06))
