@@ -17,7 +17,7 @@ fits the agent to a detector of your own. Each part is also a function or a diff
 import lazy_loader
 
 import semfov.cli.start  # noqa: F401 (before what takes long to import)
-from semfov.words import PACKAGE, missing
+from semfov.attribute_words import PACKAGE, missing
 
 # Names are imported when they are first asked for (the stub says from where): the help of the command needs none.
 _named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

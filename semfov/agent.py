@@ -11,6 +11,7 @@ from semfov.agents.head import HeadAgent
 from semfov.agents.kinds import KINDS_OF_LOOK, KindOfLook
 from semfov.agents.picture import OpenedPicture, PictureLike, check_order
 from semfov.agents.windows import ZoomAgent, knows_photographs, window_eye
+from semfov.attribute_words import AGENT, missing
 from semfov.belief.grid import check_cells
 from semfov.belief.observers import Observer, SemanticMap, SemanticSearch
 from semfov.belief.observers.any_of import TargetLike
@@ -53,7 +54,6 @@ from semfov.settings import (
     documented_by,
 )
 from semfov.strategy import Strategy, classes_named
-from semfov.words import AGENT, missing
 from semfov.zoom import GlimpseEvidence
 
 _Targets = str | int | Sequence[str | int] | None  # a class by name or index, several of them, or None for all classes

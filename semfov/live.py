@@ -6,13 +6,13 @@ from numpy.typing import ArrayLike
 
 from semfov.agents.kinds import KINDS_OF_LOOK, AgentParts
 from semfov.agents.picture import OpenedPicture
+from semfov.attribute_words import LIVE, OtherWords, Room
 from semfov.data.inputs import FRAME, ImageLike, as_image
 from semfov.data.tone import White, check_white
 from semfov.errors import check
 from semfov.motion import Motion
 from semfov.paths import Moment
 from semfov.settings import How, StreamSettings
-from semfov.words import LIVE, OtherWords, Room
 
 __all__ = ["LivePerception"]
 

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from semfov.attribute_words import DECISION, OtherWords
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
@@ -14,7 +15,6 @@ from semfov.episode import Step
 from semfov.errors import InputError, check, check_whole
 from semfov.io.schema import is_number
 from semfov.observation.thresholds import Thresholds
-from semfov.words import DECISION, OtherWords
 
 Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")

@@ -8,10 +8,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from semfov.attribute_words import OBJECTS, OtherWords
 from semfov.data.classes import amount, class_index
 from semfov.data.inputs import as_positions
 from semfov.errors import InputError, check, check_number, check_shape
-from semfov.words import OBJECTS, OtherWords
 
 NO_TRACK = -1
 """Number of an object of a stream that no track follows."""

@@ -2,11 +2,11 @@
 
 import sys
 
+from semfov.attribute_words import Room
 from semfov.gaze import acquisition, policies, saliency
 from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax, select_fixation, soft_fixation
 from semfov.gaze.policies import Policy
 from semfov.gaze.viewer import Viewer
-from semfov.words import Room
 
 __all__ = [
     "Choice",

@@ -2,7 +2,7 @@
 
 import lazy_loader
 
-from semfov.words import METRICS, missing
+from semfov.attribute_words import METRICS, missing
 
 _MODULES = ["average_precision", "calibration", "episodes", "labels", "merging", "scanpath"]
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from semfov.attribute_words import RECORD, OtherWords
 from semfov.data.classes import canonical_name
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large
@@ -26,7 +27,6 @@ from semfov.paths.georeference import Geometry, PlaceOnEarth, box_on_earth, geor
 from semfov.paths.look import RecordedLook, confident_detections
 from semfov.paths.outcome import Outcome
 from semfov.paths.words import Words
-from semfov.words import RECORD, OtherWords
 
 if TYPE_CHECKING:
     import pandas

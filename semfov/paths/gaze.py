@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.attribute_words import GAZE_PREDICTION, OtherWords
 from semfov.data.classes import amount
 from semfov.data.fixations import Fixations
 from semfov.detection import Detector, FeatureMaps
@@ -35,7 +36,6 @@ from semfov.paths.places import Place, are_apart, places_of
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.viewed import ScanpathLike, fixations_of
 from semfov.paths.viewers import AreaVisits, drawn_durations, drawn_starts, visits_of
-from semfov.words import GAZE_PREDICTION, OtherWords
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,7 +137,6 @@ class GazePrediction(OtherWords):
                 fixations = fixations_of(seen, "seen", size, source)
                 features = _foveal_features(eye, image, fixations.resized(size_of_image), fitted)
                 terms = converted.terms(features, size[::-1])
-
         on_processor = {name: term.cpu() for name, term in terms.items()}
         photograph = reduced_copy(image)
         if _is_blank(photograph):

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semfov.attribute_words import LOOK, OtherWords
 from semfov.belief.grid import Grid
 from semfov.data.classes import amount
 from semfov.data.windowed import LargePicture, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.objects import box_text
-from semfov.words import LOOK, OtherWords
 
 Box = tuple[float, float, float, float]  # `(x1, y1, x2, y2)`
 _Steps = TypeVar("_Steps", Tensor, NDArray[np.float64])

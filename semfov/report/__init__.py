@@ -2,9 +2,9 @@
 
 import sys
 
+from semfov.attribute_words import Room
 from semfov.report import gaze as _gaze  # noqa: F401 (predictions are drawn there)
 from semfov.report.page import page_html, write_page
-from semfov.words import Room
 
 __all__ = ["page_html", "write_page"]
 

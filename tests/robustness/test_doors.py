@@ -16,6 +16,7 @@ from semfov import (
     WindowEye,
     ZoomAgent,
     as_image,
+    attribute_words,
     foveate,
     read_image,
     words,
@@ -361,7 +362,7 @@ def test_a_run_takes_earlier_names_and_settings_name_the_present_ones(agent):
         said = f"^{former}: expected an option of {kind.__name__}, .* did you mean {present}="
         with pytest.raises(SemfovError, match=said):
             kind(**{former: 0.5})
-    with pytest.raises(SemfovError, match=r"^iou: .* did you mean per_class=\?$"):
+    with pytest.raises(SemfovError, match=r"^iou: .* agent=semfov\.ActivePerception\.recommended\(iou=…\)$"):
         semfov.run("a.jpg", "cup", agent=agent, iou=0.5)
     with pytest.warns(FutureWarning, match="least is called score_threshold now"):
         assert small.Fixed(("cup",), least=0.4).score_threshold == 0.4
@@ -602,7 +603,7 @@ NAMED = {
 @pytest.mark.parametrize("table", ["AGENT", "DECISION", "GAZE_PREDICTION", "LIVE", "OBJECTS", "PACKAGE", "RECORD"])
 def test_what_a_hint_names_is_there(table, agent):
     """Every attribute in the words for others' words is one of the class."""
-    text = "\n".join({*getattr(words, table).values(), *words.MAKERS.values()})
+    text = "\n".join({*getattr(attribute_words, table).values(), *words.MAKERS.values()})
     names = re.findall(rf"\b({'|'.join(NAMED)})\.(\w+)", text)
     assert names
     absent = [

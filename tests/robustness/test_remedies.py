@@ -16,7 +16,7 @@ import torch
 from matplotlib.figure import Figure
 
 import semfov
-from semfov import ActivePerception, words
+from semfov import ActivePerception, attribute_words, words
 from semfov.cli.commands import SUBCOMMANDS
 from semfov.cli.main import _option_names
 from semfov.cli.options import FindOptions
@@ -30,9 +30,16 @@ from tests import small
 PIXELS = np.random.default_rng(0).integers(0, 256, (30, 44, 3), dtype=np.uint8)
 
 ATTRIBUTES = (
-    words.PACKAGE, words.AGENT, words.DECISION, words.LIVE, words.OBJECTS, words.RECORD, words.GAZE_PREDICTION,
-    words.LOOK, words.METRICS,
-)  # fmt: skip
+    attribute_words.PACKAGE,
+    attribute_words.AGENT,
+    attribute_words.DECISION,
+    attribute_words.LIVE,
+    attribute_words.OBJECTS,
+    attribute_words.RECORD,
+    attribute_words.GAZE_PREDICTION,
+    attribute_words.LOOK,
+    attribute_words.METRICS,
+)
 REMEDIES = {
     *(remedy for table in (*ATTRIBUTES, words._OTHER_PLACES) for remedy in table.values()),
     *(remedy for table in words.ADVICE_OF.values() for remedy in table.values()),
@@ -177,9 +184,9 @@ def test_the_head_of_a_word_of_several_parts_comes_first(word, parts):
 
 def test_measures_are_in_the_modules_that_are_named():
     for name in ("nss", "multimatch", "calibration_error", "area_under_roc"):
-        with pytest.raises(AttributeError, match=words.METRICS[name]):
+        with pytest.raises(AttributeError, match=attribute_words.METRICS[name]):
             getattr(semfov.metrics, name)
-        assert hasattr(importlib.import_module(words.METRICS[name]), name)
+        assert hasattr(importlib.import_module(attribute_words.METRICS[name]), name)
 
 
 def test_the_modules_of_measures_need_no_import_of_their_own():
@@ -198,7 +205,7 @@ def test_remedies_are_read():
 
 
 def test_sizes_of_objects_are_those_that_the_remedy_computes():
-    code = words.OBJECTS["xywh"].rpartition(": ")[2].removesuffix(" are their sizes")
+    code = attribute_words.OBJECTS["xywh"].rpartition(": ")[2].removesuffix(" are their sizes")
     objects = small.agent(small.Fixed(("cup",)), grid=(4, 3), sigma=10.0).find_all(PIXELS, "cup").candidates
     for (x1, y1, x2, y2), (width, height) in zip(objects.boxes.tolist(), eval(code, {"objects": objects}), strict=True):
         assert (float(width), float(height)) == pytest.approx((x2 - x1, y2 - y1))
