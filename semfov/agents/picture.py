@@ -80,6 +80,9 @@ class OpenedPicture:
     def kind(self, how: str, canvas: tuple[int, int], *, every: bool = False, photographs: bool = False) -> KindName:
         """Choose the kind of look that suits the picture.
 
+        Where windows suit photographs, too, `auto` takes them for every flat picture; else for those with a side of at
+        least four times the detector's input.
+
         Args:
             how: a kind of look, or `auto`.
             canvas: `(width, height)` of the detector's input.

@@ -77,8 +77,11 @@ presence does (`settle`):
 Places of large pictures are in `semfov.zoom.places`, those of photographs in `semfov.zoom.closer`, and decisions by
 windows in `semfov.zoom.decision`.
 
-Without fitted models no probability decides: a detection whose score is at least `confirm` is `found`
-(ending "detection"), nothing is `absent`. A head decides as a fovea without closer looks, by its present gaze alone.
+Without fitted models no probability decides: a detection whose score is at least `confirm` is `found` (ending
+"detection"), with a fovea if it covers the fixated cell well enough (`detects`, `confirms`); nothing is `absent`.
+
+A head has no closer looks that decide: the target is found if presence and the cell of the present gaze reach
+`confirm`, and `stop_below` is compared with the best cell that was not fixated (`semfov.agents.head`).
 """
 
 from semfov.decision.candidates import CandidateCells, CandidatePlace, CandidatePlaces

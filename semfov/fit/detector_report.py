@@ -11,10 +11,10 @@ from semfov.runs.tables import percent, plus_minus, table
 
 
 class Difference(NamedTuple):
-    """The difference between a measure with fitted models and with raw scores, paired over photographs.
+    """The difference between a measure of the agent with a fitted part and without it, paired over photographs.
 
     Attributes:
-        mean: mean of the paired differences; positive where the fitted models are better.
+        mean: mean of the paired differences; positive where the fitted part is better.
         error: its standard error.
         photographs: number of photographs.
     """

@@ -5,8 +5,9 @@
     with evidence              mean of the looks that show it whole    probability that it is there, by its facts
     (`merge_with_facts`)                                               (`semfov.zoom.certainty`)
     without (`merge`)          that of the sharpest look               the highest of all looks
-    at a stream that forgets,  where the tracker has it                probability that it is there still
-    with evidence              (`semfov.tracking`)
+    at a stream that forgets,  where the tracker has it                probability that it is there, times that its
+    with evidence              (`semfov.tracking`)                     box fits (`Tracks.probability`)
+    without                    that of the sharpest recent look        the highest of recent looks
 
 Boxes of one class that overlap, or of which one is cut and lies in the other, are of one object.
 """
