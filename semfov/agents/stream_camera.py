@@ -16,8 +16,8 @@ class StreamCamera:
     """How the camera moves between frames: by the poses that are given, or estimated from the frames.
 
     The first frame decides: with a pose `_poses` is made, and without one `_estimate`, where the camera is followed.
-    Either way `flow` follows objects. It reads all of a frame, so that with poses it is shown those alone that are in
-    memory.
+    Either way `flow` follows objects. It reads all of a frame, so that with poses it is made only where the first frame
+    is in memory.
 
     Args:
         follows: whether its motion is estimated from the frames, where no poses are given.
@@ -47,9 +47,10 @@ class StreamCamera:
             self._begin(view, is_pose_known=pose is not None)
         self._is_first = False
         if pose is not None and self._poses is not None:
+            step = self._poses.step(pose)  # first, as a pose may be refused
             if self.flow is not None:
                 self.flow.step(_pixels(view))
-            return self._poses.step(pose)
+            return step
         return None if self._estimate is None else self._estimate.step(_pixels(view))
 
     def _begin(self, view: WindowView, *, is_pose_known: bool) -> None:

@@ -185,6 +185,8 @@ class WindowSession:
 
     def look(self) -> KeptLook | None:
         """Look at the next window, or closely at a place that seems to hold the target; None if no window is left."""
+        if self.forgetting is not None:
+            self._closer_looks = [look for look in self._closer_looks if self._counts(look)]
         if self.decisions.candidate is not None:
             return self._look_closely(self.decisions.candidate)
         step = next(self._steps, None)
@@ -192,9 +194,6 @@ class WindowSession:
             return None
         self.step = step
         self._number(step.newest)
-        if self.forgetting is not None:
-            oldest = self.source.time - self.forgetting.span
-            self._closer_looks = [look for look in self._closer_looks if look.time >= oldest]
         self.decisions.see(step, self.kept_looks, self.passes, self.limits.room(self.passes))
         return step.newest
 
@@ -204,8 +203,13 @@ class WindowSession:
         look = KeptLook(original, self.source.time, candidate.probability)
         self._number(look)
         self._closer_looks.append(look)
-        self.decisions.examine(original)
+        # No look at another window forgets what has aged meanwhile, and places of old looks would be due for ever.
+        self.decisions.examine(original, [kept for kept in self.kept_looks if self._counts(kept)])
         return look
+
+    def _counts(self, look: KeptLook) -> bool:
+        """Tell whether half of what a look showed, or more, is left."""
+        return self.forgetting is None or look.time >= self.source.time - self.forgetting.span
 
     def _number(self, look: KeptLook) -> None:
         """Give the newest look the number of its pass and the time at its end."""

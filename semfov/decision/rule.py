@@ -26,7 +26,7 @@ MOST_CLOSER = 2
 """Number of closer looks after which a place is found that is probable enough; by default a search makes no more."""
 
 _NEARLY = 0.9  # share of the largest probability of any cell from which on a fixated cell counts as the target's
-EVEN_CHANCE = 0.5  # presence below which the target of a search without a find is absent
+EVEN_CHANCE = 0.5  # presence below which a picture rather lacks the target: without a find it is absent
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,14 @@ _FLOOR = 1e-6
 
 
 class _Verdict(NamedTuple):
-    """A closer look at a place, its magnification, the seconds since then, and whether the present frame shows it."""
+    """A closer look at a place, and what became of it since.
+
+    Attributes:
+        look: the closer look, where the place is in the present frame.
+        magnification: canvas pixels of the look for a pixel of the present frame.
+        age: seconds since the look.
+        in_view: whether the present frame shows the place.
+    """
 
     look: CloseUp
     magnification: float
@@ -379,11 +386,13 @@ def _moved_verdicts(verdicts: list[_Verdict], motion: Motion, size: tuple[int, i
     moved_boxes, boxes_ahead = motion.boxes_ahead(boxes)
     ahead = boxes_ahead.tolist()
     in_view = inside_frame(moved_boxes, size).tolist()
+    scales = motion.scale_at((boxes[:, :2] + boxes[:, 2:]) / 2).tolist()
     moved_verdicts = []
     for number, verdict in enumerate(verdicts):
         if ahead[number]:
             look = replace(verdict.look, box=moved_boxes[number])
-            moved_verdicts.append(verdict._replace(look=look, in_view=in_view[number]))
+            magnification = verdict.magnification / scales[number]
+            moved_verdicts.append(verdict._replace(look=look, magnification=magnification, in_view=in_view[number]))
     return moved_verdicts
 
 

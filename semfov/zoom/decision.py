@@ -65,8 +65,13 @@ class WindowDecisions(DecisionState):
         """Make the decision of a search that ends as it is, also if a closer look is due."""
         return self.decision
 
-    def examine(self, look: WindowLook) -> None:
-        """Judge the candidate by a closer look, and choose the next one."""
+    def examine(self, look: WindowLook, kept: Sequence[KeptLook]) -> None:
+        """Judge the candidate by a closer look, and choose the next one.
+
+        Args:
+            look: the closer look.
+            kept: the looks that count and show some of the picture, this one included.
+        """
 
     def wait(self, passed: float) -> None:
         """Let seconds pass. In a stream, call it before every frame."""
@@ -122,7 +127,7 @@ class LastingAbsence:
 
     A window is free for another look when half of what it showed is left, so that the search goes on, and `absent`
     would come and go before a scene in which nothing changes. It stays for as long as a look counts, unless the picture
-    rather holds the target, or the camera has lost the scene.
+    rather holds the target, or the camera shows another scene.
     """
 
     def __init__(self, forgetting: Forgetting | None) -> None:
@@ -134,9 +139,10 @@ class LastingAbsence:
         """Let seconds pass."""
         self._age += passed
 
-    def end(self) -> None:
-        """Let it end, as the scene is another one."""
-        self._age = math.inf
+    def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
+        """Let it end where the scene is another one: the camera has lost it, or nothing that was seen is in view."""
+        if camera.motion is None or not kept:
+            self._age = math.inf
 
     def see(self, decision: Decision | None) -> None:
         """Take the decision after a look."""
@@ -215,8 +221,7 @@ class DecisionsByPresence(WindowDecisions):
         self._absence.wait(passed)
 
     def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
-        if camera.motion is None:
-            self._absence.end()
+        self._absence.follow(camera, kept)
         looks = [] if camera.motion is None or self._step is None else self._telling(self._step, kept)
         if looks:
             self._facts.see(looks)
@@ -261,11 +266,13 @@ class DecisionsByCloserLooks(DecisionsByPresence):
     def looks(self) -> list[CloseUp]:
         return self.verifier.looks
 
-    def examine(self, look: WindowLook) -> None:
+    def examine(self, look: WindowLook, kept: Sequence[KeptLook]) -> None:
         if self._is_large:
-            self._facts.add(look)
+            self._facts.see([of_picture.current for of_picture in kept])
         self.verifier.examine(look.candidates)
         self._examine_shown()
+        if self._facts.latest:
+            self._absence.see(self._latest_decision)
 
     def _examine_shown(self) -> None:
         """Examine the places that need no pass, and decide."""
@@ -286,12 +293,11 @@ class DecisionsByCloserLooks(DecisionsByPresence):
 
     def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
         self.verifier.follow(camera, self.frame)
-        if camera.motion is None:
-            self._absence.end()
         candidate = self.candidate
         if candidate is not None and not bool(inside_frame(candidate.box, self.frame)):
             self.verifier.candidate = None  # a closer look would show another place
         if self.candidate is None:
+            self._absence.follow(camera, kept)
             return  # the look that follows has facts of its own
         super().follow(camera, kept)
         if self._facts.looks:

@@ -81,7 +81,6 @@ class PhotographEvidence(nn.Module):
         Returns:
             Log odds, `(...)`.
         """
-        facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1)
         facts = torch.stack([best.logit(1e-4), self.usual[target - 1]], -1).to(self.whole.weight)
         with without_autocast(facts):
             return self.whole(facts)[..., 0]

@@ -195,7 +195,7 @@ class ObjectPlaces(WindowPlaces):
 class ObjectVerifier(PlaceVerifier[TargetFacts]):
     """Decides a search of a large picture: a place is as probable as the object of the target there.
 
-    A closer look is one more look at the picture, which `facts` have before it is judged (`SearchFacts.add`). The place
+    A closer look is one more look at the picture, which `facts` have before it is judged. The place
     has the probability of the surest object whose box overlaps that of the candidate, and its box. The probability of
     the picture is that after all looks, and no smaller than that of the place.
 
