@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import WindowEye, ZoomAgent
+from semfov import InputError, WindowEye, ZoomAgent
 from semfov.motion import Motion
 from semfov.observation.matching import box_iou
 from semfov.paths import WindowMoment
@@ -122,6 +122,21 @@ def textured_frames(count, camera_step):
         view[y : y + 48, x : x + 48] = square
         left, top = 20 + number * camera_step[0], 20 + number * camera_step[1]
         yield view[top : top + 768, left : left + 1024], Motion.similarity(shift=(20 - left, 20 - top))
+
+
+def test_a_pose_that_is_refused_does_not_move_the_flow_on():
+    """The same frame may be given again, with another pose."""
+    velocities = []
+    for refused_pose in (None, np.full((3, 3), np.nan)):
+        agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2)).eval()
+        episode = agent.stream(None, (RED,), StreamSettings(), follows=True)
+        for number, (frame, pose) in enumerate(textured_frames(3, (4, 2))):
+            if number == 2 and refused_pose is not None:
+                with pytest.raises(InputError, match="3 × 3 matrix"):
+                    episode.step(frame, pose=refused_pose)
+            moment = episode.step(frame, pose=pose)
+        velocities.append(moment.tracks.velocities)
+    torch.testing.assert_close(velocities[0], velocities[1])
 
 
 @pytest.mark.parametrize("is_pose_given", [False, True])

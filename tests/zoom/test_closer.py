@@ -31,6 +31,7 @@ from semfov.zoom.slices import ranked, raw, usual_slices
 from tests.motion.test_camera import scene
 from tests.refusals import refused, unusable
 from tests.small import Coloured
+from tests.zoom.test_carrying import Patches
 
 AT = Thresholds(confirm=0.6, stop_below=0.01, place=0.2)
 LATTICE = Lattice.over((1024, 768), (128, 128))
@@ -491,6 +492,55 @@ def test_a_still_picture_that_lacks_the_target_lacks_it_from_then_on():
     assert set(outcomes[first:]) == {"absent"}
 
 
+def test_a_camera_that_turns_to_other_ground_lacks_nothing_yet():
+    """`absent` is not said of what no look has covered."""
+    ground = np.repeat(scene(2, side=2300)[:768].mean(-1, keepdims=True) / 4 + 60, 3, -1).astype(np.uint8)
+    live = ZoomAgent(WindowEye(Sized()), evidence()).stream(1, (), StreamSettings(rate=1.0, stop_below=0.35))
+    outcomes = []
+    for left in (0,) * 12 + (1200,) * 2:
+        moment = live.step(ground[:, left : left + 1024], pose=Motion.similarity(shift=(-left, 0)))
+        outcomes.append(moment.decision.outcome)
+    assert outcomes[11:] == ["absent", "undecided", "undecided"]
+
+
+@pytest.mark.parametrize("scale", [2.0, 0.4])
+def test_the_magnification_of_a_verdict_follows_the_zoom_of_a_camera(scale):
+    """A closer look has as many pixels for the object, whatever the present frame shows it with."""
+    whole = replace(seen([ONE], [0.3]), window=Window.overview(LATTICE))
+    facts = SearchFacts(ZoomBelief(LATTICE, evidence(), 1), latest=True)
+    facts.add(whole)
+    judge = ObjectVerifier(ObjectPlaces(facts, Forgetting(0.25)), AT, 9)
+    judge.see(TargetFacts(whole.detections, 1, facts.presence(), 0.3, 0.0, whole.window), last=True)
+    close = replace(seen([ONE], [0.9]), window=closer_window(LATTICE, judge.candidate.box))
+    facts.add(close)
+    judge.examine(close.detections)
+    (before,) = judge.verdicts
+    judge.follow(CameraStep(Motion.similarity(scale=scale)), LATTICE.size)
+    (after,) = judge.verdicts
+    widths = [float(verdict.look.box[2] - verdict.look.box[0]) for verdict in (before, after)]
+    assert after.magnification * widths[1] == pytest.approx(before.magnification * widths[0])
+    assert before.magnification == pytest.approx(close.window.fixation[2])
+
+
+def test_objects_that_stay_unsure_do_not_keep_a_stream_from_other_windows():
+    """Each is due again when its look has aged, and the looks that showed it age, too."""
+    torch.manual_seed(0)
+    model = GlimpseEvidence(2, thresholds=Thresholds(0.3, 0.01), places=Thresholds(0.97, 0.01, 0.2)).eval()
+    model.certainty = Certainty(0.9, (0.0,) * len(FACTS))
+    with torch.no_grad():
+        model.whole.weight.copy_(torch.tensor([[0.0, 1.0]]))
+    picture = np.full((768, 1024, 3), 90, np.uint8)
+    for x, y in ((100, 100), (600, 120), (300, 500), (820, 560), (500, 330)):
+        picture[y : y + 60, x : x + 60] = 255, 0, 0
+    live = ZoomAgent(WindowEye(Patches()), model).stream(1, (), StreamSettings(rate=1.0))
+    closer = 0
+    for _ in range(20):
+        moment = live.step(picture, passed=0.3)
+        assert len(moment.looks) <= 6
+        closer += moment.examined is not None
+    assert 5 <= closer <= 15
+
+
 ABSENT, OPEN, LIKELY = Decision("absent", 0.3), Decision("undecided", 0.4), Decision("undecided", 0.6)
 
 
@@ -516,9 +566,15 @@ def test_a_target_stays_absent_while_a_look_counts_unless_something_says_otherwi
 
 def test_an_absence_ends_with_its_scene_and_lasts_in_no_picture():
     absence = LastingAbsence(Forgetting(1.0))
-    absence.see(ABSENT)
-    absence.end()
-    assert absence.kept(OPEN) == OPEN
+    looks = [object()]  # some are in view
+    for camera, in_view, outcome in (
+        (CameraStep(Motion.still()), looks, "absent"),
+        (CameraStep(None), looks, "undecided"),
+        (CameraStep(Motion.still()), [], "undecided"),
+    ):
+        absence.see(ABSENT)
+        absence.follow(camera, in_view)
+        assert absence.kept(OPEN).outcome == outcome
     for forgetting in (None, Forgetting()):
         absence = LastingAbsence(forgetting)
         absence.see(ABSENT)
