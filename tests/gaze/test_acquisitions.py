@@ -21,7 +21,7 @@ from semfov.gaze.acquisition import (
     TwoPeaks,
 )
 from tests import small
-from tests.gaze.test_modules import LOOKAHEADS, functions
+from tests.gaze.test_modules import functions
 from tests.refusals import refused
 from tests.small import draw, values_of
 
@@ -138,6 +138,18 @@ def test_values_depend_only_on_the_probability_of_the_target(name):
 def test_target_posterior_uses_the_probabilities_given_absence_from_visited_cells():
     alone = target_belief(draw(3, 12), draw(3, 12, seed=1), small.GRID.cell_distance[[0, 6, 11]].double())
     assert torch.equal(EVERY["TargetPosterior"]()(alone, visits()), alone.following)
+
+
+LOOKAHEADS = (
+    "KLDivergence",
+    "BayesianSurprise",
+    "NegativeEntropy",
+    "TwoPeaks",
+    "UpperConfidenceBound",
+    "ProbabilityOfImprovement",
+    "ExpectedAccuracy",
+)
+"""Functions that subtract nearly equal values."""
 
 
 @pytest.mark.parametrize("shape", [(5,), (11, 4), (1, 13, 4)])
