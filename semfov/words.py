@@ -17,6 +17,9 @@ _VERBS = ("as", "draw", "exclude", "export", "hide", "ignore", "plot", "print", 
 NEGATIONS = ("disable", "no", "not", "without")
 """Beginnings of words that ask for the opposite of what follows."""
 
+_LINKS = ("for",)
+"""Parts that mean an option as a word alone, `--for cup`, and nothing in a word of several, `--wait-for`."""
+
 
 def parts_of(word: str) -> list[str]:
     """List the parts of a word of several that may tell what it means, the likeliest first.
@@ -36,7 +39,12 @@ def parts_of(word: str) -> list[str]:
     ends = ["_".join(words[first:]) for first in range(1, len(words))]
     beginnings = ["_".join(words[:count]) for count in range(len(words) - 1, 0, -1)]
     parts = beginnings + ends if words[0] in _VERBS else ends + beginnings
-    return [form for part in parts if len(part) > 2 for form in (part, f"{part}s", part.removesuffix("s"))]
+    return [
+        form
+        for part in parts
+        if len(part) > 2 and part not in _LINKS
+        for form in (part, f"{part}s", part.removesuffix("s"))
+    ]
 
 
 OPTIONS = by_word(
@@ -154,7 +162,7 @@ _ADVICE = by_word(
     }
 )
 
-_ADVICE_FOR_BOXES = by_word(
+ADVICE_FOR_BOXES = by_word(
     {
         "the detector leaves out what overlaps a better box; in Python semfov.load_detector(NAME, iou=…) says when": (
             "iou iou_thres iou_threshold match_threshold nms nms_iou nms_threshold"
@@ -162,6 +170,7 @@ _ADVICE_FOR_BOXES = by_word(
         "boxes of all classes suppress each other, unless --per-class is given": "agnostic agnostic_nms class_agnostic",
     }
 )
+"""What to do in place of an option for the boxes that a detector keeps, also where it asks for the opposite."""
 
 _ADVICE_FOR_OBJECTS = by_word(
     {
@@ -202,12 +211,12 @@ ADVICE = {**_ADVICE, **_ADVICE_FOR_OBJECTS, **_ADVICE_FOR_GAZE, "export": _PAGE_
 """What to do in place of an option or a command that others have, and `semfov` has not."""
 
 ADVICE_OF = {
-    **{command: {**_ADVICE, **_ADVICE_FOR_BOXES, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")},
-    "app": _ADVICE_FOR_BOXES,
-    "gaze": {**_ADVICE, **_ADVICE_FOR_BOXES, **_ADVICE_FOR_GAZE},
+    **{command: {**_ADVICE, **ADVICE_FOR_BOXES, **_ADVICE_FOR_OBJECTS} for command in ("search", "find", "explore")},
+    "app": ADVICE_FOR_BOXES,
+    "gaze": {**_ADVICE, **ADVICE_FOR_BOXES, **_ADVICE_FOR_GAZE},
     "live": {
         **_ADVICE,
-        **_ADVICE_FOR_BOXES,
+        **ADVICE_FOR_BOXES,
         **by_word(
             {
                 "each frame is looked at; live.step in Python takes the frames that you choose": "skip stride",
@@ -216,7 +225,7 @@ ADVICE_OF = {
         ),
     },
     "compare": {
-        **_ADVICE_FOR_BOXES,
+        **ADVICE_FOR_BOXES,
         **by_word(
             {
                 "--out FOLDER has compare.html, compare.csv and compare.png": "html page report",

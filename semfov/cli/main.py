@@ -19,6 +19,7 @@ from semfov.cli.commands import OVERVIEW, SUBCOMMANDS
 from semfov.version import __version__
 from semfov.words import (
     ADVICE,
+    ADVICE_FOR_BOXES,
     ADVICE_OF,
     COMMANDS,
     FORMER,
@@ -258,7 +259,7 @@ def _one_letter(command: str, words: Sequence[str]) -> str | None:
     for letter, option in meant:
         if option in _option_names(command):
             return f"unknown option -{letter}; did you mean --{dashed(option)}?"
-        if positional is not None and option == "picture":  # what is looked at, which may be a stream
+        if positional in ("pictures", "source") and option == "picture":  # what is looked at, which may be a stream
             return _without_option(command, f"-{letter}", positional)
     return None
 
@@ -336,13 +337,11 @@ def _switched_off(command: str, option: str) -> str | None:
     negation, _, positive = option.partition("_")
     if negation not in NEGATIONS or not positive:
         return None
-    defaults = {field.name: field.default for field in fields(_options_of(command))}
-    if positive in defaults and positive in SWITCHED_OFF:
-        return f"use {SWITCHED_OFF[positive]}"
-    if defaults.get(positive) is False:
-        return f"leave --{dashed(positive)} out"
+    if positive in _option_names(command):
+        return f"use {SWITCHED_OFF[positive]}" if positive in SWITCHED_OFF else f"leave --{dashed(positive)} out"
     having = _having(positive)
-    return f"--{dashed(positive)} is one of {having}" if having else ADVICE_OF.get(command, {}).get(positive)
+    # Other advice says how to do what is not wanted here.
+    return f"--{dashed(positive)} is one of {having}" if having else ADVICE_FOR_BOXES.get(positive)
 
 
 def _having(option: str) -> str:

@@ -1,5 +1,6 @@
 """Arguments of a command line as users write them: brought into the parser's form, or refused in one line."""
 
+import os
 import re
 import sys
 from collections import deque
@@ -105,30 +106,47 @@ def _with_value(word: str, kind: SettingType, words: deque[str]) -> list[str]:
 
 
 def _check_group(word: str, names: Sequence[str], words: Sequence[str]) -> None:
-    """Raise `InputError` for an option of a group of settings, `names`, whose value holds no settings of it.
+    """Raise `InputError` for an option of a group of settings, `names`, whose value is no table of settings.
 
     The value may be a file, or be written as in one: `--data FILE.yaml`, `--data '{"limit": 3}'`.
     """
     option, has_value, value = word.partition("=")
     text = value if has_value else next(iter(words), "")
-    if not names or text in ("", "null"):
+    is_option = not has_value and text.startswith("--")
+    if not names or is_option or text in ("", "null"):
+        return
+    try:
+        settings = _settings_in(text)
+    except yaml.YAMLError:  # the parser tells its line and column
         return
     group = _in_messages(_option_of(option))
-    settings = _settings_in(text)
-    top_names = {name.partition(".")[0] for name in names}
-    if isinstance(settings, dict) and all(str(key).partition(".")[0] in top_names for key in settings):
-        return
-    is_of_yolo = isinstance(settings, dict) and "names" in settings
-    given = f"a data set of YOLO; {FROM_YOLO}" if is_of_yolo else repr(text)
+    given = repr(text)
+    if isinstance(settings, dict):
+        if "names" not in settings or "names" in names:
+            return  # the parser checks the names and values of the settings
+        given = f"a data set of YOLO; {FROM_YOLO}"
+    elif text.endswith(_FILES_OF_SETTINGS) and not os.path.exists(text):
+        raise InputError(f"{group}: no such file: {text}; check the path")
     examples = ", ".join(f"--{group}.{name}" for name in names[:2])
-    raise InputError(f"{group}: expected {examples} and others, or a file of them, got {given}")
+    raise InputError(f"{group}: expected {examples} and others, or a file of them (.yaml, .json), got {given}")
+
+
+_FILES_OF_SETTINGS = (".yaml", ".yml", ".json")
+"""How the names of files of settings end."""
 
 
 def _settings_in(text: str) -> object:
-    """Read the settings in a file, or in a text that is none; None where there are none."""
+    """Read the settings in a file, or in a text that is none; None where there are none.
+
+    Raises:
+        yaml.YAMLError: they are no YAML.
+    """
+    is_file = os.path.isfile(text)  # false for a text that is too long for the name of a file, too
+    if is_file and not text.endswith(_FILES_OF_SETTINGS):
+        return None  # unread: a table of fixations may be long
     try:
-        return load_yaml(Path(text).read_text(encoding="utf-8") if Path(text).is_file() else text)
-    except (OSError, ValueError, yaml.YAMLError):  # ValueError: text that is no UTF-8, or a date that there is not
+        return load_yaml(Path(text).read_text(encoding="utf-8") if is_file else text)
+    except (OSError, ValueError):  # ValueError: text that is no UTF-8, or a number with thousands of digits
         return None
 
 
@@ -225,11 +243,13 @@ def _refusal(kind: SettingType, value: str) -> str | None:
 
 def _unknown_argument(text: str, options: Iterable[str], help_option: str) -> str:
     """Say what is wrong with arguments that the parser does not know."""
-    option = next((word.partition("=")[0] for word in text.split() if word.startswith("-")), None)
-    if option is None:
+    word = next((word for word in text.split() if word.startswith("-")), None)
+    if word is None:
         return f"unexpected argument {text!r}; put a name with spaces in quotes, and commas in a list"
-    if Path(option).exists():
-        return f"unknown option {option}; write the file of this name as ./{option}"
+    # `exists` takes a word that is too long for the name of a file, too.
+    if os.path.exists(word):
+        return f"unknown option {word}; write the file of this name as ./{word}"
+    option = word.partition("=")[0]
     names = [dashed(name[2:]) for name in options]
     matches = get_close_matches(dashed(option.lstrip("-")), names, n=1, cutoff=0.7)
     remedy = f"did you mean --{matches[0]}?" if matches else f"{help_option} lists all options"

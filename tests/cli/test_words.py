@@ -1,6 +1,7 @@
 """What the command is told: help, version, and mistakes that are refused in one line before anything is loaded."""
 
 import importlib
+import json
 import re
 import signal
 import sys
@@ -17,6 +18,7 @@ from semfov.cli.outcome import table_lines
 from semfov.cli.results import kind_of
 from semfov.errors import DataError, InputError
 from semfov.fit.settings import FitDetectorConfig
+from semfov.runs import arguments
 from semfov.runs.arguments import usual_form
 from semfov.runs.command import make_parser
 from tests import small
@@ -141,10 +143,21 @@ WRONG_USE = {
     "find --no-closer": "unknown option --no-closer; --closer is one of `semfov search` and `semfov live`\n",
     "find --no-recursive": "unknown option --no-recursive; leave --recursive out\n",
     "search --target cup --disable-draw": "unknown option --disable-draw; use --draw none\n",
-    "fit my.onnx --data coco.yaml": "data: expected --data.root, --data.annotations and others, or a file of them",
+    "fit my.onnx --data coco.yaml": "error: data: no such file: coco.yaml; check the path\n",
     "fit my.onnx --data FOLDER": "data: expected --data.root, --data.annotations and others, or a file of them",
     "fit my.onnx --gaze people.csv": "gaze: expected --gaze.fixations, --gaze.pictures and others, or a file of them",
     "find --oat 3": "unknown option --oat; --help-all lists all options",
+    f"find . --{'x' * 300}": "x; --help-all lists all options",
+    "fit my.onnx --data --device cpu": "error: --data: expected a value, got none\n",
+    "fit my.onnx --data nosuch.json": "error: data: no such file: nosuch.json; check the path\n",
+    "fit my.onnx --data [1]": "data: expected --data.root, --data.annotations and others, or a file of them",
+    f"fit my.onnx --data {'1' * 5000}": "data: expected --data.root, --data.annotations and others, or a file of them",
+    "fit my.onnx -i a.jpg": "unknown option -i; --help-all lists all options",
+    "search . --target cup --no-confirm": "unknown option --no-confirm; leave --confirm out\n",
+    "find . --no-stream": "unknown option --no-stream; --help-all lists all options",
+    "find . --no-augment": "unknown option --no-augment; --help-all lists all options",
+    "search . --target cup --no-tta": "unknown option --no-tta; --help-all lists all options",
+    "search . --target cup --wait-for 3": "unknown option --wait-for; --help-all lists all options",
     "search --target": "--target: expected a value, got none",
     "search --passes many --target cup": "passes: expected a whole number from 1 to 1,000,000, got 'many'",
     "search --target cup --start 5;5": "start: expected a cell as column,row (5,5) or as its number (47), got '5;5'",
@@ -297,13 +310,53 @@ def test_the_file_of_a_yolo_data_set_is_refused_with_what_converts_it(tmp_path, 
         assert error.count("\n") == 1
 
 
-def test_a_file_whose_name_begins_with_a_dash_is_no_option(tmp_path, monkeypatch, capsys):
-    (tmp_path / "-a.jpg").touch()
+@pytest.mark.parametrize("name", ["-a.jpg", "-x=y.jpg"])
+def test_a_file_whose_name_begins_with_a_dash_is_no_option(name, tmp_path, monkeypatch, capsys):
+    (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
-        main(["find", "-a.jpg"])
+        main(["find", name])
     assert stopped.value.code == 2
-    assert capsys.readouterr().err == "error: unknown option -a.jpg; write the file of this name as ./-a.jpg\n"
+    assert capsys.readouterr().err == f"error: unknown option {name}; write the file of this name as ./{name}\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("data.yaml", "limt: 3\n", "Group 'data' does not accept option 'limt'\n"),
+        ("data.json", '{"limt": 3}', "Group 'data' does not accept option 'limt'\n"),
+        ("data.yaml", "root: photographs\nlimit: [3\nids: 4\n", "line 3, column 4"),
+        ("data.yaml", b"root: \xff\n", "expected --data.root, --data.annotations and others, or a file of them"),
+        ("data.csv", "limit: 3\n", "or a file of them (.yaml, .json), got "),
+    ],
+)
+def test_a_mistake_in_the_file_of_a_group_is_told(name, text, message, tmp_path, capsys):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SystemExit) as stopped:
+        main(["fit", "mine.onnx", "--data", str(path)])
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_table_for_a_group_of_settings_is_refused_unread(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "people.csv"
+    path.write_text("viewer,picture,x,y\n1,a.jpg,3,4\n")
+    monkeypatch.setattr(arguments, "load_yaml", lambda text: pytest.fail("the table was read"))
+    with pytest.raises(SystemExit) as stopped:
+        main(["fit", "mine.onnx", "--gaze", str(path)])
+    assert stopped.value.code == 2
+    assert f"or a file of them (.yaml, .json), got {str(path)!r}" in capsys.readouterr().err
+
+
+def test_settings_of_a_group_may_be_too_long_for_the_name_of_a_file(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["fit", "mine.onnx", "--print-config", "--data", json.dumps({"limit": 3, "root": "r" * 260})])
+    assert stopped.value.code == 0
+    assert "limit: 3\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("text", ["limit: 3\n", '{"limit": 3}', "limit: null\n"])
