@@ -96,10 +96,16 @@ class _Surroundings(ABC, Generic[_Eye]):
 
     @cached_property
     def key(self) -> str:
-        """sha256 of scenes, settings and models: the same wherever they are opened again."""
+        """sha256 of scenes, settings and models: the same wherever they are opened again.
+
+        Raises:
+            InputError: the scenes have no `fingerprint`.
+        """
+        fingerprint = getattr(self.pictures, "fingerprint", None)
+        check(fingerprint is not None, "scenes", "a `fingerprint`, sha256 of what they depend on", "none")
         return digest_of(
             {
-                "scenes": self.pictures.fingerprint,
+                "scenes": fingerprint,
                 "shifts": self.shifts,
                 "targets": self._chosen,
                 **self._depends_on(),

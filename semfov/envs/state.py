@@ -16,7 +16,8 @@ class EnvState:
     """A state of an environment, from `save_state`, for `restore`.
 
     A copy, also by `pickle`, has the key of the scenes in their place: a worker restores it in an environment of its
-    own, opened with the same settings, and no detector is loaded for it.
+    own, opened with the same settings, and no detector is loaded for it. Scenes of your own need a `fingerprint` for
+    the key; of a folder without annotations the first copy hashes every file.
 
     Attributes:
         kind: the kind of environment: a single one, or several side by side.
@@ -48,6 +49,9 @@ class EnvState:
 
         Returns:
             64 hexadecimal digits.
+
+        Raises:
+            InputError: the scenes have no `fingerprint`.
         """
         return self.scenery if isinstance(self.scenery, str) else self.scenery.key
 

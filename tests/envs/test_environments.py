@@ -359,6 +359,20 @@ def test_states_of_other_environments_are_refused(sceneries, world):
             refused("state: .* got one of other scenes; open both .* the same settings", another.restore, state)
 
 
+def test_states_of_scenes_without_a_fingerprint_stay_in_their_environment(sceneries, world):
+    scenery = open_scenery("search", **world)
+    del scenery.pictures.fingerprint
+    env = GazeSearch(scenery)
+    env.reset(seed=0)
+    state = env.save_state()
+    first = env.step(3)
+    env.restore(state)
+    assert same(env.step(3), first)
+    message = "scenes: expected a `fingerprint`, sha256 of what they depend on, got none"
+    refused(message, pickle.dumps, state)
+    refused(message, GazeSearch(sceneries["search"]).restore, state)
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_a_pickled_state_goes_on_in_another_process(sceneries, world, task, fresh, tmp_path):
     """A planner gives each of its workers a state and an action; each has opened the same scenes itself."""
