@@ -3,10 +3,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 GRADIO := build/gradio
+# An environment is brought up to date with the builds of PyTorch that it was made with.
+CPU_WHEELS ?= $(shell cat $(VENV)/cpu_wheels.txt 2>/dev/null)
 # Of files that name all packages; bytecode is written when a module is first imported.
 INSTALL := install --quiet --no-compile --no-deps --require-hashes --requirement
 INSTALL_CPU = install --quiet --no-compile --no-deps \
-	$(if $(findstring ://,$(CPU_WHEELS)),--index-url,--no-index --find-links) $(CPU_WHEELS) --requirement
+	$(if $(findstring ://,$(CPU_WHEELS)),--index-url,--no-index --find-links) "$(CPU_WHEELS)" --requirement
 LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes --no-annotate \
 	--custom-compile-command "make constraints"
 # The tests of a file stay together: what they share is made once.
@@ -40,11 +42,13 @@ help:
 setup: $(STAMP)
 
 # Three processes unpack the packages: torch, its libraries and all others are about equally large. PyTorch's builds for
-# the CPU have other digests than those of constraints.txt, and need no CUDA.
+# the CPU have other digests than those of constraints.txt, and need no CUDA. CPU may be in the environment for other ends.
 $(STAMP): pyproject.toml constraints.txt
-	$(if $(CPU),$(if $(CPU_WHEELS),,$(error CPU: expected CPU_WHEELS=ADDRESS too, the one after --index-url in the command \
-		for Linux, Pip and CPU on PyTorch's install page (docs/install.md), or a folder of these wheels)))
+	$(if $(and $(findstring command line,$(origin CPU)),$(CPU)),$(if $(CPU_WHEELS),,$(error CPU: expected \
+		CPU_WHEELS=ADDRESS too, the one after --index-url in the command for Linux, Pip and CPU on PyTorch's install page \
+		(docs/install.md), or a folder of these wheels)))
 	$(PYTHON) -m venv $(VENV)
+	$(if $(CPU_WHEELS),echo "$(CPU_WHEELS)" >$(VENV)/cpu_wheels.txt)
 	awk '/^[a-z]/ {part = /^(nvidia|cuda|triton)/ ? "cuda" : /^torch(vision)?=/ ? "torch" : "others"} \
 		/^torch(vision)?=/ {print $$1 >("$(VENV)/cpu.txt")} \
 		/^[a-z ]/ {print >("$(VENV)/" part ".txt")}' constraints.txt

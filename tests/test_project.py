@@ -3,6 +3,7 @@
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -80,16 +81,27 @@ def test_what_is_installed_before_tests_and_releases_and_actions_are_pinned():
         assert [each for each in used if not re.match(r"[\w./-]+@[0-9a-f]{40} # v", each)] == []
 
 
-def set_up(folder, *settings):
+PYTHON = """
+import os, shlex, shutil, sys
+with open(CALLS, "a") as calls:
+    calls.write(shlex.join(sys.argv[1:]) + "\\n")
+if sys.argv[2] == "venv":
+    os.makedirs(sys.argv[3] + "/bin", exist_ok=True)
+    shutil.copy(__file__, sys.argv[3] + "/bin/python")
+"""
+"""A Python that only writes down what it is asked for, as a shell would read it."""
+
+
+def set_up(folder, *settings, **environment):
     """Run `make setup` with a Python that only writes down what it is asked for; returns the process and its calls."""
     python, calls = folder / "python3", folder / "calls.txt"
-    python.write_text(
-        f'#!/bin/sh\necho "$@" >>{calls}\n[ "$2" != venv ] || {{ mkdir -p "$3/bin"; cp "$0" "$3/bin/python"; }}\n'
-    )
+    calls.unlink(missing_ok=True)
+    python.write_text(f"#!{sys.executable} -IS\n{PYTHON.replace('CALLS', repr(str(calls)))}")
     python.chmod(0o755)
     call = ["make", "setup", f"PYTHON={python}", f"VENV={folder}/venv", *settings]
-    alone = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}  # also within another make
-    done = subprocess.run(call, cwd=ROOT, env=alone, capture_output=True, text=True, check=False)
+    # Also within another make.
+    alone = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "CPU_WHEELS", "CPU")}
+    done = subprocess.run(call, cwd=ROOT, env=alone | environment, capture_output=True, text=True, check=False)
     return done, calls.read_text(encoding="utf-8").splitlines() if calls.exists() else []
 
 
@@ -103,7 +115,7 @@ def write_wheel(folder, name, version):
 
 
 def test_set_up_with_builds_for_the_cpu_takes_them_from_a_folder_and_no_cuda(tmp_path):
-    wheels = tmp_path / "wheels"
+    wheels = tmp_path / "my wheels"
     wheels.mkdir()
     names = ("torch", "torchvision")
     for name in names:
@@ -117,7 +129,7 @@ def test_set_up_with_builds_for_the_cpu_takes_them_from_a_folder_and_no_cuda(tmp
         name for name in pinned if not re.match("nvidia|cuda|triton", name) and name not in names
     }
     assert not re.search("--require-hashes", builds)
-    call = [sys.executable, *builds.split(), "--dry-run", "--ignore-installed", "--disable-pip-version-check"]
+    call = [sys.executable, *shlex.split(builds), "--dry-run", "--ignore-installed", "--disable-pip-version-check"]
     tried = subprocess.run([each for each in call if each != "--quiet"], capture_output=True, text=True, check=True)
     assert f"Would install torch-{pinned['torch']}+cpu torchvision-{pinned['torchvision']}+cpu" in tried.stdout
 
@@ -134,8 +146,18 @@ def test_set_up_takes_builds_for_the_cpu_from_an_address_and_asks_for_it(tmp_pat
     assert "--no-index" not in builds
 
 
+def test_later_calls_take_the_builds_that_an_environment_was_made_with(tmp_path):
+    set_up(tmp_path, "CPU_WHEELS=my wheels")
+    (tmp_path / "venv/.installed").unlink()  # as after a change of the pinned versions
+    for settings, builds in ([], "'my wheels'"), (["CPU_WHEELS=others"], "others"), ([], "others"):
+        done, calls = set_up(tmp_path, *settings)
+        (tmp_path / "venv/.installed").unlink()
+        assert done.returncode == 0, done.stderr
+        assert [f"--no-index --find-links {builds} " in call for call in calls if call.endswith("cpu.txt")] == [True]
+
+
 def test_set_up_without_further_settings_checks_the_digest_of_each_pinned_file(tmp_path):
-    done, calls = set_up(tmp_path)
+    done, calls = set_up(tmp_path, CPU="x86_64")  # which other programs set
     assert done.returncode == 0, done.stderr
     parts = [call.split() for call in calls if ".txt" in call]
     assert all("--require-hashes" in part for part in parts)
