@@ -132,6 +132,7 @@ def _correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> 
     Returns:
         `(...)`.
     """
+    place = place.to(torch.promote_types(place.dtype, signal.dtype))
     noise = torch.linspace(-5, 5, nodes, dtype=place.dtype, device=place.device)
     weight = (-noise.square() / 2).softmax(0)  # φ(w) dw
     d = signal.clamp(min=_LEAST_SIGNAL)

@@ -11,6 +11,7 @@ from torch import Tensor
 from semfov.belief.fusion import check_parameters
 from semfov.errors import InputError, check, values_known
 from semfov.observation import dirichlet
+from semfov.observation.precision import without_autocast
 
 _TOGETHER = 1 << 22  # elements of the rows that an accelerator computes at once
 
@@ -261,4 +262,6 @@ def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     if not values_known(*rows) or len(first) <= together:
         return function(*rows)
     parts = zip(*(row.split(together) for row in rows), strict=True)
-    return torch.cat([function(*part) for part in parts])
+    results = [function(*part) for part in parts]
+    with without_autocast(first):  # it would join no results in another half precision than its own
+        return torch.cat(results)

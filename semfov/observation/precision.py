@@ -24,7 +24,7 @@ def without_autocast(like: Tensor) -> AbstractContextManager[object]:
 
 
 def exact_product(left: Tensor, right: Tensor) -> Tensor:
-    """Multiply matrices, or a matrix and a vector, with the precision of the factors (`without_autocast`).
+    """Multiply matrices, or a matrix and a vector, in the wider type of the factors (`without_autocast`).
 
     Args:
         left: the first factor.
@@ -33,5 +33,6 @@ def exact_product(left: Tensor, right: Tensor) -> Tensor:
     Returns:
         `left @ right`.
     """
+    wider = torch.promote_types(left.dtype, right.dtype)
     with without_autocast(left):
-        return left @ right
+        return left.to(wider) @ right.to(wider)

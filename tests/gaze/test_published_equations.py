@@ -395,6 +395,26 @@ def test_values_use_the_given_number_of_integration_nodes():
         CorrectLocalisation(1, make_model(), GRID, nodes=7)
 
 
+@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("amp", [None, torch.bfloat16, torch.float16])
+def test_searchers_take_half_precision_with_automatic_mixed_precision_or_without(half, amp):
+    belief, model = make_belief(batch=3), make_model()
+    beta = belief.beta.to(half)
+    visited = torch.zeros(3, 12, dtype=torch.bool)
+    visited[:, 5] = True
+    for function in (EntropyLimit(1, model, GRID), CorrectLocalisation(1, model, GRID, nodes=16)):
+        expected = function(DirichletBelief(beta.double(), belief.closest), visited)
+        place = belief.probability(1).to(half)
+        values = function.values(place.double(), function.signal[None].expand(3, -1, -1).double())
+        with torch.autocast("cpu", amp or half, enabled=amp is not None):
+            got = function(DirichletBelief(beta, belief.closest.to(half)), visited)
+            got_values = function.values(place, function.signal[None].expand(3, -1, -1).float())
+        # Only the place is rounded there, and not the product.
+        torch.testing.assert_close(got_values.double(), values, rtol=1e-5, atol=1e-6)
+        assert got_values.dtype == torch.float32
+        torch.testing.assert_close(got.double(), expected, rtol=0.03, atol=0.03)
+
+
 @pytest.mark.parametrize("nodes", [8, 64])
 def test_localisation_is_a_sum_over_equidistant_noise(nodes):
     """Noise from -5 to 5, each weighted by its normal density; 64 nodes by default."""
