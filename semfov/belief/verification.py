@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
-from semfov.io.pretrained import PretrainedForEye, fit_command
+from semfov.io.pretrained import PretrainedForEye, fit_again_command
 from semfov.io.schema import Field, Schema
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
@@ -76,7 +76,7 @@ class Verification(DecidingModule, PretrainedForEye):
             `(..., 2)`, log odds that the target is at the place, and that the image holds it.
         """
         with without_autocast(features):
-            return self.linear(features)
+            return self.linear(features.to(self.linear.weight))
 
     def check_searching(self, searching: FovealObservationModel) -> None:
         """Check that it was fitted to probabilities of cells such as those of a search.
@@ -90,11 +90,10 @@ class Verification(DecidingModule, PretrainedForEye):
         kinds = {True: "true probabilities of cells", False: "probabilities of cells as the belief has them"}
         read = bool(self.metadata.get(TRUE_CELLS, False))
         if read != searching.true_cells:
-            detector = searching.metadata.get("detector", {}).get("name", "MODEL")
             raise InputError(
                 f"verification: expected one that was fitted to a search with {kinds[searching.true_cells]}, got one "
                 f"of {kinds[read]}; fit again with python -m train.fit_search and python -m train.fit_verification, or "
-                f"fit both into a folder, which takes the place of the file: {fit_command(detector)}"
+                f"fit both into a folder, which takes the place of the file: {fit_again_command(searching.metadata)}"
             )
 
     def _record(self) -> dict[str, Any]:

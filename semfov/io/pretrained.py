@@ -4,11 +4,12 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from shlex import quote
 from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
-from semfov.errors import DataError, InputError, check, lookup, printable, reason_of
+from semfov.errors import DataError, InputError, check, lookup, reason_of
 from semfov.io.compatibility import Settings, check_grid, check_same_detector, check_sensor
 from semfov.io.files import JsonObject
 from semfov.io.schema import Json, Object, Schema, Text
@@ -108,7 +109,7 @@ class Pretrained(StatedModule):
                 model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
             # Its checksum is right, so that the file is as it was written.
-            command = fit_command(_detector_of(record), cls.data)
+            command = fit_again_command(record.get("metadata"), cls.data)
             again = f"if another version of semfov wrote it, fit it again: {command}"
             raise DataError(f"{path}: not a complete {cls.title} ({reason_of(error)}); {again}") from None
         return model.eval()
@@ -148,17 +149,27 @@ def fit_command(model: str = "MODEL", data: str = Pretrained.data, out: str = "m
         out: folder of the models.
 
     Returns:
-        The command.
+        The command, for a shell.
     """
-    return f"semfov fit {model} {data} --out {out}"
+    return f"semfov fit {quote(model)} {data} --out {quote(out)}"
 
 
-def _detector_of(record: JsonObject) -> str:
-    """Find the name of the detector of a model in its record, which may lack it."""
-    try:
-        return printable(str(record["metadata"]["detector"]["name"]))
-    except (KeyError, TypeError):
-        return "MODEL"
+def fit_again_command(metadata: object, data: str = Pretrained.data) -> str:
+    """Write the command that fits all models again to the detector of a fitted model.
+
+    Args:
+        metadata: metadata of the model, which a stranger may have written.
+        data: options that name what they are fitted to.
+
+    Returns:
+        The command. It names a published detector; of any other one the metadata have the name, and not the file.
+    """
+    from semfov.detection.weights import WEIGHTS
+
+    detector = metadata.get("detector") if isinstance(metadata, dict) else None
+    name = detector.get("name") if isinstance(detector, dict) else None
+    model = name if isinstance(name, str) and name in WEIGHTS else "MODEL.onnx"
+    return fit_command(model, data)
 
 
 def shipped_model(kind: type[Pretrained], name: str, detector: str, model: str) -> str:

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from semfov import Detections, FovealObservationModel
 from semfov.belief import Verification
-from semfov.belief.verification import closer_features
+from semfov.belief.verification import TRUE_CELLS, closer_features
+from tests.refusals import refused
 from tests.small import iou
 
 
@@ -78,3 +79,24 @@ def test_features_keep_double_precision_and_a_box_that_overlaps_by_exactly_the_l
     assert torch.equal(found, part)
     assert features.dtype == torch.float64
     assert features[3:].tolist() == pytest.approx([logit(0.24), logit(0.8), logit(0.0), logit(0.8)], abs=1e-6)
+
+
+@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("amp", [torch.bfloat16, torch.float16])
+def test_features_in_half_precision_suit_automatic_mixed_precision(half, amp):
+    torch.manual_seed(0)
+    model, features = Verification(), torch.randn(3, 7).to(half)
+    expected = features.double() @ model.linear.weight.double().T + model.linear.bias.double()
+    for enabled in (True, False):
+        with torch.autocast("cpu", amp, enabled=enabled):
+            torch.testing.assert_close(model(features), expected.float())
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"), [("mine", "MODEL.onnx"), ("x; rm -rf y", "MODEL.onnx"), ("yolov3-tiny", "yolov3-tiny")]
+)
+def test_the_command_that_fits_again_names_published_detectors_alone(name, shown):
+    searching = FovealObservationModel.identity(["cup"], [0.5], metadata={"detector": {"name": name}})
+    verification = Verification(metadata={TRUE_CELLS: True})
+    message = rf"verification: .* place of the file: semfov fit {shown} --data\.root PHOTOS .* --out mymodels$"
+    refused(message, verification.check_searching, searching)

@@ -596,7 +596,14 @@ def test_thresholds_of_places_are_saved_with_the_evidence(tmp_path):
     old = tensors | {"verification.linear.weight": torch.zeros(2, 7), "verification.linear.bias": torch.zeros(2)}
     write_file(tmp_path / "old.safetensors", old, record)
     again = "another version of semfov wrote it, fit it again: semfov fit {} --data.root PHOTOS --data.annotations"
-    for metadata, detector in ({}, "MODEL"), ({"detector": {"name": "mine"}}, "mine"):
+    for metadata, detector in (
+        ({}, "MODEL.onnx"),
+        ({"detector": {}}, "MODEL.onnx"),
+        ({"detector": {"name": "mine"}}, "MODEL.onnx"),  # of the file `mine.onnx`, which the command would need
+        ({"detector": {"name": "x; rm -rf y"}}, "MODEL.onnx"),
+        ({"detector": {"name": ["yolox-nano"]}}, "MODEL.onnx"),
+        ({"detector": {"name": "yolox-s"}}, "yolox-s"),
+    ):
         write_file(tmp_path / "old.safetensors", old, record | {"metadata": metadata})
         message = f"not a complete model of evidence .*; if {again.format(detector)}"
         unusable(message, GlimpseEvidence.from_pretrained, tmp_path / "old.safetensors")
