@@ -97,7 +97,7 @@ def _beside(path: Path, end: str) -> Path:
 
 
 def disk_is_full(error: BaseException) -> bool:
-    """Tell whether an error, or its cause, is that of a full disk, on which no other file can be written either.
+    """Tell whether an error, or one of its causes, is that of a full disk, on which no file can be written any more.
 
     Args:
         error: the error.
@@ -105,8 +105,16 @@ def disk_is_full(error: BaseException) -> bool:
     Returns:
         Whether it is.
     """
-    cause = error.__cause__ or error
-    return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+    import sqlite3
+
+    chain: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in chain:  # causes may go in a circle
+        chain.append(cause)
+        cause = cause.__cause__
+    numbers = {link.errno for link in chain if isinstance(link, OSError)}
+    codes = {getattr(link, "sqlite_errorcode", None) for link in chain if isinstance(link, sqlite3.Error)}
+    return not numbers.isdisjoint((errno.ENOSPC, errno.EDQUOT)) or sqlite3.SQLITE_FULL in codes
 
 
 @contextmanager

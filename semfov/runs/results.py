@@ -95,7 +95,7 @@ class SceneResults:
         try:
             self._write()
         except (sqlite3.OperationalError, OSError) as error:
-            raise DataError(f"cannot write {self.path}: {error}") from None
+            raise DataError(f"cannot write {self.path}: {error}") from error
         except _DAMAGED:
             self.path.unlink()  # it is no database, or damaged: its scenes are run again
             self._write()

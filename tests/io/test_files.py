@@ -1,15 +1,20 @@
 """Atomic writes: what is left of a write that does not finish."""
 
+import errno
 import os
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from semfov.errors import DataError
-from semfov.io.files import discard_unfinished, replacing, write_bytes, written_alone
+from semfov.io.files import discard_unfinished, disk_is_full, replacing, write_bytes, written_alone
+from semfov.io.pretrained import Pretrained, fit_command
 
 
 def test_a_process_that_ends_while_the_temporary_file_is_created_leaves_nothing(tmp_path, monkeypatch):
@@ -89,3 +94,37 @@ def test_what_a_process_writes_is_refused_to_others_until_it_ends_in_any_way(tmp
     with written_alone([file], [folder]):
         pass
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["crops", "labels"]
+
+
+def chain(*errors):
+    """Errors, each caused by the next one; the first."""
+    for error, cause in pairwise(errors):
+        error.__cause__ = cause
+    return errors[0]
+
+
+def test_a_full_disk_is_found_behind_any_number_of_causes():
+    full = OSError(errno.ENOSPC, "no space left")
+    for error in (full, chain(DataError("a"), full), chain(DataError("a"), DataError("b"), ValueError("c"), full)):
+        assert disk_is_full(error)
+    assert disk_is_full(chain(OSError(errno.EACCES, "denied"), OSError(errno.EDQUOT, "quota")))
+    assert disk_is_full(chain(full, DataError("a")))
+    circle = DataError("a")
+    for error in (DataError("a"), chain(DataError("a"), OSError(errno.EACCES, "denied")), chain(circle, circle)):
+        assert not disk_is_full(error)
+
+
+def test_a_full_disk_is_found_in_an_error_of_a_database():
+    database = sqlite3.connect(":memory:")
+    database.execute("PRAGMA max_page_count = 2")
+    with closing(database), pytest.raises(sqlite3.OperationalError, match="full") as caught:
+        database.execute("CREATE TABLE pages AS SELECT randomblob(100000)")
+    assert disk_is_full(chain(DataError("cannot write"), caught.value))
+    with pytest.raises(sqlite3.OperationalError) as other, closing(sqlite3.connect(":memory:")) as database:
+        database.execute("SELECT * FROM pages")
+    assert not disk_is_full(chain(DataError("cannot read"), other.value))
+
+
+def test_a_command_quotes_names_of_files():
+    assert fit_command("my models/a.onnx", out="$x") == (f"semfov fit 'my models/a.onnx' {Pretrained.data} --out '$x'")
+    assert fit_command("yolox-nano") == f"semfov fit yolox-nano {Pretrained.data} --out mymodels"

@@ -1,7 +1,9 @@
 """Stored results of other code or other images are not used, and do not depend on threads."""
 
+import errno
 import logging
 import os
+import re
 import shutil
 import sqlite3
 from contextlib import closing
@@ -14,8 +16,9 @@ import torch
 
 from eval.comparison.records import StoredRecords
 from eval.search.run import SearchConfig, SearchRun
-from semfov.errors import InputError
+from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import FUNCTIONS, TargetPosterior
+from semfov.io.files import disk_is_full
 from semfov.runs import policy_looking, scene_run
 from semfov.runs.config import PolicyConfig
 from semfov.runs.results import SceneResults
@@ -144,6 +147,17 @@ def test_a_file_that_is_no_database_counts_as_missing_and_is_replaced(tmp_path):
     results.path.unlink()
     os.mkfifo(results.path)
     unusable("expected a file, got a pipe", outcomes, results, 1)
+
+
+def test_a_full_disk_is_known_where_outcomes_cannot_be_written(tmp_path, monkeypatch):
+    def no_space(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    results = SceneResults(tmp_path, "1-2", lambda index: "a")
+    monkeypatch.setattr(sqlite3, "connect", no_space)
+    with pytest.raises(DataError, match=f"cannot write {re.escape(str(results.path))}: .*No space left") as caught:
+        results.save(0, [{"policy": "random"}], {"look": 0.5})
+    assert disk_is_full(caught.value)
 
 
 def test_what_a_killed_process_has_half_written_is_undone(tmp_path):
