@@ -289,7 +289,7 @@ def score(
     size = group.size
     generator = torch.Generator().manual_seed(0)  # the same fixations for all models
     centre = model.centre_bias(size)[None]
-    scores = [torch.zeros(0, len(without), 3)]
+    by_picture: list[list[Tensor]] = []  # for each set of terms
     for maps_of_picture, picture in zip(maps, pictures, strict=True):
         events = Events.of(group.paths[picture], size, raster[::-1])
         if conditional:
@@ -298,9 +298,10 @@ def score(
         if conditional:
             terms = model.given(terms, size, events.before)
         densities = (_density(terms, names, raster).expand(len(events.cell), -1) for names in without)
-        of_picture = [_scores(density, events.cell) for density in densities]
-        scores.append(torch.stack(of_picture)[None])
-    return [*torch.cat(scores).unbind(1)]
+        by_picture.append([_scores(density, events.cell) for density in densities])
+    if not by_picture:
+        return [centre.new_zeros(0, 3) for _ in without]
+    return [torch.stack(of_terms) for of_terms in zip(*by_picture, strict=True)]
 
 
 def _density(terms: dict[str, Tensor], left_out: Sequence[str], raster: tuple[int, int]) -> Tensor:

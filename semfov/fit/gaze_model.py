@@ -77,9 +77,9 @@ def _describe_starts(model: FixationDensity, groups: Sequence[Viewed]) -> None:
     starts = []
     for group in groups:
         height, width = group.size
-        firsts = torch.stack([path[0] for path in chain.from_iterable(group.paths)])
-        starts.append((firsts + 0.5) / torch.tensor([width, height]))
-    model.start = _mean_and_spread(torch.cat(starts)).clamp(0, 1)
+        sides = torch.tensor([width, height])
+        starts += [(path[0] + 0.5) / sides for path in chain.from_iterable(group.paths)]
+    model.start = _mean_and_spread(torch.stack(starts)).clamp(0, 1)
 
 
 def _mean_and_spread(values: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """The density of fixations against loops, saliency of cells, and what glimpses show."""
 
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.ndimage import map_coordinates
 
 from semfov import Detections, Grid
 from semfov.detection import FeatureMaps, Placement
-from semfov.gaze.saliency import FixationDensity, OculomotorBias, cell_saliency, features_so_far
+from semfov.gaze.saliency import FixationDensity, OculomotorBias, cell_saliency, features_so_far, fixation_density
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.gaze.saliency.oculomotor import _LENGTHS, _NEAR
 from tests.refusals import refused, unusable
@@ -44,6 +45,25 @@ def test_densities_of_pictures_of_any_size_sum_to_one(model, maps, size):
         density = model(maps, size, scanpath)
         assert density.shape == (2, *size)
         torch.testing.assert_close(density.exp().sum((1, 2)), torch.ones(2, dtype=torch.float64))
+
+
+def test_one_map_at_a_time_is_resized(monkeypatch):
+    """The twin of the next test checks the sum."""
+    resize, resized, most = fixation_density.on_picture, [], []
+
+    def watched(*arguments):
+        most.append(sum(each() is not None for each in resized))
+        made = resize(*arguments)
+        resized.append(weakref.ref(made))
+        return made
+
+    monkeypatch.setattr(fixation_density, "on_picture", watched)
+    layers = {"fine": 3, "middle": 2, "coarse": 2, "coarsest": 2}
+    density = FixationDensity(layers, units=4).requires_grad_(False)
+    features = {name: rand(1, channels, 3 + 3 * k, 4 + 4 * k) for k, (name, channels) in enumerate(layers.items())}
+    density.map(features, (300, 400))
+    assert len(most) == 4
+    assert max(most) <= 1
 
 
 def test_the_map_equals_loops(model, maps):

@@ -121,6 +121,28 @@ def test_a_model_of_few_people_can_be_read(tmp_path):
     assert torch.equal(read.duration[:, 1], torch.zeros(len(read.duration)))
 
 
+def test_pictures_without_scanpaths_change_no_first_fixation():
+    one, other = (saliency.FixationDensity({"backbone8": 3}) for _ in range(2))
+    group = viewed([(picture(0)[0], people(0, np.array([40, 30])))])
+    unseen = viewed([(picture(1)[0], []), (picture(2)[0], [])])
+    _describe_viewing(one, [group])
+    _describe_viewing(other, [unseen, group])
+    assert torch.equal(other.start, one.start)
+    assert torch.equal(other.duration, one.duration)
+
+
+def test_there_is_a_score_for_each_set_of_terms_and_picture(group):
+    model = saliency.FixationDensity({"backbone8": 3}).requires_grad_(False)
+    maps = maps_of(model, group, [2, 3])
+    for conditional in (False, True):
+        assert score(model, group, maps, [2, 3], conditional=conditional, without=[]) == []
+        assert score(model, group, [], [], conditional=conditional, without=[]) == []
+        for pictures in ([], [2, 3]):
+            without = (("centre bias",), ("map",), ())
+            scored = score(model, group, maps[: len(pictures)], pictures, conditional=conditional, without=without)
+            assert [each.shape for each in scored] == [(len(pictures), 3)] * 3
+
+
 def test_scores_equal_the_measures_of_scanpaths(group):
     """Of a picture whose cells are the bins, so that nothing is summed."""
     torch.manual_seed(1)

@@ -264,9 +264,10 @@ class FixationDensity(Pretrained):
         """
         cells = cells_of(size)
         units_by_shape = self._units(features, self.read if read is None else read)
-        first, *further = (on_picture(units, features, shape, cells) for shape, units in units_by_shape.items())
-        hidden = first + self.shift[:, None, None]
-        for on_cells in further:
+        # One at a time, as all of them would fill the memory.
+        resized = (on_picture(units, features, shape, cells) for shape, units in units_by_shape.items())
+        hidden = next(resized) + self.shift[:, None, None]
+        for on_cells in resized:
             hidden.add_(on_cells)
         units_of_readout = self.mix.shape[-1]
         first_layer = F.relu_(hidden).flatten(2).unflatten(1, (-1, units_of_readout))
