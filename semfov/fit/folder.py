@@ -1,16 +1,18 @@
 """The fits of a model folder, one part after another; what an earlier run finished is read from the folder.
 
-    part          builds on                              without it, or if it is no better, agents have
+    part          builds on                              without it, or if it is no better
     ------------  -------------------------------------  ---------------------------------------------------
-    observation   looks at cells                         raw scores
-    search        the same looks, from the observation   raw scores, and no presence
-                  model if that is used
+    observation   looks at cells                         without it explorations look at random places, with
+                                                         raw scores; whether it is used there, its maps tell
+    search        the same looks, from the observation   photographs are looked at by windows, with raw scores
+                  model if that is used                  unless those are fitted; a fovea has raw scores, too
     verification  closer looks of the search model;      no closer looks
                   left out without one
-    windows       its own looks at mosaics               slices, which no belief chooses
+    windows       its own looks at mosaics               slices in the order of raw scores
 
-A part is fitted again if its settings, the photographs, a part before it or any code of the package changed. Looks are
-made again only if what looking imports changed (`semfov.io.code`).
+A part is fitted again if its settings, the detector, the sensor, the photographs, a part before it, any code of the
+package or the version of a library changed. Looks are made again for another detector, sensor, grid or photograph, or
+with another version of a library. Of code, they depend only on what looking imports (`semfov.io.code`).
 """
 
 import json

@@ -6,10 +6,15 @@
     (`semfov.runs.store`)                (`semfov.runs.looks.LOOK_SOURCES`)
     results of studies, parts of a fit   the package, and classes of a user    they are computed anew
     (`semfov.runs.scene_run`)            that run in it
+    feature maps of viewed pictures      what looking, `semfov.human.viewing`  they are computed anew
+    (`semfov.human.viewing`)             and `semfov.gaze.saliency` import
+    models of gaze of folds, and scores  what `semfov.gaze.saliency` and       they are fitted and computed anew
+    (`semfov.fit.gaze_folds`)            `semfov.fit.gaze_folds` import
     pictures that a stopped command has  the package                           the command refuses to go on, and says
     finished (`semfov.cli.results`)                                            which folder to remove
 
-Comments and docstrings change no digest.
+The first three also depend on the versions of libraries, and on the machine (`semfov.runs.store.versions`); adapted
+models of gaze also on what `semfov.fit.gaze_adapted` imports. Comments and docstrings change no digest.
 """
 
 import hashlib
