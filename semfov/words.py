@@ -18,7 +18,7 @@ NEGATIONS = ("disable", "no", "not", "without")
 """Beginnings of words that ask for the opposite of what follows."""
 
 _LINKS = ("for",)
-"""Parts that mean an option as a word alone, `--for cup`, and nothing in a word of several, `--wait-for`."""
+"""Words that mean an option where they stand alone, and nothing as a part of another word: `for`, not `wait_for`."""
 
 
 def parts_of(word: str) -> list[str]:
