@@ -28,8 +28,8 @@ class Forgetting:
       `semfov.zoom.closer`);
     - that a target was absent, after `span` (`semfov.zoom.decision.LastingAbsence`);
     - detections by which a search decides: after `span` (`semfov.decision.stopping`);
-    - looks at windows: after `span`, or when a look replaces them (`semfov.zoom.episode`,
-      `semfov.agents.window_episode`).
+    - looks at windows: after `span`, or when a look replaces them; the look at the whole when it is made anew
+      (`semfov.zoom.episode`, `semfov.agents.window_episode`).
 
     Objects that are tracked have a rate of their own (`TrackingModel.loss`). The default rates are `RATE` in
     `semfov.agents.fovea` and in `semfov.agents.windows`; a scene for a head has its own `rate`.

@@ -83,8 +83,9 @@ class Tracker:
     and did not (`TrackingModel`), and times one for an object that is seen to move (`Tracks.moving_odds`).
 
     Detections belong to the objects at whose predicted places they most probably lie, all of them jointly; others begin
-    objects of their own. What no look covers goes on, also out of view: it loses ℓ a second (`TrackingModel.loss`), and
-    is dropped below `TrackingModel.least`.
+    objects of their own. What no look covers goes on, also out of view: p falls by ℓ a second (`TrackingModel.loss`),
+    and below `TrackingModel.least` it is dropped. What is listed is p times the probability that its box still fits,
+    which falls as its place becomes uncertain (`Tracks.probability`).
 
     Args:
         model: what is assumed of objects and looks; None for the usual.
