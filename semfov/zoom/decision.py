@@ -311,9 +311,8 @@ def decisions_of(
 
     Evidence for large pictures has two sets of fitted thresholds, that for photographs one:
 
-        `GlimpseEvidence.thresholds`   of presence: its `stop_below` ends searches, and its `confirm` finds where no
-                                       closer look is made
-        `GlimpseEvidence.places`       of places after closer looks: its `confirm` finds. None for no closer looks
+        thresholds   of presence: its `stop_below` ends searches, and its `confirm` finds where no closer look is made
+        places       of places after closer looks: its `confirm` finds. None for no closer looks
 
     The setting `stop_below` replaces that of presence. The setting `confirm` replaces that of places, and where no
     closer look is made that of presence. In files of models `stop_below` is named `give_up`.

@@ -127,8 +127,8 @@ def textured_frames(count, camera_step):
 def test_a_pose_that_is_refused_does_not_move_the_flow_on():
     """The same frame may be given again, with another pose."""
     velocities = []
+    agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2)).eval()  # one, as its evidence is drawn
     for refused_pose in (None, np.full((3, 3), np.nan)):
-        agent = ZoomAgent(WindowEye(Patches()), GlimpseEvidence(2)).eval()
         episode = agent.stream(None, (RED,), StreamSettings(), follows=True)
         for number, (frame, pose) in enumerate(textured_frames(3, (4, 2))):
             if number == 2 and refused_pose is not None:
