@@ -37,7 +37,8 @@ def expected_in_all(rows: Collection[Values]) -> str:
     """Say how many objects of each class that was looked for to expect in all pictures.
 
     The errors of pictures are independent: the square of that of the sum is the sum of their squares. Where pictures
-    are without a number, the sum is of the others, and says of how many.
+    are without a number, or it is a guess, the sum is of the others, and says of how many. Guesses have a sum of their
+    own.
 
     Args:
         rows: those of the pictures; ones that were left out have an `error`.
@@ -57,7 +58,7 @@ def expected_in_all(rows: Collection[Values]) -> str:
 
 
 def _expected_of_class(rows: Sequence[Values], target: str, noun: str) -> str:
-    """Say how many objects of a class to expect in pictures, and of how many that is a guess; empty without a number.
+    """Say how many objects of a class to expect in pictures; guesses are summed apart. Empty without a number.
 
     Args:
         rows: those of the pictures.
@@ -65,14 +66,26 @@ def _expected_of_class(rows: Sequence[Values], target: str, noun: str) -> str:
         noun: what is counted, after a blank; empty where there is but one class.
     """
     known = [row for row in rows if row["expected"].get(target) is not None]
-    if not known:
-        return ""
-    where = "all" if len(known) == len(rows) else f"{len(known)} of {amount(len(rows), 'picture')}"
-    text = f"expect {_sum_with_error(known, target)}{noun} in {where}"
     guesses = [row for row in known if row["expected_guessed"][target]]
+    numbers = [row for row in known if not row["expected_guessed"][target]]
+    parts = []
+    if numbers:
+        parts.append(f"{_sum_with_error(numbers, target)}{noun} in {_pictures(numbers, rows)}")
     if guesses:
-        text += f", of which {_sum_with_error(guesses, target)} at a guess in {amount(len(guesses), 'picture')}"
-    return text
+        are_the_rest = numbers and len(known) == len(rows)
+        where = _the_other(len(guesses)) if are_the_rest else _pictures(guesses, rows)
+        parts.append(f"at a guess {_sum_with_error(guesses, target)}{'' if numbers else noun} in {where}")
+    return f"expect {', and '.join(parts)}" if parts else ""
+
+
+def _pictures(some: Sequence[Values], rows: Sequence[Values]) -> str:
+    """Say in how many of the pictures."""
+    return "all" if len(some) == len(rows) else f"{len(some)} of {amount(len(rows), 'picture')}"
+
+
+def _the_other(number: int) -> str:
+    """Say in how many pictures that are all but those already named."""
+    return "the other picture" if number == 1 else f"the other {number}"
 
 
 def _sum_with_error(rows: Sequence[Values], target: str) -> str:

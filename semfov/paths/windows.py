@@ -332,8 +332,7 @@ class ZoomPath(Record):
             return super().expected_guessed
         guessed: dict[str, bool | None] = {}
         for label, (mean, _) in self._numbers().items():
-            is_guess = self._is_said(label, mean) and not self._reacts_to([label])
-            guessed[self.classes[label]] = None if math.isnan(mean) else is_guess
+            guessed[self.classes[label]] = None if math.isnan(mean) else not self._reacts_to([label])
         return guessed
 
     def _is_said(self, label: int, mean: float) -> bool:

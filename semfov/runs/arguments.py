@@ -4,7 +4,7 @@ import os
 import re
 import sys
 from collections import deque
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from keyword import iskeyword
 from pathlib import Path
@@ -171,7 +171,7 @@ def in_present_names(text: str, config: type[Settings]) -> str:
         YAML with names of settings. Names that are not known stay as they are, and what is no YAML.
 
     Raises:
-        InputError: the file has a setting twice.
+        InputError: the file has a setting twice, or something else where a group of settings belongs.
     """
     try:
         values = load_yaml(text)
@@ -180,6 +180,7 @@ def in_present_names(text: str, config: type[Settings]) -> str:
     if not isinstance(values, dict):
         return text
     types = setting_types(config)
+    _check_groups(values, types)
     renamed: dict[str, object] = {}
     for key, value in values.items():
         name = str(key)
@@ -187,6 +188,18 @@ def in_present_names(text: str, config: type[Settings]) -> str:
         check(present not in renamed, _in_messages(present), "once", f"it again as {name!r}")
         renamed[present] = value
     return text if renamed.keys() == values.keys() else yaml.safe_dump(renamed, sort_keys=False)
+
+
+def _check_groups(values: Mapping[object, object], types: Mapping[str, SettingType], prefix: str = "") -> None:
+    """Check that each group of settings is a mapping by names, or a text: the name of a file of them."""
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        hint = types.get(name, _NO_SETTING).hint
+        if value is None or isinstance(value, str) or not (isinstance(hint, type) and issubclass(hint, CheckedSettings)):
+            continue
+        is_group = isinstance(value, dict) and all(isinstance(inner, str) for inner in value)
+        check(is_group, _in_messages(name), "settings by name, or a file of them", repr(value))
+        _check_groups(value, types, f"{name}.")
 
 
 def _present_name(name: str, known: Container[str]) -> str:
@@ -216,6 +229,18 @@ def mistake(message: str, config: type[CheckedSettings], options: Iterable[str],
     unknown = re.match(r"unrecognized arguments: (.*)", message, re.DOTALL)
     if unknown:
         return _unknown_argument(unknown[1], options, help_option)
+    setting_of_file = re.match(r"Option '(.*)' is not accepted", message, re.DOTALL)
+    if setting_of_file:
+        name = setting_of_file[1]
+        return f"unknown setting {name!r}; {_remedy_for(name, options, help_option)}"
+    setting_of_group = re.match(r"Group '(.*)' does not accept option '(.*)'", message, re.DOTALL)
+    if setting_of_group:
+        name = ".".join(setting_of_group.groups())
+        return f"unknown setting {name!r}; {_remedy_for(name, options, help_option)}"
+    unread = re.match(r"Parser key \"([\w.]+)\": Unable to load config '(.*?)'", message, re.DOTALL)
+    if unread:
+        group, file = unread.groups()
+        return f"{_in_messages(group)}: no file of settings: {file}; check the path"
     missing = re.match(r"argument (--\S+): expected one argument", message)
     if missing:
         return f"--{dashed(missing[1][2:])}: expected a value, got none"
@@ -250,7 +275,11 @@ def _unknown_argument(text: str, options: Iterable[str], help_option: str) -> st
     if os.path.exists(word):
         return f"unknown option {word}; write the file of this name as ./{word}"
     option = word.partition("=")[0]
-    names = [dashed(name[2:]) for name in options]
-    matches = get_close_matches(dashed(option.lstrip("-")), names, n=1, cutoff=0.7)
-    remedy = f"did you mean --{matches[0]}?" if matches else f"{help_option} lists all options"
-    return f"unknown option {option}; {remedy}"
+    return f"unknown option {option}; {_remedy_for(option.lstrip('-'), options, help_option)}"
+
+
+def _remedy_for(name: str, options: Iterable[str], help_option: str) -> str:
+    """Name the option that is probably meant by an unknown name, or else the option that lists all."""
+    names = [dashed(option[2:]) for option in options]
+    matches = get_close_matches(dashed(name), names, n=1, cutoff=0.7)
+    return f"did you mean --{matches[0]}?" if matches else f"{help_option} lists all options"

@@ -13,6 +13,8 @@ from semfov.io.ranges import NOUNS, CheckedSettings, Form
 _FLAGS = ("true", "false", "yes", "no", "True", "False")
 """Words that may follow a flag as its value."""
 
+_NOUNS: dict[object, str] = {**NOUNS, Path: "the name of a file or folder"}
+
 
 class SettingType:
     """Type of a setting whose value is one word, which the parser takes as it stands.
@@ -42,7 +44,7 @@ class SettingType:
 
     def expected(self) -> str | None:
         """Say what a value must be; None for types that need more words."""
-        return NOUNS[self.hint] if self.hint in (int, float) else None
+        return _NOUNS.get(self.hint)
 
 
 class FlagType(SettingType):
@@ -82,7 +84,7 @@ class ListType(SettingType):
 
     def expected(self) -> str | None:
         words = ", ".join(map(repr, self.words()))
-        return f"some of {words}" if words else None
+        return f"some of {words}" if words else "a list, such as [a, b]"
 
 
 class OneOrTupleType(SettingType):

@@ -371,8 +371,9 @@ def test_the_sum_of_what_is_expected_has_the_error_of_independent_pictures():
     of_two = "expect 23 ± 10 people in 2 of 3 pictures; expect 1.0 ± 1.0 cups in 1 of 3 pictures"
     assert expected_in_all([*two, row("cup", 1.0, 1.0)]) == of_two
     guesses = [row("person", 3.0, 24.0, guessed=True), row("person", 8.0, 7.0, guessed=True)]  # 7, 24, 25
-    assert expected_in_all([*two, guesses[0]]) == "expect 26 ± 26 in all, of which 3 ± 24 at a guess in 1 picture"
-    assert expected_in_all([*two, *guesses]) == "expect 34 ± 27 in all, of which 11 ± 25 at a guess in 2 pictures"
+    assert expected_in_all([*two, guesses[0]]) == "expect 23 ± 10 in 2 of 3 pictures, and at a guess 3 ± 24 in the other picture"
+    assert expected_in_all([*two, *guesses]) == "expect 23 ± 10 in 2 of 4 pictures, and at a guess 11 ± 25 in the other 2"
+    assert expected_in_all(guesses) == "expect at a guess 11 ± 25 in all"
 
 
 def test_a_find_of_several_classes_ends_with_the_sum_of_each():
@@ -388,7 +389,7 @@ def test_a_find_of_several_classes_ends_with_the_sum_of_each():
 
     rows = [row(12.0, 2.0, None), row(20.0, 5.0, 1.0)]
     people = "expect 32 ± 4 people in all"
-    cups = "expect 7.0 ± 4.2 cups in all, of which 5.0 ± 3.0 at a guess in 1 picture"
+    cups = "expect 2.0 ± 3.0 cups in 1 of 2 pictures, and at a guess 5.0 ± 3.0 in the other picture"
     dogs = "expect 1.0 ± 3.0 dogs in 1 of 2 pictures"
     assert expected_in_all(rows) == f"{people}; {cups}; {dogs}"
     job = SimpleNamespace(every=True)
