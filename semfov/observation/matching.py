@@ -95,14 +95,22 @@ def right_boxes(objects: Objects, annotation: Annotation) -> Tensor:
         of_one_class = torch.ones(len(single)).long()
         hits = (match(boxes, single.to(boxes), of_one_class, iou=SAME_OBJECT_IOU) > 0).long()
         if len(crowds):
-            in_crowd = (_share_inside(boxes, crowds) >= SAME_OBJECT_IOU).any(-1)
+            in_crowd = (share_inside(boxes, crowds) >= SAME_OBJECT_IOU).any(-1)
             hits[in_crowd & (hits == 0)] = -1
         verdicts[numbers] = hits
     return verdicts
 
 
-def _share_inside(boxes: Tensor, others: Tensor) -> Tensor:
-    """Compute the share of the area of each box `(N, 4)` that lies in each other box `(M, 4)`, `(N, M)`."""
+def share_inside(boxes: Tensor, others: Tensor) -> Tensor:
+    """Compute the share of the area of each box that lies in each other box.
+
+    Args:
+        boxes: `(N, 4)`.
+        others: `(M, 4)`, in the same frame.
+
+    Returns:
+        `(N, M)`, from 0 to 1.
+    """
     low = torch.maximum(boxes[:, None, :2], others[:, :2])  # (N, M, 2)
     high = torch.minimum(boxes[:, None, 2:], others[:, 2:])
     shared = (high - low).clamp(min=0).prod(-1)

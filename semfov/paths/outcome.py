@@ -18,12 +18,13 @@ from semfov.detection.detections import Detections
 from semfov.detection.objects import NO_TRACK, SCORE_THRESHOLD, Objects
 from semfov.errors import InputError, check_whole
 from semfov.kinds import LookKind
-from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, share_inside
 from semfov.paths.files import Ending
 from semfov.paths.look import RecordedLook
 from semfov.paths.merging import FixationBoxes, distances_to, merge_fixations
 
 _DOUBTFUL = 0.1  # probability from which on an absent target is only probably absent
+_PART = 0.8  # share of a box in that of a listed object from which on it is a part of it
 _CONFIRMING = 0.5  # probability from which on a closer look confirms that the target is there
 
 
@@ -224,8 +225,9 @@ class Outcome(ABC):
     def objects(self) -> Objects:
         """The candidates of the targets that have at least the score `score_threshold`, or that were confirmed.
 
-        One that was confirmed has the box that confirmed it, and that box's probability where it is higher. A search
-        that did not find its target lists none: `best_place` is where the target is most likely.
+        One that was confirmed has the box that confirmed it, and that box's probability where it is higher than a score
+        that is no probability. A search that did not find its target lists none: `best_place` is where the target is
+        most likely.
         """
         return self._outcome[0]
 
@@ -324,7 +326,9 @@ class Outcome(ABC):
         # A score does not compare with the probability of a place that was looked at closely.
         if not places or self.unseen is not None:
             others = self._candidates_not_examined()
-            places += zip(others.boxes, others.scores.tolist(), strict=True)
+            # No place is more probable than the picture; a rare target makes both improbable.
+            most = self.decision.probability if self.unseen is not None else 1.0
+            places += zip(others.boxes, others.scores.clamp(max=most).tolist(), strict=True)
         return max(places, key=lambda place: place[1], default=None)
 
     def _candidates_not_examined(self) -> Objects:
@@ -369,7 +373,8 @@ class Outcome(ABC):
     @cached_property
     def _shown_objects(self) -> tuple[Objects, Tensor]:
         """The objects that the looks show, whatever was decided, and which of them were confirmed."""
-        listing = _Listing(self.candidates.of(self.sought), self.score_threshold)
+        candidates = self.candidates.of(self.sought)
+        listing = _Listing(candidates, self.score_threshold, are_probable=self.unseen is not None)
         for place in self._confirmed_places:
             listing.confirm(place)
         objects, confirmed = listing.result()
@@ -391,9 +396,11 @@ class _Listing:
     Args:
         candidates: the candidates of the classes that were searched for.
         score_threshold: score from which on a candidate counts.
+        are_probable: whether scores are probabilities by all looks, closer ones too, which no prior changes.
     """
 
-    def __init__(self, candidates: Objects, score_threshold: float) -> None:
+    def __init__(self, candidates: Objects, score_threshold: float, *, are_probable: bool) -> None:
+        self.are_probable = are_probable
         self.boxes = candidates.boxes
         self.scores = candidates.scores
         self.labels = candidates.labels
@@ -403,14 +410,22 @@ class _Listing:
         self.confirmed = torch.zeros(len(candidates), dtype=torch.bool)
 
     def confirm(self, place: _ConfirmedPlace) -> None:
-        """Give the object at a confirmed place its box, and its probability where that is higher."""
+        """Give the object at a confirmed place its box, and its probability in place of a lower score.
+
+        Where the box is a part of a listed object, the object keeps its own box.
+        """
         box = place.box[None].to(self.boxes)
         probability = self.scores.new_tensor([place.probability])
         row = self._row_at(box, place.label)
+        if row is not None:
+            self.boxes = self.boxes.index_copy(0, row, box)
+        else:
+            # The part of an object confirms the object, and says nothing of its box.
+            row = self._row_around(box, place.label)
         if row is None:
             row = self._append(box, probability, place)
-        self.boxes = self.boxes.index_copy(0, row, box)
-        self.scores = self.scores.index_copy(0, row, probability.maximum(self.scores[row]))
+        if not self.are_probable:
+            self.scores = self.scores.index_copy(0, row, probability.maximum(self.scores[row]))
         self.confirmed[row] = True
 
     def _row_at(self, box: Tensor, label: int) -> Tensor | None:
@@ -420,6 +435,12 @@ class _Listing:
         overlap = box_iou(self.boxes, box)[:, 0].masked_fill(self.labels != label, 0)
         row = overlap.argmax()[None]
         return row if bool(overlap[row] >= SAME_OBJECT_IOU) else None
+
+    def _row_around(self, box: Tensor, label: int) -> Tensor | None:
+        """Find the row `(1,)` of the most probable listed object of a class that a box `(1, 4)` is a part of."""
+        is_part = share_inside(box, self.boxes)[0] >= _PART
+        rows = (is_part & (self.labels == label) & (self.counts | self.confirmed)).nonzero()[:, 0]
+        return rows[self.scores[rows].argmax()][None] if len(rows) else None
 
     def _append(self, box: Tensor, probability: Tensor, place: _ConfirmedPlace) -> Tensor:
         """Add a place that no candidate has, and return its row `(1,)`."""

@@ -195,7 +195,11 @@ def _check_groups(values: Mapping[object, object], types: Mapping[str, SettingTy
     for key, value in values.items():
         name = f"{prefix}{key}"
         hint = types.get(name, _NO_SETTING).hint
-        if value is None or isinstance(value, str) or not (isinstance(hint, type) and issubclass(hint, CheckedSettings)):
+        if (
+            value is None
+            or isinstance(value, str)
+            or not (isinstance(hint, type) and issubclass(hint, CheckedSettings))
+        ):
             continue
         is_group = isinstance(value, dict) and all(isinstance(inner, str) for inner in value)
         check(is_group, _in_messages(name), "settings by name, or a file of them", repr(value))

@@ -371,8 +371,13 @@ def test_the_sum_of_what_is_expected_has_the_error_of_independent_pictures():
     of_two = "expect 23 ± 10 people in 2 of 3 pictures; expect 1.0 ± 1.0 cups in 1 of 3 pictures"
     assert expected_in_all([*two, row("cup", 1.0, 1.0)]) == of_two
     guesses = [row("person", 3.0, 24.0, guessed=True), row("person", 8.0, 7.0, guessed=True)]  # 7, 24, 25
-    assert expected_in_all([*two, guesses[0]]) == "expect 23 ± 10 in 2 of 3 pictures, and at a guess 3 ± 24 in the other picture"
-    assert expected_in_all([*two, *guesses]) == "expect 23 ± 10 in 2 of 4 pictures, and at a guess 11 ± 25 in the other 2"
+    assert (
+        expected_in_all([*two, guesses[0]])
+        == "expect 23 ± 10 in 2 of 3 pictures, and at a guess 3 ± 24 in the other picture"
+    )
+    assert (
+        expected_in_all([*two, *guesses]) == "expect 23 ± 10 in 2 of 4 pictures, and at a guess 11 ± 25 in the other 2"
+    )
     assert expected_in_all(guesses) == "expect at a guess 11 ± 25 in all"
 
 

@@ -66,6 +66,38 @@ def test_the_nearest_fixation_and_the_closer_look_have_the_box():
     assert refuted.objects.boxes.tolist() == [RIGHT]
 
 
+def test_a_confirmed_part_of_an_object_is_no_second_object():
+    whole = [10.0, 10, 30, 70]
+    part = [11.0, 12, 29, 30]  # inside the whole, with an IoU of 0.27
+    other = [50.0, 40, 70, 55]
+    first = torch.zeros(1).long()
+    candidates = Objects(torch.tensor([whole]), torch.tensor([0.9]), first + 1, first)
+    lattice = Lattice.over((640, 480), (416, 416))
+    parts = {"looks": (), "score_threshold": 0.5, "unseen": (0.0, 0.0), "classes": CLASSES, "candidates": candidates}
+    path = ZoomPath(lattice=lattice, target=1, decision=Decision("found", 0.97, 0.95), **parts)
+    confirmed = replace(path, closer=(closer_look(part, 0.75), closer_look(whole, 0.95)))
+    assert confirmed.objects.boxes.tolist() == [whole]
+    assert confirmed.confirmed.tolist() == [True]
+    # The score is a probability by all looks, whatever prior that of the place has.
+    assert confirmed.objects.scores.tolist() == pytest.approx([0.9])
+    elsewhere = replace(path, closer=(closer_look(other, 0.75),))
+    assert elsewhere.objects.boxes.tolist() == [whole, other]
+
+
+def closer_look(box, place):
+    return CloseUp(None, 1, None, torch.tensor(box), place, place, 0)
+
+
+@pytest.mark.parametrize("probability", [0.02, 0.3, 0.96])
+def test_no_place_is_more_probable_than_the_picture(probability):
+    first = torch.zeros(1).long()
+    candidates = Objects(torch.tensor([[10.0, 10, 30, 70]]), torch.tensor([0.8]), first + 1, first)
+    parts = {"looks": (), "unseen": (0.0, 0.0), "classes": CLASSES, "candidates": candidates}
+    lattice = Lattice.over((640, 480), (416, 416))
+    path = ZoomPath(lattice=lattice, target=1, decision=Decision("undecided", probability), **parts)
+    assert path.place_probability == pytest.approx(min(probability, 0.8))
+
+
 def test_what_was_not_sure_enough_for_the_decision_is_not_called_confirmed(monkeypatch):
     """Nothing is listed beside `undecided` or `absent`; at a frame of a stream it is, by its probability."""
     path = scanpath(
