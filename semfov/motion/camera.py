@@ -1,15 +1,16 @@
 """The motion of a camera from frame to frame, estimated from the frames by sparse optical flow.
 
-    key frame ────── `_key_to_last` ──────► last frame ── the step ──► present frame
-    `_key`    ──────────────── estimated, from `_key_to_last` on ────►
+    key frame ─────── `key_to_last` ──────► last frame ── the step ──► present frame
+    `key`     ───────────────── estimated, from `key_to_last` on ────►
 
 The step is the motion from the key frame to the present frame, with the motion to the last frame taken off. Where the
 present frame fits neither the key frame nor the last one, it becomes the key frame. The key frame before is then kept
 as `_lost` for some frames, and each of them is compared with it, too: `CameraStep.recovered` says where it was found.
-Where only the last frame fits, that one becomes the key frame, and `_anchor` is the key frame before: it tells whether
+Where only the last frame fits, that one becomes the key frame, and the anchor is the key frame before: it tells whether
 the scene has been exchanged little by little. Invariant: the key frame is not before the anchor.
 """
 
+from itertools import product
 from types import ModuleType
 from typing import NamedTuple
 
@@ -106,15 +107,39 @@ class _Fit(NamedTuple):
     is_repeated: bool = False
 
 
-class _LostFrame:
-    """The key frame before a disturbance, and the motion from it to the last frame before that.
+class _Scene(NamedTuple):
+    """What is in view: its frames, and the motions `(3, 3)` from two of them to the last one, in reduced pixels.
 
-    `waited` is the number of frames since then.
+    Attributes:
+        key: the key frame.
+        anchor: the first key frame of what has been in view since then.
+        last: the last frame.
+        key_to_last: motion from the key frame.
+        anchor_to_last: motion from the anchor.
     """
 
-    def __init__(self, key: GreyFrame, key_to_last: NDArray[np.float64]) -> None:
-        self.key = key
-        self.key_to_last = key_to_last
+    key: GreyFrame
+    anchor: GreyFrame
+    last: GreyFrame
+    key_to_last: NDArray[np.float64] = _STILL
+    anchor_to_last: NDArray[np.float64] = _STILL
+
+    @classmethod
+    def of(cls, frame: GreyFrame) -> "_Scene":
+        """Begin with a frame, from which nothing has moved."""
+        return cls(frame, frame, frame)
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether the camera has moved since the key frame."""
+        return not np.array_equal(self.key_to_last, _STILL)
+
+
+class _LostScene:
+    """The scene before a disturbance, and the number of frames since then, `waited`."""
+
+    def __init__(self, scene: _Scene) -> None:
+        self.scene = scene
         self.waited = 0
 
 
@@ -167,14 +192,10 @@ class CameraMotion:
         self._cv2: ModuleType = cv2
         self.patience = patience
         self.flow = PatchFlow()
-        self._key: GreyFrame | None = None  # None before the first frame
-        self._key_to_last = _STILL  # `(3, 3)`, motion from the key frame to the last frame, in reduced pixels
-        self._anchor: GreyFrame | None = None  # the first key frame of what has been in view since then
-        self._anchor_to_last = _STILL
-        self._last: GreyFrame | None = None
+        self._scene: _Scene | None = None  # None before the first frame
         self._stands_still = False  # whether the camera stood still between the last two frames
         self._course: NDArray[np.float64] | None = None  # the last motion between two frames, in reduced pixels
-        self._lost: _LostFrame | None = None  # what was seen before a disturbance, while it may still be found
+        self._lost: _LostScene | None = None  # what was seen before a disturbance, while it may still be found
 
     def step(self, frame: NDArray[np.uint8]) -> CameraStep:
         """Take the next frame, and estimate its motion.
@@ -188,29 +209,28 @@ class CameraMotion:
         grey = in_grey(self._cv2, frame)
         self.flow.step(grey)
         present = GreyFrame(self._cv2, grey)
-        last = self._last
-        self._last = present
-        if last is None or self._key is None:
-            self._begin_at(present)
+        scene = self._scene
+        if scene is None:
+            self._scene = _Scene.of(present)
             return CameraStep(None)
-        # Kept now, as a doubted motion replaces the key frame.
-        before = _LostFrame(self._key, self._key_to_last)
-        motion = self._since_last(self._key, last, present)
+        motion = self._since_last(scene, present)
         if motion is None and self._lost is None:
-            self._lost = before
+            self._lost = _LostScene(scene)
         if self._lost is None:
             return CameraStep(motion)
         recovered = self._recover(self._lost, present)
         waits = self._lost is not None
         return CameraStep(motion, recovered, waits=waits, gives_up=recovered is None and not waits)
 
-    def _recover(self, lost: _LostFrame, present: GreyFrame) -> Motion | None:
+    def _recover(self, lost: _LostScene, present: GreyFrame) -> Motion | None:
         """Compare the present frame with what was seen before a disturbance, which is given up after a while."""
         lost.waited += 1
-        fit = self._between(lost.key, present, lost.key_to_last)
-        if fit is not None and self._is_found(lost.key, present, fit):
+        key = lost.scene.key
+        key_to_last = lost.scene.key_to_last
+        fit = self._between(key, present, key_to_last)
+        if fit is not None and self._is_found(key, present, fit):
             self._lost = None
-            return _at_full_size(fit.similarity @ np.linalg.inv(lost.key_to_last), present.ratio)
+            return _at_full_size(fit.similarity @ np.linalg.inv(key_to_last), present.ratio)
         if lost.waited >= self.patience:
             self._lost = None
             self._course = None
@@ -218,51 +238,46 @@ class CameraMotion:
 
     def _is_found(self, key: GreyFrame, present: GreyFrame, fit: _Fit) -> bool:
         """Tell whether a motion since before a disturbance is the camera's: it has no rival, and few blocks are off."""
-        if fit.is_repeated or not self._is_certain(fit, None):
+        if fit.is_repeated or fit.rival is not None:
             return False
         return share_off(self._cv2, key, present, fit.similarity[:2]) < _MOST_OFF
 
-    def _since_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> Motion | None:
-        """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the key."""
-        unmoved = key if np.array_equal(self._key_to_last, _STILL) else None
-        if self._stands_still and unmoved is not None and self._stays(unmoved, last, present):
-            return Motion.still()
+    def _since_last(self, scene: _Scene, present: GreyFrame) -> Motion | None:
+        """Estimate the motion since the last frame, by the key frame or else by the last one, and renew the scene."""
+        self._scene = scene._replace(last=present)  # stays so where the camera stands still
         has_stood = self._stands_still
-        self._stands_still = False
-        key, fit = self._fit_to_key_or_last(key, last, present)
-        if unmoved is not None and self._shows_no_drift(unmoved, present, fit):
-            self._stands_still = has_stood or self._is_exactly_there(unmoved, present)
-            if self._stands_still:
-                return Motion.still()
+        if has_stood and not scene.has_moved and self._stays(scene, present):
+            return Motion.still()
+        fitted, fit = self._fit_to_key_or_last(scene, present)
+        self._stands_still = not scene.has_moved and self._shows_no_drift(scene.key, present, fit, has_stood=has_stood)
+        if self._stands_still:
+            return Motion.still()
         if fit is None:
-            self._begin_at(present)
-            return Motion.still() if self._is_same(last, present) else None
-        return self._by_fit(key, last, present, fit, has_stood=has_stood)
+            self._scene = _Scene.of(present)
+            return Motion.still() if self._is_same(scene.last, present) else None
+        return self._by_fit(fitted, present, fit, has_stood=has_stood)
 
-    def _by_fit(
-        self, key: GreyFrame, last: GreyFrame, present: GreyFrame, fit: _Fit, *, has_stood: bool
-    ) -> Motion | None:
+    def _by_fit(self, scene: _Scene, present: GreyFrame, fit: _Fit, *, has_stood: bool) -> Motion | None:
         """Judge a fitted motion, and keep it, or doubt it and begin anew at the present frame.
 
         Args:
-            key: the frame from which the motion was fitted.
-            last: the last frame.
-            present: the present one.
+            scene: what was in view, with the frame from which the motion was fitted as its key frame.
+            present: the present frame.
             fit: the motion from the key frame to the present one.
             has_stood: whether the camera stood still in the last frame.
 
         Returns:
             The motion since the last frame; None for one that is doubted.
         """
-        to_last = np.linalg.inv(self._key_to_last)
+        to_last = np.linalg.inv(scene.key_to_last)
         rival = None if fit.rival is None else fit.rival @ to_last
         since_last = _Fit(fit.similarity @ to_last, rival, fit.median)
         is_still = _largest_shift(since_last.similarity, present.grey.shape) * max(present.ratio) < _STILL_SHIFT
-        is_believed = self._is_believed(since_last, key, present, fit.similarity)
+        is_believed = self._is_believed(since_last, scene, present, fit.similarity)
         if fit.is_repeated:
-            is_believed = is_believed and is_still and self._repeats_in_place(last, present, has_stood=has_stood)
+            is_believed = is_believed and is_still and self._repeats_in_place(scene.last, present, has_stood=has_stood)
         if not is_believed:
-            self._begin_at(present)
+            self._scene = _Scene.of(present)
             # A doubted motion may be believed once it goes on, which is told by this one.
             if self._course is None:
                 self._course = since_last.similarity
@@ -270,13 +285,13 @@ class CameraMotion:
         self._course = since_last.similarity
         if is_still:
             # The motion to the last frame stays as it was: noise of a camera that stands would add up.
-            self._key = key
+            self._scene = scene._replace(last=present)
             self._stands_still = True
             return Motion.still()
-        self._move_on(key, fit.similarity, since_last.similarity, present)
+        self._scene = _moved(scene, fit.similarity, since_last.similarity, present)
         return _at_full_size(since_last.similarity, present.ratio)
 
-    def _shows_no_drift(self, unmoved: GreyFrame, present: GreyFrame, fit: _Fit | None) -> bool:
+    def _shows_no_drift(self, unmoved: GreyFrame, present: GreyFrame, fit: _Fit | None, *, has_stood: bool) -> bool:
         """Tell whether the camera stands before a scene in which no motion can be fitted, or several fit.
 
         Stripes have no corners, or any motion along them fits. The key frame tells, so that a slow drift is seen.
@@ -285,11 +300,14 @@ class CameraMotion:
             unmoved: the key frame, from which the camera has not moved.
             present: the present frame.
             fit: the motion that was fitted; None: none fits.
+            has_stood: whether the camera stood still in the last frame.
         """
         if fit is not None and not fit.is_repeated:
             return False
         least = _CLEAR if fit is None else max(_CLEAR, fit.median - _AS_GOOD)
-        return self._is_unchanged(unmoved, present, least)
+        if not self._is_unchanged(unmoved, present, least):
+            return False
+        return has_stood or self._is_exactly_there(unmoved, present)
 
     def _repeats_in_place(self, last: GreyFrame, present: GreyFrame, *, has_stood: bool) -> bool:
         """Tell whether a pattern, which fits several motions, is where it was in the last frame.
@@ -312,79 +330,51 @@ class CameraMotion:
         return whole_shift(self._cv2, first, present) < _NO_SHIFT
 
     def _is_believed(
-        self, since_last: _Fit, key: GreyFrame, present: GreyFrame, key_to_present: NDArray[np.float64]
+        self, since_last: _Fit, scene: _Scene, present: GreyFrame, key_to_present: NDArray[np.float64]
     ) -> bool:
-        """Tell whether a motion is the camera's: no other is as good, and it goes on or explains all of the frame."""
-        if not self._is_certain(since_last, self._course):
-            return False
-        return self._goes_on(since_last.similarity) or not self._is_divided(key, present, key_to_present)
+        """Tell whether a motion is the camera's: it goes on, or there is no other, and it explains all of the frame."""
+        course = self._course
+        if course is None:
+            return since_last.rival is None and not self._is_divided(scene, present, key_to_present)
+        shape = present.grey.shape
+        change = _difference(since_last.similarity, course, shape)
+        if since_last.rival is not None:
+            return change < min(_STEADY, _difference(since_last.rival, course, shape))
+        return change < _STEADY or not self._is_divided(scene, present, key_to_present)
 
-    def _move_on(
-        self,
-        key: GreyFrame,
-        key_to_present: NDArray[np.float64],
-        last_to_present: NDArray[np.float64],
-        present: GreyFrame,
-    ) -> None:
-        """Keep a believed motion; a frame that shows little of the anchor begins anew.
-
-        The motions of a camera that stands do not come here: their noise would add up.
-        """
-        self._anchor_to_last = last_to_present @ self._anchor_to_last
-        if _share_in_view(self._anchor_to_last, present.grey.shape) < _LEAST_IN_VIEW:
-            self._begin_at(present)
-            return
-        self._key = key
-        self._key_to_last = key_to_present
-
-    def _fit_to_key_or_last(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> tuple[GreyFrame, _Fit | None]:
+    def _fit_to_key_or_last(self, scene: _Scene, present: GreyFrame) -> tuple[_Scene, _Fit | None]:
         """Fit the present frame to the key frame, or where it fits none to the last frame, which is the key then.
 
         A frame that fits the last one, but no longer the anchor, shows another scene that has come little by little.
         """
-        expected = self._key_to_last if self._course is None else self._course @ self._key_to_last
-        fit = self._between(key, present, expected)
-        if fit is not None or last is key:
-            return key, fit
-        self._key_to_last = _STILL
-        fit = self._between(last, present, _STILL)
-        is_replaced = fit is not None and self._is_replaced(present, fit)
-        return last, None if is_replaced else fit
+        expected = scene.key_to_last if self._course is None else self._course @ scene.key_to_last
+        fit = self._between(scene.key, present, expected)
+        if fit is not None or scene.last is scene.key:
+            return scene, fit
+        fit = self._between(scene.last, present, _STILL)
+        is_replaced = fit is not None and self._is_replaced(scene, present, fit)
+        return scene._replace(key=scene.last, key_to_last=_STILL), None if is_replaced else fit
 
-    def _stays(self, key: GreyFrame, last: GreyFrame, present: GreyFrame) -> bool:
+    def _stays(self, scene: _Scene, present: GreyFrame) -> bool:
         """Tell whether a camera that stood still stands still, in a third of the time that another motion takes."""
+        key = scene.key
         if key.grey.shape != present.grey.shape:
             return False
         found = agreement(self._cv2, key.contrast, present.contrast)
         if not found.is_enough or found.is_partial or found.median < _CLEAR:
             return False
-        if key.repeats and largest_change(self._cv2, last.grey, present.grey) >= _SAME:
+        if key.repeats and largest_change(self._cv2, scene.last.grey, present.grey) >= _SAME:
             return False
         return corners_stay(self._cv2, key, present, _STILL_SHIFT / max(present.ratio))
 
-    def _is_certain(self, fit: _Fit, course: NDArray[np.float64] | None) -> bool:
-        """Tell whether no other motion is as good: there is no rival, or the motion is that of the frames before."""
-        if fit.rival is None:
-            return True
-        if course is None or self._key is None:
-            return False
-        shape = self._key.grey.shape
-        return _difference(fit.similarity, course, shape) < min(_STEADY, _difference(fit.rival, course, shape))
-
-    def _goes_on(self, last_to_present: NDArray[np.float64]) -> bool:
-        """Tell whether the camera moves as it did between the frames before."""
-        if self._course is None or self._last is None:
-            return False
-        return _difference(last_to_present, self._course, self._last.grey.shape) < _STEADY
-
-    def _is_divided(self, key: GreyFrame, present: GreyFrame, similarity: NDArray[np.float64]) -> bool:
+    def _is_divided(self, scene: _Scene, present: GreyFrame, similarity: NDArray[np.float64]) -> bool:
         """Tell whether the motion from the key frame is one of two: blocks are off, or some move as before."""
-        if share_off(self._cv2, key, present, similarity[:2]) >= _MOST_OFF:
+        if share_off(self._cv2, scene.key, present, similarity[:2]) >= _MOST_OFF:
             return True
         if self._course is None:
             return False
-        as_before = self._course @ self._key_to_last
-        count = blocks_of_rival(self._cv2, key.contrast, present.contrast, similarity[:2], as_before[:2])
+        as_before = self._course @ scene.key_to_last
+        count = blocks_of_rival(self._cv2, scene.key.contrast, present.contrast, similarity[:2], as_before[:2])
         return count >= _GOING_ON
 
     def _is_same(self, last: GreyFrame, present: GreyFrame) -> bool:
@@ -403,19 +393,10 @@ class CameraMotion:
         found = agreement(self._cv2, first.contrast, present.contrast)
         return found.is_whole and found.median >= least
 
-    def _is_replaced(self, present: GreyFrame, fit: _Fit) -> bool:
+    def _is_replaced(self, scene: _Scene, present: GreyFrame, fit: _Fit) -> bool:
         """Tell whether another scene has come little by little, as in a dissolve; `fit` is that of the last frame."""
-        if self._anchor is None:
-            return False
-        anchor_to_present = fit.similarity @ self._anchor_to_last
-        return not agreement(self._cv2, self._anchor.coarse, present.coarse, anchor_to_present[:2]).is_enough
-
-    def _begin_at(self, frame: GreyFrame) -> None:
-        """Make a frame the key frame, from which nothing has moved."""
-        self._key = frame
-        self._key_to_last = _STILL
-        self._anchor = frame
-        self._anchor_to_last = _STILL
+        anchor_to_present = fit.similarity @ scene.anchor_to_last
+        return not agreement(self._cv2, scene.anchor.coarse, present.coarse, anchor_to_present[:2]).is_enough
 
     def _between(self, first: GreyFrame, present: GreyFrame, guess: NDArray[np.float64]) -> _Fit | None:
         """Estimate the motion between two reduced frames; None where they do not fit together."""
@@ -429,13 +410,32 @@ class CameraMotion:
         if found.median < _CLEAR and coarse_shift(cv2, first, present, similarity[:2]) > _COARSE_SHIFT:
             return None
         rival = rival_between(cv2, first, present, similarity, found.elsewhere) if found.is_partial else None
-        for shift in first.repeats:
-            for sign in (-1, 1):
-                repeated = similarity.copy()
-                repeated[:2, 2] += sign * similarity[:2, :2] @ shift
-                if agreement(cv2, first.contrast, present.contrast, repeated[:2]).median > found.median - _AHEAD:
-                    return _Fit(similarity, rival, found.median, is_repeated=True)
-        return _Fit(similarity, rival, found.median)
+        is_repeated = self._fits_as_well(first, present, similarity, found.median - _AHEAD)
+        return _Fit(similarity, rival, found.median, is_repeated)
+
+    def _fits_as_well(
+        self, first: GreyFrame, present: GreyFrame, similarity: NDArray[np.float64], least: float
+    ) -> bool:
+        """Tell whether two frames correlate by more than a least number a period of their pattern away, too."""
+        for shift, sign in product(first.repeats, (-1, 1)):
+            repeated = similarity.copy()
+            repeated[:2, 2] += sign * similarity[:2, :2] @ shift
+            if agreement(self._cv2, first.contrast, present.contrast, repeated[:2]).median > least:
+                return True
+        return False
+
+
+def _moved(
+    scene: _Scene, key_to_present: NDArray[np.float64], last_to_present: NDArray[np.float64], present: GreyFrame
+) -> _Scene:
+    """Move on by a believed motion; a frame that shows little of the anchor begins anew.
+
+    The motions of a camera that stands do not come here: their noise would add up.
+    """
+    anchor_to_present = last_to_present @ scene.anchor_to_last
+    if _share_in_view(anchor_to_present, present.grey.shape) < _LEAST_IN_VIEW:
+        return _Scene.of(present)
+    return scene._replace(last=present, key_to_last=key_to_present, anchor_to_last=anchor_to_present)
 
 
 def _difference(first: NDArray[np.float64], second: NDArray[np.float64], shape: tuple[int, ...]) -> float:
