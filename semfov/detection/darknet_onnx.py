@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import singledispatchmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -123,21 +124,12 @@ _ACTIVATIONS: dict[str, Callable[[Graph, str], str]] = {
 class _NetworkGraph(Graph):
     """The graph of a Darknet network, in float32."""
 
+    @singledispatchmethod
     def layer(self, layer: nn.Module, *sources: str) -> str:
-        """Add a layer that reads the outputs of others."""
-        if isinstance(layer, Convolution):
-            return self._convolution(layer, sources[0])
-        if isinstance(layer, MaxPool):
-            return self._max_pool(layer, sources[0])
-        if isinstance(layer, nn.Upsample):
-            return self._upsample(layer, sources[0])
-        if isinstance(layer, Route):
-            return self._route(layer, sources)
-        if isinstance(layer, Shortcut):
-            total = self.add("Add", *sources)
-            return _ACTIVATIONS[layer.activation](self, total)
-        return sources[0]  # heads are decoded apart from their maps, and dropout does nothing
+        """Add a layer that reads the outputs of others; heads are decoded apart, and dropout does nothing."""
+        return sources[0]
 
+    @layer.register
     def _convolution(self, layer: Convolution, source: str) -> str:
         vertical, horizontal = (int(side) for side in layer.padding)
         convolved = self.add(
@@ -151,6 +143,7 @@ class _NetworkGraph(Graph):
         )
         return _ACTIVATIONS[layer.activation](self, convolved)
 
+    @layer.register
     def _max_pool(self, layer: MaxPool, source: str) -> str:
         before = layer.padding // 2
         after = layer.padding - before
@@ -162,6 +155,7 @@ class _NetworkGraph(Graph):
             pads=[before, before, after, after],
         )
 
+    @layer.register
     def _upsample(self, layer: nn.Upsample, source: str) -> str:
         scale = float(cast(float, layer.scale_factor))
         return self.add(
@@ -175,12 +169,18 @@ class _NetworkGraph(Graph):
             coordinate_transformation_mode="asymmetric",
         )
 
-    def _route(self, layer: Route, sources: Sequence[str]) -> str:
-        chunks = sources
+    @layer.register
+    def _route(self, layer: Route, *sources: str) -> str:
+        chunks: Sequence[str] = sources
         if layer.groups > 1:
             parts = [self.add_several("Split", source, outputs=layer.groups, axis=1) for source in sources]
             chunks = [names[layer.group] for names in parts]
         return chunks[0] if len(chunks) == 1 else self.add("Concat", *chunks, axis=1)
+
+    @layer.register
+    def _shortcut(self, layer: Shortcut, *sources: str) -> str:
+        total = self.add("Add", *sources)
+        return _ACTIVATIONS[layer.activation](self, total)
 
     def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
         """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""

@@ -138,6 +138,16 @@ class _CellsHead(Head):
         """Make a box with its scores of each row of the tables."""
 
 
+class _DistancesHead(_CellsHead):
+    """Base of heads whose tables are class scores, the distances of `decode_distances`, and the cells."""
+
+    def bound(self, tables: tuple[Tensor, ...]) -> Tensor:
+        return tables[0].amax(-1)
+
+    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
+        return decode_distances(*tables)
+
+
 class _Candidates(Head):
     """Outputs of `semfov.detection.export`, as `Candidates` holds them.
 
@@ -197,14 +207,10 @@ class _Yolox(_CellsHead, _RowsHead):
         return decode_yolox(*tables)
 
 
-class _YoloxDecoded(_CellsHead, _RowsHead):
+class _YoloxDecoded(_Yolox):
     """YOLOX with boxes that the network has decoded: rows of `yolov5`, for an image in the corner of the canvas."""
 
     name = "yolox-decoded"
-    preprocessing = _YOLOX
-
-    def recognises_rows(self, rows: Rows, signature: Signature) -> bool:
-        return rows.cells.levels == 3 and rows.may_have_objectness
 
     def tables(self, outputs: _Outputs, canvas: Canvas) -> tuple[Tensor, ...]:
         return (_checked(_single(outputs)),)
@@ -213,7 +219,7 @@ class _YoloxDecoded(_CellsHead, _RowsHead):
         return decode_yolov5(*tables)
 
 
-class _NanodetPlus(_CellsHead, _RowsHead):
+class _NanodetPlus(_DistancesHead, _RowsHead):
     """NanoDet-Plus: one output `(B, N, K + 32)`, for the corners of the cells of strides 8, 16, 32 and 64.
 
     A row has K class scores, then the distances of `decode_distances`, with 8 bins for each side.
@@ -235,12 +241,6 @@ class _NanodetPlus(_CellsHead, _RowsHead):
         rows = _checked(_single(outputs))
         grid = _grid_of(rows, canvas, STRIDES, 0.0)
         return rows[..., :-_DISTANCE_CHANNELS], rows[..., -_DISTANCE_CHANNELS:], grid
-
-    def bound(self, tables: tuple[Tensor, ...]) -> Tensor:
-        return tables[0].amax(-1)
-
-    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
-        return decode_distances(*tables)
 
 
 class _Yolov5(_CellsHead, _RowsHead):
@@ -337,7 +337,7 @@ class _EndToEndNms(_SelectionHead):
         return super().recognises(signature) and {*signature.shapes} != _SELECTED_BY_DETR
 
 
-class _DistanceMaps(_CellsHead):
+class _DistanceMaps(_DistancesHead):
     """Base of heads with a class map `(B, N_s, K)` and a distance map `(B, N_s, 4 bins)` for each level of cells.
 
     The class map of a level comes before its distance map. Distances are those of `decode_distances`, from the middle
@@ -365,12 +365,6 @@ class _DistanceMaps(_CellsHead):
             distance_maps.append(maps[1])
         scores = torch.cat(class_maps, 1)
         return scores, torch.cat(distance_maps, 1), _grid_of(scores, canvas, strides, 0.5)
-
-    def bound(self, tables: tuple[Tensor, ...]) -> Tensor:
-        return tables[0].amax(-1)
-
-    def decode_rows(self, tables: tuple[Tensor, ...]) -> Candidates:
-        return decode_distances(*tables)
 
 
 class _Picodet(_DistanceMaps):
