@@ -199,12 +199,12 @@ class Mosaic:
             values, present = self._values(source, columns, rows, resampling)
             # A view, so that what is copied to it is written to the canvas.
             part = canvas[rows.covered.start : rows.covered.stop, columns.covered.start : columns.covered.stop]
-            np.copyto(part, _as_kind(values, band.kind), where=True if present is None else present)
+            np.copyto(part, _as_kind(values, band.kind), where=present)
         return canvas
 
     def _values(
         self, source: Source, columns: _Side, rows: _Side, reduction: "Resampling | None"
-    ) -> tuple[Values, NDArray[np.bool_] | None]:
+    ) -> tuple[Values, NDArray[np.bool_]]:
         """Read the values of the covered part of a source, and where pixels are there.
 
         Args:
@@ -214,7 +214,7 @@ class Mosaic:
             reduction: resampling of a window that is reduced; None for that of the source.
 
         Returns:
-            Values `(h, w)`, and where they are there; None for all over.
+            Values `(h, w)`, and where they are there, `(h, w)`.
         """
         from rasterio.enums import Resampling
         from rasterio.windows import Window
@@ -236,16 +236,16 @@ class Mosaic:
         if borders != ((0, 0), (0, 0)):
             # What lies at the edge of the source shows what is beside it.
             values = np.pad(values, borders, "edge")
-            present = None if present is None else np.pad(present, borders, "edge")
+            present = np.pad(present, borders, "edge")
         return values, present
 
 
-def _presence(source: Source, file: Dataset, stored: Values, options: WindowOptions) -> NDArray[np.bool_] | None:
-    """Find where the pixels of a source are there, `(h, w)`; None for all over."""
+def _presence(source: Source, file: Dataset, stored: Values, options: WindowOptions) -> NDArray[np.bool_]:
+    """Find where the pixels of a source are there, `(h, w)`."""
     if source.masked:
         return np.asarray(file.read_masks(source.band, **options) > 0)
     if source.nodata is None:
-        return None
+        return np.ones(stored.shape, np.bool_)
     # NaN equals no number, itself included.
     present = ~np.isnan(stored) if np.isnan(source.nodata) else stored != source.nodata
     return np.asarray(present)
