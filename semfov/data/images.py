@@ -4,7 +4,7 @@ import logging
 import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from os import PathLike
@@ -234,7 +234,7 @@ def _of_another_kind(kind: str) -> str:
 
     Image.init()  # without it Pillow knows few formats
     got = f", got {kind}" if kind else ""
-    return f"not an image in a format that is read ({', '.join(_known_to_pillow(_FORMATS))}){got}; convert it"
+    return f"not an image in a format that is read ({', '.join(_known_to_pillow())}){got}; convert it"
 
 
 @contextmanager
@@ -276,17 +276,17 @@ def _open_in_formats(file: BinaryIO) -> "ImageFile":
 
     Image.preinit()
     try:
-        return Image.open(file, formats=_known_to_pillow(_FORMATS))
+        return Image.open(file, formats=_known_to_pillow())
     except UnidentifiedImageError:
         Image.init()
-        return Image.open(file, formats=_known_to_pillow(_FORMATS))
+        return Image.open(file, formats=_known_to_pillow())
 
 
-def _known_to_pillow(formats: Sequence[str]) -> list[str]:
+def _known_to_pillow() -> list[str]:
     """List the formats that Pillow can open so far; AVIF and HEIF need libraries that may be missing."""
     from PIL import Image
 
-    return [kind for kind in formats if kind in Image.OPEN]
+    return [kind for kind in _FORMATS if kind in Image.OPEN]
 
 
 def _seek_full_page(image: "Image") -> None:

@@ -158,7 +158,7 @@ class WindowWords(Words):
         mean, variance = record._numbers().get(label, (math.nan, math.nan))
         if not record._is_said(label, mean):
             return ""
-        guess = "" if record._reacts_to([label]) else "at a guess "
+        guess = "" if record._reacts_to(label) else "at a guess "
         return f"{guess}{number_with_error(mean, variance**0.5)}"
 
     @property
@@ -320,10 +320,10 @@ class ZoomPath(Record):
         It does where objects are listed of which five or more have a probability of one half, or where these make up
         three fifths of the sum of all probabilities. Otherwise most of that sum is of faint candidates.
         """
-        return any(self._reacts_to([label]) for label in self.sought or self.candidates.labels.unique().tolist())
+        return any(map(self._reacts_to, self.sought or self.candidates.labels.unique().tolist()))
 
-    def _reacts_to(self, labels: Sequence[int]) -> bool:
-        return len(self._shown_objects[0].of(labels)) > 0 and reacts(self.candidates.of(labels).scores)
+    def _reacts_to(self, label: int) -> bool:
+        return len(self._shown_objects[0].of([label])) > 0 and reacts(self.candidates.of([label]).scores)
 
     @property
     def expected_guessed(self) -> dict[str, bool | None]:
@@ -332,7 +332,7 @@ class ZoomPath(Record):
             return super().expected_guessed
         guessed: dict[str, bool | None] = {}
         for label, (mean, _) in self._numbers().items():
-            guessed[self.classes[label]] = None if math.isnan(mean) else not self._reacts_to([label])
+            guessed[self.classes[label]] = None if math.isnan(mean) else not self._reacts_to(label)
         return guessed
 
     def _is_said(self, label: int, mean: float) -> bool:
@@ -373,7 +373,7 @@ class ZoomPath(Record):
             share: its share of the objects that no look has shown.
         """
         scores = self.candidates.of([label]).scores  # (N,)
-        if self._reacts_to([label]):
+        if self._reacts_to(label):
             mean_unseen, variance_unseen = self.unseen or (0.0, 0.0)
             return number_of(scores, (share * mean_unseen, share * variance_unseen), self.spread)
         if label in self._countable_if_faint:

@@ -87,10 +87,8 @@ class Tracker:
     and below `TrackingModel.least` it is dropped. What is listed is p times the probability that its box still fits,
     which falls as its place becomes uncertain (`Tracks.probability`).
 
-    Args:
-        model: what is assumed of objects and looks; None for the usual.
-
     Attributes:
+        model: what is assumed of objects and looks.
         tracks: the objects, where they are in the present frame.
 
     Private attributes: `_lost` has the objects of a scene that the camera has lost and may find again, where they were
@@ -109,8 +107,8 @@ class Tracker:
     ([1], [[49.0, 49.0]])
     """
 
-    def __init__(self, model: TrackingModel | None = None) -> None:
-        self.model = model or TrackingModel()
+    def __init__(self) -> None:
+        self.model = TrackingModel()
         self.tracks = Tracks.none()
         self._now = 0.0  # seconds of the stream
         self._lost: LostScene[_Known] = LostScene()
