@@ -53,9 +53,15 @@ PriorShare = Annotated[float | Literal["fit"], Range(above=0, below=1, noun="a s
 Rate = Annotated[float, Range(0, 100)]
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
+_Value = TypeVar("_Value")
 
 _KINDS = "kinds"  # metadata of a field: the kinds of look that the setting is for, first the one that messages suggest
 _INSTEAD = "instead"  # metadata of a field: what a message suggests for other kinds of look
+
+
+def value_or(setting: _Value | None, usual: _Value) -> _Value:
+    """Take a setting, or the usual value of who asks where it is None."""
+    return usual if setting is None else setting
 
 
 def _only_for(*kinds: KindName, instead: str) -> Mapping[str, object]:

@@ -15,7 +15,7 @@ from semfov.decision.stopping import AtDetection, AtGoal, LittleGain, StoppingCr
 from semfov.errors import InputError, check, check_finite, check_shape, check_whole
 from semfov.gaze.acquisition import ExpectedGain
 from semfov.paths import GazePrediction, Scanpath
-from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings, value_or
 
 _MIN_GAIN = 0.1  # default for the least gain of a look, in cells that are classified correctly
 # It is 0.1 a frame at 25 frames a second, chosen on ten photographs of the fit.
@@ -71,8 +71,7 @@ class FoveaAgent(GazeParts):
         def criterion(grid: Grid) -> StoppingCriterion:
             if boxes is not None:
                 return AtGoal(_goal_cells(boxes, grid, self.eye.sensor.like))
-            score = _CONFIRM if settings.confirm is None else settings.confirm
-            return AtDetection(grid, index, weights, score)
+            return AtDetection(grid, index, weights, value_or(settings.confirm, _CONFIRM))
 
         learned = boxes is None and plan.thresholds is not None
         return FoveaEpisode(plan, image, limits, None if learned else criterion)
@@ -106,7 +105,7 @@ class FoveaAgent(GazeParts):
             if not isinstance(observer, SemanticMap) or (policy is not None and min_gain is None):
                 return StoppingCriterion()
             gain = ExpectedGain(grid, self.eye.sensor.width(self.eye.sensor.settings()) / self.eye.reference)
-            return LittleGain(gain, _MIN_GAIN if min_gain is None else min_gain)
+            return LittleGain(gain, value_or(min_gain, _MIN_GAIN))
 
         return FoveaEpisode(plan, image, limits, criterion).run()
 
@@ -147,7 +146,7 @@ class FoveaAgent(GazeParts):
             settings.score_threshold,
         )
         check(settings.passes in (None, 1), "passes", "1 for a fovea, or how='windows'", settings.passes)
-        rate = RATE if settings.rate is None else settings.rate
+        rate = value_or(settings.rate, RATE)
         plan = GazePlan(self, target, start=settings.start, seed=settings.seed, decisions=settings, rate=rate)
         return FoveaStream(plan, settings.color)
 

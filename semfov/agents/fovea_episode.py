@@ -36,7 +36,7 @@ from semfov.paths.fovea import FoveaLook, moment_look
 from semfov.paths.stimulus import Stimulus, in_bytes, reduced_copy
 from semfov.paths.trace import Trace
 from semfov.sensor.glimpse import window_around
-from semfov.settings import DecisionSettings, Start
+from semfov.settings import DecisionSettings, Start, value_or
 from semfov.strategy import Strategy
 
 _LONGEST = 640  # longer side of the frames that records keep, in pixels
@@ -108,7 +108,7 @@ class GazePlan:
         mapper = agent.exploring.observer
         self.beside = None if mapper is chosen.observer else on_cpu(mapper)
         self.forgetting = None if rate is None else Forgetting(rate)
-        self.most_closer = MOST_CLOSER if decisions.closer is None else decisions.closer
+        self.most_closer = value_or(decisions.closer, MOST_CLOSER)
         # The thresholds are those of the verification where there is one.
         self.verification = self._fitted_verification()
         self.thresholds = self._thresholds(decisions)

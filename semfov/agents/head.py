@@ -31,7 +31,7 @@ from semfov.paths import Ending, HeadPath
 from semfov.paths.head import HeadLook, head_look
 from semfov.paths.stimulus import reduced_copy
 from semfov.sensor.foveation import Foveation
-from semfov.settings import MOST_PASSES, ExploreSettings, FindSettings, LookSettings, SearchSettings, StartSettings
+from semfov.settings import MOST_PASSES, ExploreSettings, FindSettings, SearchSettings, StartSettings, value_or
 
 _SIGMA = 100.0  # width of the fovea that the shipped models were fitted with, in pixels of a view of 640 pixels
 _PASSES = 40  # default of the largest number of looks
@@ -148,12 +148,12 @@ class HeadAgent(nn.Module):
         never_seen = inner.prior(chance)
         gain = SearchGain(views, foresight)
         observer = SceneObserver(inner, views, unseen_chance=never_seen)
-        confirm = _CONFIRM if settings.confirm is None else settings.confirm
-        stop_below = never_seen if settings.stop_below is None else settings.stop_below
-        thresholds = Thresholds(confirm, stop_below, place=confirm)
+        confirm = value_or(settings.confirm, _CONFIRM)
+        thresholds = Thresholds(confirm, value_or(settings.stop_below, never_seen), place=confirm)
         return HeadEpisode(
             self, observer, gain, index,
-            thresholds=thresholds, limits=limits, start=_first_action(settings), duration=_duration(settings),
+            thresholds=thresholds, limits=limits, start=_first_action(settings),
+            duration=value_or(settings.duration, _DURATION),
             seed=settings.seed, prior=settings.given_share, assumed=inner.prior.assumed,
         ).run()  # fmt: skip
 
@@ -220,18 +220,13 @@ class HeadAgent(nn.Module):
             ExploreGain(views),
             None,
             targets,
-            min_gain=0.0 if settings.min_gain is None else settings.min_gain,
+            min_gain=value_or(settings.min_gain, 0.0),
             limits=limits,
             start=start,
-            duration=_duration(settings),
+            duration=value_or(settings.duration, _DURATION),
             seed=seed,
         ).run()
         return path if settings.score_threshold is None else replace(path, score_threshold=settings.score_threshold)
-
-
-def _duration(settings: LookSettings) -> float:
-    """Take the time limit of a scene, or the usual one."""
-    return _DURATION if settings.duration is None else settings.duration
 
 
 def _first_action(settings: StartSettings) -> int | None:
@@ -284,7 +279,7 @@ class HeadEpisode(PictureEpisode[HeadPath]):
         views = observer.views
         speeds = views.world.speeds
         zooms = len(views.fields) > 1
-        first = views.ahead if start is None else start
+        first = value_or(start, views.ahead)
         check_whole(first, "start", 0, len(views.grid) - 1)
         self.views = views
         self.thresholds = thresholds

@@ -15,7 +15,7 @@ from semfov.detection.load import load_detector, loader_options
 from semfov.errors import check, check_options
 from semfov.kinds import WINDOWS
 from semfov.paths import ZoomPath
-from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings
+from semfov.settings import ExploreSettings, FindSettings, SearchSettings, StreamSettings, value_or
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, WindowEye
 from semfov.zoom.looks import LiveWindowLooks
@@ -246,6 +246,6 @@ class ZoomAgent(nn.Module):
             The episode, to which frames are given.
         """
         settings = StreamSettings() if settings is None else settings
-        rate = RATE if settings.rate is None else settings.rate
+        rate = value_or(settings.rate, RATE)
         task = self.task(target, targets, decisions=settings, score_threshold=settings.score_threshold)
         return WindowStream(task, self.eye, rate, passes=settings.passes or 1, color=settings.color, follows=follows)
