@@ -23,7 +23,8 @@ from semfov.episode import Forgetting
 from semfov.errors import InputError, check, check_number, check_whole, type_of
 from semfov.motion import Motion
 from semfov.paths import Ending, Moment, Record, RecordedLook
-from semfov.settings import MOST_PASSES, LookSettings, OnLook
+from semfov.paths.outcome import sought_classes
+from semfov.settings import MOST_PASSES, LookSettings, OnLook, value_or
 
 _UNREDUCED = 2  # largest number of moments that hold their whole frames
 
@@ -59,8 +60,7 @@ class EpisodeLimits:
         Returns:
             The limits.
         """
-        passes = usual if settings.passes is None else settings.passes
-        return cls(passes, settings.seconds, settings.on_look)
+        return cls(value_or(settings.passes, usual), settings.seconds, settings.on_look)
 
     def reached(self, passes: int, record: Callable[[], Record]) -> Literal["stopped", "passes", "seconds"] | None:
         """Find the limit that is reached after a look. Call it once after each look.
@@ -113,9 +113,14 @@ class Goal:
         return cls(tuple(classes), targets[0] if targets else target, searches=searches)
 
     @property
+    def searched(self) -> int | None:
+        """The class that one object of is searched for; None for other goals."""
+        return self.target if self.searches else None
+
+    @property
     def sought(self) -> tuple[int, ...]:
         """The classes that are looked for; none stands for all."""
-        return self.targets or (() if self.target is None else (self.target,))
+        return sought_classes(self.target, self.targets)
 
     def describe(self) -> str:
         """Describe what is done in a few words."""

@@ -31,7 +31,7 @@ from semfov.paths import Ending, WindowMoment, ZoomPath
 from semfov.paths.conversion import Values
 from semfov.paths.stimulus import reduced_copy
 from semfov.paths.windows import LookAtWindow, look_at_window
-from semfov.settings import DecisionSettings
+from semfov.settings import DecisionSettings, value_or
 from semfov.tracking import Tracker, Tracks
 from semfov.tracking.gain import value_of_windows
 from semfov.zoom.belief import ZoomBelief
@@ -146,27 +146,32 @@ class WindowSession:
         task = self.task
         source = self.source
         evidence = task.evidence
-        target = task.goal.target if task.goal.searches else None
         # Sought once, so not in a stream, whose frames change.
         if isinstance(source, LiveWindowLooks) and self._stands_still and source.lattice.levels > 1:
             source.blank = cache(partial(blank_cells, source.view.picture, source.lattice))
-        if target is not None and evidence is None:
-            self.decisions = DecisionsByScore(target, task.decisions.confirm)
+        if task.goal.searched is not None:
+            return self._search(task.goal.searched, evidence)
         if evidence is None or task.takes_slices(source.lattice):
             return self._slices()
-        if target is not None:
-            belief = ZoomBelief(source.lattice, evidence, target, source.blank)
-            self.decisions = decisions_of(belief, task.decisions, self.forgetting)
-            return search_windows(source, belief, forgetting=self.forgetting)
         return find_everything(
             source,
             evidence,
             task.goal.target,
             batch=task.batch,
-            min_gain=NEW_OBJECTS if task.min_gain is None else task.min_gain,
+            min_gain=value_or(task.min_gain, NEW_OBJECTS),
             forgetting=self.forgetting,
             known=None if self.tracker is None else self._value_of_known,
         )
+
+    def _search(self, target: int, evidence: GlimpseEvidence | None) -> Iterator[WindowStep[ZoomBelief | None]]:
+        """Search for a class by a belief, or without evidence by the scores in slices."""
+        settings = self.task.decisions
+        if evidence is None:
+            self.decisions = DecisionsByScore(target, settings.confirm)
+            return self._slices()
+        belief = ZoomBelief(self.source.lattice, evidence, target, self.source.blank)
+        self.decisions = decisions_of(belief, settings, self.forgetting)
+        return search_windows(self.source, belief, forgetting=self.forgetting)
 
     def _slices(self) -> Iterator[WindowStep[None]]:
         """Look at slices in the order of the overview's scores in them."""
@@ -245,9 +250,13 @@ class WindowSession:
     @property
     def kept_looks(self) -> list[KeptLook]:
         """The looks that count and show some of the present frame, in their order."""
-        chosen = () if self.step is None else self.step.kept_looks
-        in_view = [look for look in (*chosen, *self._closer_looks) if look.in_view]
+        in_view = [look for look in (*self._chosen_looks, *self._closer_looks) if look.in_view]
         return sorted(in_view, key=lambda look: look.number)
+
+    @property
+    def _chosen_looks(self) -> Sequence[KeptLook]:
+        """The looks that count but closer ones."""
+        return () if self.step is None else self.step.kept_looks
 
     def record_fields(self, looks: Sequence[LookAtWindow]) -> Values:
         """Collect what the record of a picture and that of a frame have alike.
@@ -256,7 +265,7 @@ class WindowSession:
             looks: the looks that count, in the order of `kept_looks`.
         """
         task = self.task
-        places = {look.number: place for place, look in enumerate(self.kept_looks)}
+        places: dict[int | None, int] = {look.number: place for place, look in enumerate(self.kept_looks)}
         merged = self._merged(looks)
         return {
             "lattice": self.source.lattice,
@@ -274,7 +283,7 @@ class WindowSession:
             "closer": _renumbered(self.decisions.looks, places),
         }
 
-    def _tracked(self, tracks: Tracks, places: Mapping[int, int]) -> Callable[[], Objects]:
+    def _tracked(self, tracks: Tracks, places: Mapping[int | None, int]) -> Callable[[], Objects]:
         """Make what lists the tracked objects in the frame, each with the place of its look in the record."""
         return partial(_objects_in_frame, tracks, places, self.source.lattice.size)
 
@@ -313,11 +322,35 @@ class WindowSession:
 
     def _promised(self) -> float:
         """Sum the values that looks after the overview were chosen for."""
-        chosen = () if self.step is None else self.step.kept_looks
-        return sum(look.value for look in chosen[1:] if isfinite(look.value))
+        return sum(look.value for look in self._chosen_looks[1:] if isfinite(look.value))
 
 
-class WindowEpisode(PictureEpisode[ZoomPath]):
+class _WindowsOfPicture(PictureEpisode[ZoomPath]):
+    """Base of looks at windows of a picture, which keeps them as the record has them.
+
+    Args:
+        session: looks at the windows.
+        limits: where the episode ends, unless it decides before.
+    """
+
+    def __init__(self, session: WindowSession, limits: EpisodeLimits) -> None:
+        super().__init__(session.task.goal, limits)
+        self.source = session.source
+        self.session = session
+        self._looks: list[LookAtWindow] = []
+
+    @property
+    def looks(self) -> tuple[LookAtWindow, ...]:
+        return tuple(self._looks)
+
+    def _recorded(self, look: KeptLook) -> LookAtWindow:
+        """Keep a look as the record has it."""
+        recorded = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
+        self._looks.append(recorded)
+        return recorded
+
+
+class WindowEpisode(_WindowsOfPicture):
     """Looks at windows of a picture.
 
     A search decides by closer looks (`semfov.decision.PlaceVerifier`), or without them by the probability of the
@@ -331,17 +364,11 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
     """
 
     def __init__(self, task: WindowTask, source: WindowLooks, limits: EpisodeLimits | None = None) -> None:
-        super().__init__(task.goal, limits)
-        self.source = source
-        self.session = WindowSession(task, source, self.limits)
+        limits = limits or EpisodeLimits()
+        super().__init__(WindowSession(task, source, limits), limits)
         # The choice after the overview asks for the first, and the record at the end for the second.
         source.meanwhile = lambda: (source.blank(), self._photograph)
-        self._looks: list[LookAtWindow] = []
         self._final_decision: Decision | None = None
-
-    @property
-    def looks(self) -> tuple[LookAtWindow, ...]:
-        return tuple(self._looks)
 
     @property
     def criterion(self) -> str | None:
@@ -357,12 +384,10 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
         look = self.session.look()
         if look is None:
             return None
-        recorded = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
-        self._looks.append(recorded)
         decisions = self.session.decisions
         if decisions.outcome and decisions.candidate is None:
             self.ending = decisions.ending
-        return recorded
+        return self._recorded(look)
 
     def _end(self, limit: Ending | None) -> None:
         decisions = self.session.decisions
@@ -393,7 +418,7 @@ class WindowEpisode(PictureEpisode[ZoomPath]):
         return reduced_copy(self.source.view.picture) if isinstance(self.source, LiveWindowLooks) else None
 
 
-class GivenWindows(PictureEpisode[ZoomPath]):
+class GivenWindows(_WindowsOfPicture):
     """Looks at the windows that are given, the first of which is the overview; nothing is decided.
 
     Args:
@@ -403,17 +428,12 @@ class GivenWindows(PictureEpisode[ZoomPath]):
     """
 
     def __init__(self, goal: Goal, evidence: GlimpseEvidence | None, source: WindowLooks) -> None:
-        super().__init__(replace(goal, searches=False))
-        self.source = source
         self._next = Window.overview(source.lattice)
         belief = None if evidence is None else ZoomBelief(source.lattice, evidence, goal.target or 0)
         steps = look_by_look(source, lambda looks, windows: [(self._next, 0.0)], belief)
-        self.session = WindowSession(WindowTask(self.goal, evidence), source, self.limits, steps=steps)
-        self._looks: list[LookAtWindow] = []
-
-    @property
-    def looks(self) -> tuple[LookAtWindow, ...]:
-        return tuple(self._looks)
+        limits = EpisodeLimits()
+        task = WindowTask(replace(goal, searches=False), evidence)
+        super().__init__(WindowSession(task, source, limits, steps=steps), limits)
 
     @property
     def criterion(self) -> str | None:
@@ -429,9 +449,7 @@ class GivenWindows(PictureEpisode[ZoomPath]):
         self._next = window or self._next
         look = self.session.look()
         assert look is not None
-        recorded = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
-        self._looks.append(recorded)
-        return recorded
+        return self._recorded(look)
 
     def _end(self, limit: Ending | None) -> None:
         self.ending = limit
@@ -539,14 +557,13 @@ class WindowStream(StreamEpisode[WindowMoment]):
         )
 
 
-def _objects_in_frame(tracks: Tracks, places: Mapping[int, int], size: tuple[int, int]) -> Objects:
+def _objects_in_frame(tracks: Tracks, places: Mapping[int | None, int], size: tuple[int, int]) -> Objects:
     """List the tracked objects in a frame, each with the place of its look in the record; -1 for none there."""
     objects = tracks.objects()
     passes = torch.tensor([places.get(number, -1) for number in objects.passes.tolist()], dtype=torch.long)
     return replace(objects, passes=passes)[inside_frame(objects.boxes, size)]
 
 
-def _renumbered(closer: Sequence[CloseUp], places: Mapping[int, int]) -> tuple[CloseUp, ...]:
+def _renumbered(closer: Sequence[CloseUp], places: Mapping[int | None, int]) -> tuple[CloseUp, ...]:
     """Give the closer looks that count the places of their looks in the record as indices."""
-    counting = [look for look in closer if look.index is not None and look.index in places]
-    return tuple(replace(look, index=places[look.index]) for look in counting if look.index is not None)
+    return tuple(replace(look, index=places[look.index]) for look in closer if look.index in places)

@@ -28,6 +28,17 @@ _PART = 0.8  # share of a box in that of a listed object from which on it is a p
 _CONFIRMING = 0.5  # probability from which on a closer look confirms that the target is there
 
 
+def sought_classes(target: int | None, targets: tuple[int, ...]) -> tuple[int, ...]:
+    """List the classes that are looked for: several, or the target alone; none stands for all.
+
+    >>> sought_classes(3, ()), sought_classes(None, (3, 5)), sought_classes(None, ())
+    ((3,), (3, 5), ())
+    """
+    if target is None or targets:
+        return targets
+    return (target,)
+
+
 class NumberByClass(dict[str, float]):
     """Numbers by the name of their class, which may be in the plural or another spelling, as that of a target may."""
 
@@ -290,7 +301,7 @@ class Outcome(ABC):
     @property
     def sought(self) -> tuple[int, ...]:
         """Classes that were searched for; none stands for all."""
-        return self.targets or (() if self.target is None else (self.target,))
+        return sought_classes(self.target, self.targets)
 
     @property
     def place_probability(self) -> float | None:
