@@ -15,9 +15,9 @@ from semfov.zoom.eye import WindowView
 class StreamCamera:
     """How the camera moves between frames: by the poses that are given, or estimated from the frames.
 
-    The first frame decides: with a pose `_poses` is made, and without one `_estimate`, where the camera is followed.
-    Either way `flow` follows objects. It reads all of a frame, so that with poses it is made only where the first frame
-    is in memory.
+    The first frame decides: with a pose there is one of each frame (`_has_poses`), and without one `_estimate` is made,
+    where the camera is followed. Either way `flow` follows objects. It reads all of a frame, so that with poses it is
+    made only where the first frame is in memory.
 
     Args:
         follows: whether its motion is estimated from the frames, where no poses are given.
@@ -30,33 +30,35 @@ class StreamCamera:
     def __init__(self, *, follows: bool) -> None:
         self._follows = follows
         self._estimate: CameraMotion | None = None
-        self._poses: KnownPoses | None = None
+        self._has_poses = False
+        self._poses = KnownPoses()
         self.flow: PatchFlow | None = None
         self._is_first = True  # whether no frame was seen
 
     @property
     def is_followed(self) -> bool:
         """Whether its motion is known at all, from the first frame on."""
-        return self._estimate is not None or self._poses is not None
+        return self._estimate is not None or self._has_poses
 
     def step(self, view: WindowView, pose: Motion | ArrayLike | None) -> CameraStep | None:
         """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
-        is_pose_expected = self._is_first or (self._poses is None) == (pose is None)
-        check(is_pose_expected, "pose", "a pose of each frame, or of none", pose)
         if self._is_first:
             self._begin(view, is_pose_known=pose is not None)
         self._is_first = False
-        if pose is not None and self._poses is not None:
-            step = self._poses.step(pose)  # first, as a pose may be refused
-            if self.flow is not None:
-                self.flow.step(_pixels(view))
-            return step
-        return None if self._estimate is None else self._estimate.step(_pixels(view))
+        check(self._has_poses == (pose is not None), "pose", "a pose of each frame, or of none", pose)
+        if self._estimate is not None:
+            return self._estimate.step(_pixels(view))
+        if pose is None:
+            return None
+        step = self._poses.step(pose)  # first, as a pose may be refused
+        if self.flow is not None:
+            self.flow.step(_pixels(view))
+        return step
 
     def _begin(self, view: WindowView, *, is_pose_known: bool) -> None:
         """Make what tells the motion of the camera, and what follows objects."""
+        self._has_poses = is_pose_known
         if is_pose_known:
-            self._poses = KnownPoses()
             self.flow = _patch_flow() if isinstance(view.picture, ArrayPicture) else None
         elif self._follows:
             self._estimate = _camera_motion()
