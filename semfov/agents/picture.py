@@ -22,6 +22,7 @@ from semfov.eye import MOST_FLOATS
 from semfov.gaze.saliency.fixation_density import cells_of
 from semfov.head.camera import PanTiltCamera, open_scene
 from semfov.head.scenes import Panorama, World
+from semfov.io.files import is_pattern
 from semfov.kinds import KindName
 from semfov.paths import Record
 from semfov.settings import How
@@ -135,17 +136,19 @@ class OpenedPicture:
         if not self._is_read_by_windows():
             source = cast(ImageLike, self.source)
             return as_image(source, like=like, argument="picture", color=self.color, white=self.white)[None]
-        width, height = self.large.size
-        self._check_area(width, height)
-        return as_image(self.large.read((0, 0, width, height)), like=like, argument="picture")[None]
+        return as_image(self._all_bytes(), like=like, argument="picture")[None]
 
     def pixels(self, like: Tensor) -> Tensor:
         """Read the pixels for a fovea, as `image`; `(1, 3, H, W)` of bytes where floats of all would take too much."""
         if self.scene or math.prod(self._size()) <= MOST_FLOATS:
             return self.image(like)
+        return self._all_bytes()[None]
+
+    def _all_bytes(self) -> Tensor:
+        """Read all pixels by windows, `(3, H, W)` of bytes; raises `InputError` where they are too many for a fovea."""
         width, height = self.large.size
         self._check_area(width, height)
-        return self.large.read((0, 0, width, height))[None]
+        return self.large.read((0, 0, width, height))
 
     @property
     def is_panorama(self) -> bool:
@@ -233,9 +236,7 @@ def _names_several(source: object) -> bool:
         return any(isinstance(item, str | PathLike) for item in source)
     if not isinstance(source, str | PathLike):
         return False
-    has_wildcards = bool({*os.fspath(source)} & {*"*?["})
-    # A file may have brackets in its name, as copies do: photo[1].jpg.
-    return os.path.isdir(source) or (has_wildcards and not os.path.lexists(source))
+    return os.path.isdir(source) or is_pattern(os.fspath(source))
 
 
 def check_order(picture: object, target: object, classes: Sequence[str]) -> None:

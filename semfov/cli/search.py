@@ -24,6 +24,7 @@ from semfov.cli.sources import EXAMPLE
 from semfov.cli.totals import found_in_all
 from semfov.cli.written import PictureFiles
 from semfov.errors import InputError, SemfovError, check, check_options, lookup, rename_former
+from semfov.io.files import is_pattern
 from semfov.paths.conversion import Values
 from semfov.runs.workers import Where, run_tasks
 from semfov.threads import available_cores
@@ -78,7 +79,7 @@ def with_target(options: PictureOptions) -> PictureOptions:
 def _may_be_class(name: str) -> bool:
     """Tell whether a word among the pictures looks like a class: no path, no pattern, no file, and no example."""
     is_bare = Path(name).name == name and not Path(name).suffix and not name.startswith(EXAMPLE)
-    return is_bare and not os.path.lexists(name) and not set(name) & set("*?[")
+    return is_bare and not os.path.lexists(name) and not is_pattern(name)
 
 
 def run(
@@ -126,11 +127,12 @@ def run(
     has_target = task != "search" or target is not None
     check(has_target, "target", "a class to search for; task='find' finds all objects", target)
     values = _as_settings(options, kind)
-    made_agent = agent if isinstance(agent, ActivePerception) else None
-    if made_agent is None:
-        values["agent"] = agent
-    else:
+    made_agent = None
+    if isinstance(agent, ActivePerception):
+        made_agent = agent
         _check_agent_is_made(options)
+    else:
+        values["agent"] = agent
     if target is not None:
         values["target"] = ",".join(_classes_of(target))
     settings = kind(pictures=names, quiet=quiet, **values)
@@ -276,20 +278,19 @@ def _outcomes(
     options = job.options
     numbers = [number for number in range(len(job.sources)) if number not in before]
     where: Where = options.workers if options.scheduler is None else options.scheduler
-    may_start_processes = options.scheduler is None and options.workers != 1
-    if numbers and may_start_processes:
+    if options.scheduler is None and options.workers != 1:
         # A process takes as long to start as this one has taken so far. The first picture that can be looked at tells
         # whether that pays: a damaged one takes no time.
         start = time.process_time()
         seconds = 0.0
-        is_looked_at = False
-        while numbers and not is_looked_at:
+        while numbers:
             began = time.process_time()
             first = numbers.pop(0)
             outcome = job.outcome(first)
             seconds = time.process_time() - began
-            is_looked_at = not isinstance(outcome, SemfovError)
             yield first, outcome
+            if not isinstance(outcome, SemfovError):
+                break
         where = _worth_starting(options.workers, len(numbers), seconds, start)
     yield from run_tasks(
         PictureJob.outcome,

@@ -23,7 +23,7 @@ from semfov.data.tone import White
 from semfov.data.windowed import LargePicture
 from semfov.errors import DataError, InputError, SemfovError, check, printable, reason_of
 from semfov.head import Flat, Panorama
-from semfov.io.files import disk_is_full
+from semfov.io.files import disk_is_full, is_pattern
 from semfov.settings import How
 
 _DEBUG = "SEMFOV_DEBUG"  # variable of the environment that also prints where in the code a picture has failed
@@ -186,9 +186,7 @@ def _names_of_pictures(words: Iterable[str]) -> list[str]:
 
 def _matching(word: str) -> list[str]:
     """Find the files that match a pattern; what is none, or matches nothing, stands for itself."""
-    # A file may have brackets in its name, as copies do: photo[1].jpg.
-    is_pattern = bool(set(word) & set("*?[")) and not os.path.lexists(word)
-    if not is_pattern:
+    if not is_pattern(word):
         return [word]
     return sorted(glob(word, recursive=True)) or [word]
 

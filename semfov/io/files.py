@@ -204,6 +204,11 @@ def inside(folder: str | os.PathLike[str], name: str, *, links: bool = False) ->
     return path
 
 
+def is_pattern(name: str) -> bool:
+    """Tell whether a name is a pattern of names, and not a file with brackets in its name: a[1].jpg, as of a copy."""
+    return bool(set(name) & set("*?[")) and not os.path.lexists(name)
+
+
 def plain_name(text: str) -> str:
     """Make a text a name that is valid on every file system.
 
