@@ -49,6 +49,20 @@ class Placement:
         offset = points.new_tensor(self.offset)
         return (points + 0.5) * scale + offset - 0.5
 
+    def cut_out(self, canvas: Tensor) -> Tensor:
+        """Cut out the part of a canvas that the image fills.
+
+        Args:
+            canvas: `(..., H, W)`.
+
+        Returns:
+            `(..., h, w)`, a view of the canvas.
+        """
+        left, top = self.offset
+        width = round(self.size[0] * self.scale[0])
+        height = round(self.size[1] * self.scale[1])
+        return canvas[..., top : top + height, left : left + width]
+
     def boxes_to_image(self, boxes: Tensor) -> Tensor:
         """Map boxes from the canvas to the image, and cut them to the image.
 

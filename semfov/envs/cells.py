@@ -355,13 +355,8 @@ class CellGazes(Gazes[CellEpisode]):
 
     def _view(self, row: int) -> Tensor:
         view = self.scenery.view(self.episodes[row].scene)
-        placement = view.placement
-        left, top = placement.offset
-        # The part of the detector's canvas that the scene fills.
-        width = round(placement.size[0] * placement.scale[0])
-        height = round(placement.size[1] * placement.scale[1])
         canvas = self.scenery.eye.pictures(view, self.points(torch.tensor([row])))
-        return canvas[..., top : top + height, left : left + width]
+        return view.placement.cut_out(canvas)
 
     def _belief_of(self, rows: Tensor) -> Belief:
         """Take the belief of some rows, without a copy where these are all."""

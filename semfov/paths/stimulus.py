@@ -80,9 +80,6 @@ class Stimulus:
         placement = self.placement  # of the photograph on the canvas of the detector
         # The sensor's blur is set for photographs of a reference size; a larger one is seen at more pixels a degree.
         magnification = max(placement.size) / settings["reference"]
-        left, top = placement.offset
-        width = round(placement.size[0] * placement.scale[0])
-        height = round(placement.size[1] * placement.scale[1])
         views = []
         with torch.no_grad():
             canvas = (self.canvas[None].double() / 255).to(sensor.like)  # (1, 3, h, w)
@@ -90,9 +87,8 @@ class Stimulus:
             # One at a time: all views of a large canvas at once would take gigabytes.
             for point in placement.points_to_canvas(fixations.to(canvas)):
                 picture = sensor.picture(state, point[None])[0]
-                view = picture[:, top : top + height, left : left + width]
                 # A copy, as a view would keep the whole canvas in memory.
-                views.append(view.float().cpu().clone())
+                views.append(placement.cut_out(picture).float().cpu().clone())
         return views
 
 

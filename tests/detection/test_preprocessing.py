@@ -135,6 +135,9 @@ def test_the_image_is_at_the_place_given_by_the_placement(width, height, stride)
     assert (int(columns.min()), int(rows.min())) == (left, top)
     assert (int(columns.max()) + 1 - left, int(rows.max()) + 1 - top) == pytest.approx(inner)
     assert bool((canvas[0, 0][~bright] == 0.25).all())
+    cut_out = placement.cut_out(canvas)
+    assert cut_out.numel() == bright.sum()
+    assert bool((cut_out > 0.99).all())
     if stride is None:
         assert canvas.shape[-2:] == (64, 64)
     else:
