@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from time import perf_counter
 from typing import Generic, Literal, Self, TypeVar
 from weakref import ref
@@ -46,7 +47,7 @@ class EpisodeLimits:
         if self.passes is not None:
             check_whole(self.passes, "passes", 1, MOST_PASSES)
         if self.seconds is not None:
-            check_number(self.seconds, "seconds", 0, float("inf"))
+            check_number(self.seconds, "seconds", 0, inf)
         check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
 
     @classmethod
@@ -72,9 +73,9 @@ class EpisodeLimits:
         # First, so that it gets every look; False alone stops, as many functions return None.
         if self.on_look is not None and self.on_look(record()) is False:
             return "stopped"
-        if self.passes is not None and passes >= self.passes:
+        if self.room(passes) <= 0:
             return "passes"
-        if self.seconds is not None and self.elapsed() >= self.seconds:
+        if self.elapsed() >= value_or(self.seconds, inf):
             return "seconds"
         return None
 
@@ -84,7 +85,7 @@ class EpisodeLimits:
 
     def room(self, passes: int) -> float:
         """Count the passes that remain after some; infinite without a limit."""
-        return float("inf") if self.passes is None else self.passes - passes
+        return value_or(self.passes, inf) - passes
 
 
 @dataclass(frozen=True)

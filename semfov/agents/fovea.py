@@ -67,14 +67,13 @@ class FoveaAgent(GazeParts):
             cells=cells,
         )
         boxes = settings.boxes
-
-        def criterion(grid: Grid) -> StoppingCriterion:
-            if boxes is not None:
-                return AtGoal(_goal_cells(boxes, grid, self.eye.sensor.like))
-            return AtDetection(grid, index, weights, value_or(settings.confirm, _CONFIRM))
-
-        learned = boxes is None and plan.thresholds is not None
-        return FoveaEpisode(plan, image, limits, None if learned else criterion)
+        if boxes is not None:
+            like = self.eye.sensor.like
+            return FoveaEpisode(plan, image, limits, lambda grid: AtGoal(_goal_cells(boxes, grid, like)))
+        if plan.thresholds is None:
+            score = value_or(settings.confirm, _CONFIRM)
+            return FoveaEpisode(plan, image, limits, lambda grid: AtDetection(grid, index, weights, score))
+        return FoveaEpisode(plan, image, limits)
 
     def explore(self, image: Tensor, settings: ExploreSettings) -> Scanpath:
         """Explore a photograph, without a target (`ActivePerception.explore`).

@@ -113,8 +113,9 @@ class GazePlan:
         self.verification = self._fitted_verification()
         self.thresholds = self._thresholds(decisions)
         self._viewed = viewed
-        self._cells = None if cells is None else _checked_cells(cells, agent.cells)
+        self._cells: Tensor | None = None
         if cells is not None:
+            self._cells = _checked_cells(cells, agent.cells)
             start = cells[0]
             shifts = len(cells) - 1
         self.most = sys.maxsize if shifts is None else shifts + 1
