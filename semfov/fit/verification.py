@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from semfov.belief.prior import with_prior
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import FOUND, Verifier, final_outcome, found_at_once
-from semfov.decision.candidates import LookType
+from semfov.decision.candidates import CandidatePlace, LookType
+from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.searches import SearchedPhotograph, SearchEnd, TargetSearch, photograph_searches
@@ -85,6 +86,24 @@ class CloserLookSamples(NamedTuple):
     present: Tensor
     fold: Tensor
     known: Tensor
+
+
+class ExaminedLook(NamedTuple):
+    """A closer look at a place of a search.
+
+    Attributes:
+        looks: number of looks of the search before it.
+        candidate: the place.
+        detections: what the look shows, a batch of one.
+        features: `(7,)`, what the verification reads.
+        box: `(4,)`, box of the target in it.
+    """
+
+    looks: int
+    candidate: CandidatePlace
+    detections: Detections
+    features: Tensor
+    box: Tensor
 
 
 class VerificationInFolds(NamedTuple):
@@ -193,9 +212,9 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
         if search.spare:
             continue
         prior = search.candidates().prior
-        for features_of_look, box in _examined_places(search):
-            features.append(features_of_look)
-            right.append(search.right(box))
+        for look in examined_places(search):
+            features.append(look.features)
+            right.append(search.right(look.box))
             present.append(search.present)
             fold.append(search.picture % folds)
             known.append(with_prior(0.0, prior.share, prior.fitted))
@@ -205,8 +224,15 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
     return CloserLookSamples(torch.stack(features), *answers, torch.tensor(fold), torch.tensor(known))
 
 
-def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Look closely at the most evident places after some numbers of looks; yields features `(7,)` and box `(4,)`."""
+def examined_places(search: TargetSearch[LookType]) -> Iterator[ExaminedLook]:
+    """Look closely at the most evident places after some numbers of looks.
+
+    Args:
+        search: a search for a class.
+
+    Yields:
+        The closer looks.
+    """
     least = Thresholds(confirm=1.0, stop_below=_LEAST_CHANCE, place=_LEAST_CHANCE)
     for looks in search.after:
         if looks > len(search):
@@ -221,7 +247,7 @@ def _examined_places(search: TargetSearch[LookType]) -> Iterator[tuple[Tensor, T
             detections = candidates.shown_at(candidate)
             if detections is None:
                 detections = search.close_up(candidate.box)
-            yield candidates.examine(candidate, detections)
+            yield ExaminedLook(looks, candidate, detections, *candidates.examine(candidate, detections))
 
 
 @torch.inference_mode()

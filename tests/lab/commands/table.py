@@ -218,6 +218,13 @@ COMMANDS = {
         workers=False,
         refused=((("--data.limit", "2", "--folds", "5"), "expected at least 5 photographs"),),
     ),
+    "eval.closer": Command(
+        settings=(*NETWORK, *PHOTOGRAPHS, "--columns", "3", "--rows", "2", "--looks", "3", "--folds", "2",
+                  "--search_model", "HERE/search.safetensors"),
+        files=("report.md",),
+        parts="cache/looks/*/*/*.safetensors",
+        workers=False,
+    ),
     "eval.ivsn.fit": Command(workers=False),
     "train.fit_zoom": Command(refused=((("--steps", "0"), "steps: expected a whole number from 1"),)),
     "semfov.cli.main fit": Command(
