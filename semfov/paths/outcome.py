@@ -288,8 +288,8 @@ class Outcome(ABC):
     def expected_guessed(self) -> dict[str, bool | None]:
         """Whether the expected number of objects is a guess, by the name of their class; None where it is not known.
 
-        It is where the detector hardly reacts to the class (`semfov.paths.ZoomPath.reacts`). The words of the record say
-        `at a guess` there, if an object of it is listed, or at least one half is expected.
+        It is where the detector hardly reacts to the class (`semfov.paths.ZoomPath.reacts`). There the words of the
+        record say `at a guess`, if an object of it is listed, or at least one half is expected.
         """
         return {name: None if isnan(mean) else False for name, (mean, _) in self._claimed().items()}
 

@@ -233,29 +233,36 @@ def mistake(message: str, config: type[CheckedSettings], options: Iterable[str],
     unknown = re.match(r"unrecognized arguments: (.*)", message, re.DOTALL)
     if unknown:
         return _unknown_argument(unknown[1], options, help_option)
-    setting_of_file = re.match(r"Option '(.*)' is not accepted", message, re.DOTALL)
-    if setting_of_file:
-        name = setting_of_file[1]
-        return f"unknown setting {name!r}; {_remedy_for(name, options, help_option)}"
-    setting_of_group = re.match(r"Group '(.*)' does not accept option '(.*)'", message, re.DOTALL)
-    if setting_of_group:
-        name = ".".join(setting_of_group.groups())
-        return f"unknown setting {name!r}; {_remedy_for(name, options, help_option)}"
-    unread = re.match(r"Parser key \"([\w.]+)\": Unable to load config '(.*?)'", message, re.DOTALL)
-    if unread:
-        group, file = unread.groups()
-        return f"{_in_messages(group)}: no file of settings: {file}; check the path"
+    setting = _unknown_setting(message)
+    if setting is not None:
+        return f"unknown setting {setting!r}; {_remedy_for(setting, options, help_option)}"
+    return _mistaken_value(message, config)
+
+
+def _unknown_setting(message: str) -> str | None:
+    """Find the name in a file of settings that the parser does not know; None for another mistake."""
+    of_file = re.match(r"Option '(.*)' is not accepted", message, re.DOTALL)
+    of_group = re.match(r"Group '(.*)' does not accept option '(.*)'", message, re.DOTALL)
+    match = of_file or of_group
+    return None if match is None else ".".join(match.groups())
+
+
+def _mistaken_value(message: str, config: type[CheckedSettings]) -> str:
+    """Say what is wrong with the value of a setting; the message of the parser in one line for other mistakes."""
     missing = re.match(r"argument (--\S+): expected one argument", message)
     if missing:
         return f"--{dashed(missing[1][2:])}: expected a value, got none"
+    unread = re.match(r"Parser key \"([\w.]+)\":\s+Unable to load config '(.*?)'", message, re.DOTALL)
+    if unread and ", line " not in message:  # a mistake in the file has its line
+        group, file = unread.groups()
+        return f"{_in_messages(group)}: no file of settings: {file}; check the path"
     setting = re.search(r'Parser key "([\w.]+)"', message)
     value = re.search(r"(?:Given|Got) value: (.*)", message)
     if setting and value:
         name = setting[1]
         kind = setting_types(config).get(name, _NO_SETTING)
-        refusal = _refusal(kind, value[1].strip())
-        if refusal is not None:
-            return f"{_in_messages(name)}: {refusal}"
+        refusal = _refusal(kind, value[1].strip()) or f"expected what --help says of it, got {value[1].strip()}"
+        return f"{_in_messages(name)}: {refusal}"
     return " ".join(message.split())
 
 

@@ -297,6 +297,27 @@ def test_a_file_that_has_a_setting_by_two_names_is_refused(text, tmp_path, capsy
     assert "error: score_threshold: expected once, got it again as 'score_threshold'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("command", "text", "refusal"),
+    [
+        ("search", "detector: [a]", "detector: expected a name, got \"['a']\""),
+        ("search", "report: [x]", "report: expected the name of a file or folder, got \"['x']\""),
+        ("search", "pases: 4", "unknown setting 'pases'; did you mean --passes?"),
+        ("search", "1: x", "unknown setting '1'; --help-all lists all options"),
+        ("fit", "data: [3]", "data: expected settings by name, or a file of them, got [3]"),
+        ("fit", "data: {1: x}", "data: expected settings by name, or a file of them, got {1: 'x'}"),
+        ("fit", "data: {rot: x}", "unknown setting 'data.rot'; did you mean --data.root?"),
+        ("fit", "data: none.yaml", "data: no file of settings: none.yaml; check the path"),
+    ],
+)
+def test_files_of_settings_with_something_else_than_settings_are_refused(command, text, refusal, tmp_path, capsys):
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--config", str(tmp_path / "settings.yaml")])
+    assert stopped.value.code == 2
+    assert f"error: {refusal}\n" in capsys.readouterr().err
+
+
 def test_the_file_of_a_yolo_data_set_is_refused_with_what_converts_it(tmp_path, capsys):
     path = tmp_path / "coco.yaml"
     for names in ("names: [person]", "names:\n  0: person"):
@@ -323,8 +344,8 @@ def test_a_file_whose_name_begins_with_a_dash_is_no_option(name, tmp_path, monke
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("data.yaml", "limt: 3\n", "Group 'data' does not accept option 'limt'\n"),
-        ("data.json", '{"limt": 3}', "Group 'data' does not accept option 'limt'\n"),
+        ("data.yaml", "limt: 3\n", "unknown setting 'data.limt'; did you mean --data.limit?\n"),
+        ("data.json", '{"limt": 3}', "unknown setting 'data.limt'; did you mean --data.limit?\n"),
         ("data.yaml", "root: photographs\nlimit: [3\nids: 4\n", "line 3, column 4"),
         ("data.yaml", b"root: \xff\n", "expected --data.root, --data.annotations and others, or a file of them"),
         ("data.csv", "limit: 3\n", "or a file of them (.yaml, .json), got "),
