@@ -9,7 +9,6 @@ annotation whether it is right:
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import islice, product
 from typing import NamedTuple, Self
@@ -92,11 +91,13 @@ class Exploration(NamedTuple):
         """Number of looks."""
         return len(self.promised)
 
+    @torch.no_grad()
     def sum_after(self, certainty: Certainty, number: int) -> float:
         """Sum the probabilities of the objects after a number of looks."""
         facts, _ = self.objects[number]
         return float(certainty.probability(facts).double().sum())
 
+    @torch.no_grad()
     def number(self, certainty: Certainty, number: int) -> tuple[float, float] | None:
         """Claim a number of objects after some looks, or none: its mean, and its variance without a spread."""
         facts, right = self.objects[number]
@@ -104,10 +105,10 @@ class Exploration(NamedTuple):
         if not (chances >= 0.5).any() or not reacts(chances):
             return None
         discoveries = self.sum_after(certainty, number) - self.sum_after(certainty, 1)
-        unseen = certainty.unseen(
+        mean, variance = certainty.unseen(
             self.remaining[number - 1], promised=self.promised[number - 1], discoveries=max(discoveries, 0.0)
         )
-        return number_of(chances[right >= 0], unseen, 0.0)
+        return number_of(chances[right >= 0], (float(mean), float(variance)), 0.0)
 
 
 @torch.inference_mode()
@@ -227,7 +228,7 @@ def _fit_unseen(certainty: Certainty, explored: Sequence[Exploration]) -> Certai
         return float((expected.log1p() - last.log1p()).square().mean())
 
     best = min(product(_SCALES, _STRENGTHS, _FAINT, _PROMISES), key=error)
-    return Certainty(certainty.offset, certainty.weights, *best)
+    return Certainty(certainty.offset.item(), certainty.weights.tolist(), *best)
 
 
 class _Numbers(NamedTuple):
@@ -340,7 +341,8 @@ def fit_with_spread(
     if not numbers:
         return certainty, []
     spread, report = fit_spread(numbers)
-    return replace(certainty, spread=spread), report
+    certainty.spread = spread
+    return certainty, report
 
 
 def fit_certainty(model: GlimpseEvidence, fitted: PicturesByKind, judged: PicturesByKind, *, passes: int) -> list[str]:
@@ -361,15 +363,15 @@ def fit_certainty(model: GlimpseEvidence, fitted: PicturesByKind, judged: Pictur
     certainty, report_on_spread = fit_with_spread(by_kind, partial(_fit_certainty, passes=passes))
     model.certainty = certainty
     facts, right = _judged(held_out, passes)
-    chances = certainty.probability(facts)
+    chances = certainty.probability(facts).detach()
     is_listed = chances >= 0.5
     error = BinarySums.of(chances, right).ece
-    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(FACTS, certainty.weights, strict=True))
+    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(FACTS, certainty.weights.tolist(), strict=True))
     return [
         f"Probability of an object, fitted on {len(_judged(training, passes)[1])} objects: offset "
-        f"{certainty.offset:.2f}; {weights}. Objects that no look has shown: scale {certainty.scale:.3f}, "
-        f"strength {certainty.strength:g}, faint cells {certainty.faint:g}, promises "
-        f"{certainty.promise:g}.",
+        f"{certainty.offset.item():.2f}; {weights}. Objects that no look has shown: scale "
+        f"{certainty.scale.item():.3f}, strength {certainty.strength.item():g}, faint cells "
+        f"{certainty.faint.item():g}, promises {certainty.promise.item():g}.",
         "",
         f"Of {len(right)} objects in pictures of held-out photographs {int(right.sum())} are right and "
         f"{float(chances.sum()):.0f} are expected; the expected calibration error is {error:.3f}. Of the "

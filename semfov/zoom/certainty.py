@@ -1,13 +1,14 @@
 """The probability that an object of a large picture is there, and how many objects no look has shown yet."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from semfov.errors import check
+from semfov.io.state import StatedModule
 from semfov.observation.precision import exact_product
 
 FACTS = (
@@ -43,8 +44,7 @@ LIKELY = 0.5  # probability from which on an object is likely
 _LIKELY_SHARE = 0.6  # share of the sum of all probabilities that likely objects have where a detector reacts
 
 
-@dataclass(frozen=True)
-class Certainty:
+class Certainty(StatedModule):
     r"""A logistic regression from facts about an object to the probability that its box and class are right.
 
     The number n of objects that looks would still show is negative binomial. The evidence expects :math:`R_1` in cells
@@ -53,23 +53,44 @@ class Certainty:
     .. math:: R = R_1 + w R_2, \qquad E[c] = \frac{k c_0 + F}{k + u W}, \qquad
               E[n] = E[c] R, \qquad \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
 
-    Attributes:
+    Both are differentiable in the numbers of the fit, which are parameters.
+
+    Args:
         offset: constant of the regression.
         weights: its weights, one for each of `FACTS`.
         scale: :math:`c_0`, share of the expected objects that looks show.
         strength: k, how little discoveries change the scale; infinite where they do not.
         faint: w, weight of objects that are expected in cells which do not clearly promise one.
         promise: u, weight of what was promised.
-        spread: standard deviation of the share by which the model is off in a picture.
+        spread: standard deviation of the share by which the model is off in a picture (`number_of`).
+
+    Raises:
+        InputError: there are more or fewer weights than facts.
+
+    >>> certainty = Certainty(0.0, [1.0] + 13 * [0.0])  # by the score alone
+    >>> certainty.probability(torch.zeros(2, 14)).tolist()
+    [0.5, 0.5]
     """
 
-    offset: float
-    weights: tuple[float, ...]
-    scale: float = 0.0
-    strength: float = math.inf
-    faint: float = 1.0
-    promise: float = 1.0
-    spread: float = SPREAD
+    def __init__(
+        self,
+        offset: float,
+        weights: Sequence[float],
+        scale: float = 0.0,
+        strength: float = math.inf,
+        faint: float = 1.0,
+        promise: float = 1.0,
+        spread: float = SPREAD,
+    ) -> None:
+        super().__init__()
+        check(len(weights) == len(FACTS), "weights", f"{len(FACTS)} numbers", len(weights))
+        self.offset = _parameter(offset)
+        self.weights = _parameter(weights)
+        self.scale = _parameter(scale)
+        self.strength = _parameter(strength)
+        self.faint = _parameter(faint)
+        self.promise = _parameter(promise)
+        self.spread = spread
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Self:
@@ -92,27 +113,29 @@ class Certainty:
         count = len(FACTS) + 6
         check(len(numbers) == count, "certainty", f"2 or {count} numbers", len(numbers))
         offset, *weights = numbers[:-5]
-        return cls(offset, tuple(weights), *numbers[-5:])
+        return cls(offset, weights, *numbers[-5:])
 
     @property
     def numbers(self) -> list[float]:
-        """The numbers of a file, as `of` reads them."""
-        if math.isinf(self.strength):
-            return [self.offset, self.weights[0]]
-        return [self.offset, *self.weights, self.scale, self.strength, self.faint, self.promise, self.spread]
+        """The numbers of a file, as `of` reads them: the shortest decimals of the parameters, and the spread."""
+        regression = _decimals([self.offset, *self.weights])
+        if self.strength.isinf():
+            return regression[:2]
+        counts = _decimals([self.scale, self.strength, self.faint, self.promise])
+        return [*regression, *counts, self.spread]
 
     def probability(self, facts: Tensor) -> Tensor:
         """Compute the probabilities of objects.
 
         Args:
-            facts: `(M, 14)`, `FACTS` about each object.
+            facts: `(..., 14)`, `FACTS` about each object.
 
         Returns:
-            `(M,)`.
+            `(...)`, in the type and on the device of the facts, differentiable in them and in the parameters.
         """
-        return (self.offset + exact_product(facts, facts.new_tensor(self.weights))).sigmoid()
+        return (self.offset.to(facts) + exact_product(facts, self.weights.to(facts))).sigmoid()
 
-    def unseen(self, expected: tuple[float, float], *, promised: float, discoveries: float) -> tuple[float, float]:
+    def unseen(self, expected: tuple[float, float], *, promised: float, discoveries: float) -> tuple[Tensor, Tensor]:
         """Estimate how many objects further looks would show, n.
 
         Args:
@@ -121,19 +144,35 @@ class Certainty:
             discoveries: F, objects that they have shown for the first time.
 
         Returns:
-            Mean and variance of n.
+            Mean and variance of n, `()` each, differentiable in the parameters.
         """
         clear, faint = expected
         number = clear + self.faint * faint
-        if math.isinf(self.strength):
-            # A scale that is known exactly leaves a Poisson number, whose variance is its mean.
-            return self.scale * number, self.scale * number
-        rate = self.strength + self.promise * promised
-        scale = (self.strength * self.scale + discoveries) / rate
-        return scale * number, scale * number * (1 + number / rate)
+        weight_promised = self.promise * promised
+        rate = self.strength + weight_promised
+        # E[c] in a form that is c0 where the strength is infinite; n is Poisson there, and its variance is its mean.
+        scale = self.scale + (discoveries - self.scale * weight_promised) / rate
+        mean = scale * number
+        return mean, mean * (1 + number / rate)
+
+    def _fitted_values(self) -> dict[str, object]:
+        return {"spread": self.spread}
+
+    def _load_fitted_values(self, values: Mapping[str, Any]) -> None:
+        self.spread = values["spread"]
 
 
-BY_SCORE = Certainty.of([0.0, 1.0])
+def _parameter(numbers: float | Sequence[float]) -> nn.Parameter:
+    """Make a parameter of the default type, of whole numbers, too."""
+    return nn.Parameter(torch.tensor(numbers, dtype=torch.get_default_dtype()))
+
+
+def _decimals(parameters: Sequence[Tensor]) -> list[float]:
+    """List parameters `()` by the shortest decimals that are rounded to them: 0.1 in float32 is 0.1."""
+    return [float(str(number)) for number in torch.stack([*parameters]).detach().cpu().numpy()]
+
+
+BY_SCORE = Certainty.of([0.0, 1.0]).requires_grad_(False)
 """The certainty of an object whose probability is its score, where none was fitted."""
 
 

@@ -103,6 +103,7 @@ def _fields_of_photographs() -> dict[str, Field]:
     return {f"photograph.{name}": Field(shape, low=-1e3, high=1e3, optional=True) for name, shape in shapes.items()}
 
 
+_IN_RECORD = "certainty.", "photograph.certainty."  # parts whose numbers a file has in its record
 _CERTAINTY = Maybe(Array(Number(low=-_LARGEST, high=_LARGEST)))
 _PHOTOGRAPH = Object(
     {
@@ -315,6 +316,9 @@ class GlimpseEvidence(DecidingModule, Pretrained):
         super()._load_fitted_values(values)
         self.places = thresholds_of(values.get("places"))
 
+    def _tensors(self) -> dict[str, Tensor]:
+        return {name: tensor for name, tensor in super()._tensors().items() if not name.startswith(_IN_RECORD)}
+
     def _record(self) -> dict[str, object]:
         return {
             "classes": self.classes,
@@ -334,12 +338,15 @@ class GlimpseEvidence(DecidingModule, Pretrained):
             foresight=record["foresight"],
             metadata=record["metadata"],
             thresholds=thresholds_of(record["thresholds"]),
-            certainty=_restored_certainty(record),
             places=thresholds_of(record.get("places")),
             photograph=None if photograph is None else _restored_photograph(photograph, record["classes"], tensors),
         )
         model.survey.foresight = record["survey"]["foresight"]
         model.load_state_dict(tensors)
+        # Their numbers are in the record, so that they are no part of the state that is loaded.
+        model.certainty = _restored_certainty(record)
+        if model.photograph is not None:
+            model.photograph.certainty = _restored_certainty(record["photograph"])
         return model
 
 
@@ -370,7 +377,6 @@ def _restored_photograph(record: Mapping[str, Any], classes: int, tensors: Mappi
     return PhotographEvidence(
         classes,
         thresholds=thresholds_of(record["thresholds"]),
-        certainty=_restored_certainty(record),
         window=(least, context),
         shares=tensors.get("photograph.shares"),
     )

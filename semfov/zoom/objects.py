@@ -221,12 +221,13 @@ def probable_objects(
     before = _probable(*merge_with_facts(looks[:1], lattice, target), certainty)
     # Further looks may lower the sum, and the number of discoveries cannot be negative.
     discoveries = max(float(objects.scores.sum() - before.scores.sum()), 0.0)
-    return objects, certainty.unseen(remaining, promised=promised, discoveries=discoveries)
+    mean, variance = certainty.unseen(remaining, promised=promised, discoveries=discoveries)
+    return objects, (mean.item(), variance.item())
 
 
 def _probable(objects: Objects, facts: Tensor, certainty: Certainty) -> Objects:
     """Put probabilities in place of the scores of objects, the most probable first."""
-    chances = certainty.probability(facts).to(objects.scores)
+    chances = certainty.probability(facts).to(objects.scores).detach()
     return replace(objects, scores=chances)[chances.argsort(descending=True, stable=True)]
 
 

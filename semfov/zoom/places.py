@@ -114,7 +114,7 @@ class SearchFacts:
         """Estimate how many objects of the target there are: those that looks show, and those that looks would find."""
         _, chances = self.objects()
         unseen, _ = self._certainty.unseen(self.belief.remaining(), promised=0.0, discoveries=0.0)
-        return float(chances.sum()) + unseen
+        return float(chances.sum()) + float(unseen)
 
     def presence(self) -> float:
         """Predict whether the picture holds the target, by the prior of the fit."""

@@ -649,7 +649,7 @@ def test_a_file_keeps_the_evidence_for_photographs(tmp_path):
     assert all(torch.equal(tensor, again.state_dict()[name]) for name, tensor in model.state_dict().items())
     assert again.photograph.verification.thresholds == plain.thresholds
     assert again.photograph.window == (0.5, 3.0)
-    assert again.photograph.certainty == model.photograph.certainty
+    assert again.photograph.certainty.numbers == model.photograph.certainty.numbers
     assert again.photograph.shares is None
     model.photograph.shares = SHARES
     model.save(tmp_path / "own.safetensors")

@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from itertools import islice, product
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -20,6 +21,7 @@ from semfov.detection.objects import unlike
 from semfov.fit.logistic import logistic_regression
 from semfov.fit.windows_certainty import _fit_unseen, _Numbers, explorations_of_kinds, fit_spread
 from semfov.fit.windows_decisions import WindowSearches, fit_presence, judge_searches
+from semfov.io.storage import read
 from semfov.metrics.calibration import calibration_error
 from semfov.observation.matching import right_boxes
 from semfov.observation.thresholds import Thresholds
@@ -29,6 +31,7 @@ from semfov.settings import ExploreSettings, FindSettings, SearchSettings
 from semfov.zoom import GlimpseEvidence, Lattice
 from semfov.zoom.certainty import DISPERSION, FACTS, SPREAD, Certainty, number_of
 from semfov.zoom.episode import find_everything, look_for
+from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook
 from semfov.zoom.object_facts import DetectedBoxes, object_facts
 from semfov.zoom.objects import merge, merge_with_facts, probable_objects, without_parts
@@ -375,7 +378,7 @@ def test_what_further_looks_show_is_fitted_by_the_number_in_all():
 
     fitted = _fit_unseen(
         Certainty.of([0.0, 1.0]), [Exploration(8.0, 20.0), Exploration(30.0, 5.0), Exploration(2.0, 40.0)]
-    )
+    ).requires_grad_(False)
     for clear, faint in ((10.0, 30.0), (4.0, 5.0)):
         assert fitted.unseen((clear, faint), promised=0.0, discoveries=0.0)[0] == pytest.approx(clear / 2, rel=0.15)
         after = fitted.unseen((clear / 2, faint), promised=clear / 2, discoveries=clear / 4)[0]
@@ -409,7 +412,7 @@ def test_mixed_precision_does_not_round_whether_a_picture_holds_a_class():
 def test_mixed_precision_does_not_round_the_facts_of_a_certainty():
     generator = torch.Generator().manual_seed(0)
     facts = 5 * torch.randn(9, len(FACTS), generator=generator)
-    certainty = Certainty(-1.0, tuple(torch.randn(len(FACTS), generator=generator).tolist()))
+    certainty = Certainty(-1.0, torch.randn(len(FACTS), generator=generator).tolist())
     exact = certainty.probability(facts)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(certainty.probability(facts), exact)
@@ -434,7 +437,7 @@ def test_the_spread_is_fitted_on_the_numbers_of_records():
         )
         (expected,), (error,) = record.expected.values(), replace(record, spread=0.0).expected_error.values()
         assert sought.number(certainty, passes) == pytest.approx((expected, error**2), rel=1e-5)
-    assert sought.number(replace(certainty, offset=-9.0), 4) is None
+    assert sought.number(Certainty(-9.0, certainty.weights.tolist(), scale=0.5, strength=2.0), 4) is None
 
 
 def test_probabilities_of_the_fit_maximise_the_likelihood():
@@ -452,18 +455,59 @@ def test_probabilities_of_the_fit_maximise_the_likelihood():
 
 
 def test_what_no_look_has_shown_is_negative_binomial():
-    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5, strength=4.0, faint=0.25, promise=0.4)
+    weights = (0.0,) * len(FACTS)
+    certainty = Certainty(0.0, weights, scale=0.5, strength=4.0, faint=0.25, promise=0.4).requires_grad_(False)
     mean, variance = certainty.unseen((5.0, 4.0), promised=25.0, discoveries=3.0)
     shape, rate = 4 * 0.5 + 3, 4 + 10
     law = nbinom(shape, rate / (rate + 6))
-    assert mean == pytest.approx(law.mean())
-    assert variance == pytest.approx(law.var())
+    assert float(mean) == pytest.approx(law.mean())
+    assert float(variance) == pytest.approx(law.var())
     assert certainty.unseen((0.0, 0.0), promised=10.0, discoveries=3.0) == (0.0, 0.0)
-    assert Certainty.of(certainty.numbers) == certainty
-    assert Certainty.of([*certainty.numbers[:-1], 0.7]) == replace(certainty, spread=0.7)
-    plain = replace(certainty, faint=1.0, promise=1.0)  # all cells and promises count in full
-    assert plain.unseen((2.0, 4.0), promised=10.0, discoveries=3.0) == pytest.approx((law.mean(), law.var()))
+    # All cells and promises count in full.
+    plain = Certainty(0.0, weights, scale=0.5, strength=4.0).requires_grad_(False)
+    mean, variance = plain.unseen((2.0, 4.0), promised=10.0, discoveries=3.0)
+    assert (float(mean), float(variance)) == pytest.approx((law.mean(), law.var()))
+
+
+def test_a_scale_that_is_known_exactly_leaves_a_poisson_number():
+    certainty = Certainty(0.0, (0.0,) * len(FACTS), scale=0.5)
+    mean, variance = certainty.unseen((2.0, 4.0), promised=10.0, discoveries=3.0)
+    assert mean.item() == variance.item() == 3.0
+    gradients = torch.autograd.grad(mean + variance, [certainty.scale, certainty.strength])
+    assert [gradient.item() for gradient in gradients] == [12.0, 0.0]
+
+
+def test_a_file_keeps_the_numbers_of_a_certainty(tmp_path):
+    numbers = [*drawn_certainty(0).numbers[:-1], 0.7]
+    certainty = Certainty.of(numbers)
+    assert certainty.numbers == numbers  # short decimals stay as they are
+    assert certainty.spread == 0.7
+    evidence = GlimpseEvidence(3, certainty=certainty, photograph=PhotographEvidence(3, certainty=drawn_certainty(1)))
+    evidence.save(tmp_path / "a.safetensors")
+    loaded = GlimpseEvidence.from_pretrained(tmp_path / "a.safetensors")
+    assert loaded.certainty.numbers == numbers
+    assert loaded.photograph.certainty.numbers == drawn_certainty(1).numbers
+    loaded.save(tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+    assert not any(name.startswith("certainty") for name in read(tmp_path / "a.safetensors", evidence.kind)[0])
+    # A state has them too, the spread among them.
+    other = Certainty.of([0.0] * 20)
+    other.load_state_dict(certainty.state_dict())
+    assert other.numbers == numbers
     refused("certainty: expected 2 or 20 numbers, got 3", Certainty.of, [1.0, 2.0, 3.0])
+    refused("weights: expected 14 numbers, got 1", Certainty, 0.0, [1.0])
+
+
+@pytest.mark.parametrize("name", ["yolox-nano", "yolov3-tiny", "nanodet-plus-m-1.5x"])
+def test_shipped_numbers_are_those_of_the_file_in_float32(name):
+    _, record = read(GlimpseEvidence.shipped / f"{name}.safetensors", GlimpseEvidence.kind)
+    evidence = GlimpseEvidence.from_pretrained(name)
+    for certainty, numbers in (
+        (evidence.certainty, record["certainty"]),
+        (evidence.photograph.certainty, record["photograph"]["certainty"]),
+    ):
+        assert np.array_equal(np.float32(certainty.numbers), np.float32(numbers))
+        assert certainty.spread == numbers[-1]
 
 
 def test_boxes_are_right_once_and_crowds_are_neither():

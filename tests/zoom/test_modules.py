@@ -5,7 +5,8 @@ import torch
 from semfov.agents import ZoomAgent
 from semfov.settings import ExploreSettings
 from semfov.zoom import GlimpseEvidence, WindowEye
-from tests.base_tester import BaseTester, TensorTester
+from semfov.zoom.certainty import FACTS, Certainty
+from tests.base_tester import BaseTester, GraphTester, TensorTester
 from tests.small import Blobs, rand
 
 
@@ -23,6 +24,21 @@ class TestGlimpseEvidence(TensorTester):
     @staticmethod
     def call(module, best, expected):
         return module.presence(best, expected)
+
+
+class TestCertainty(GraphTester):
+    """Probabilities of objects by facts about them, and the number of those that no look has shown."""
+
+    def make(self):
+        return Certainty(0.5, rand(len(FACTS)).tolist(), scale=0.5, strength=4.0, faint=0.25, promise=0.4)
+
+    def inputs(self):
+        return (rand(6, len(FACTS)),)
+
+    @staticmethod
+    def call(module, facts):
+        mean, variance = module.unseen((5.0, 4.0), promised=25.0, discoveries=3.0)
+        return module.probability(facts) * mean + variance
 
 
 class TestWindowEye(BaseTester):
