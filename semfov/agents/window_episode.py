@@ -44,9 +44,8 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import WindowEye, WindowView
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import LiveWindowLooks, Window, WindowLook, WindowLooks
-from semfov.zoom.policy import WindowChoice
+from semfov.zoom.policy import WindowChoice, WindowValues
 from semfov.zoom.slices import ranked, usual_slices
-from semfov.zoom.window_sums import Cells
 
 PASSES = 24  # default for the largest number of passes of the detector
 # From 0.2 on half of a stream's list would be wrong where people are few (docs/measurements/stream.md).
@@ -183,7 +182,7 @@ class WindowSession:
 
         return look_by_look(self.source, order, None, forgetting=self.forgetting, guess=next_slice)
 
-    def _value_of_known(self, level: int) -> Cells:
+    def _value_of_known(self, level: int) -> WindowValues:
         """Value windows of a level by the objects that are known, and may have moved."""
         assert self.tracker is not None
         return value_of_windows(self.tracker.tracks, self.tracker.model, self.source.lattice, level)

@@ -120,7 +120,7 @@ class WindowGaze(Gazes[_WindowEpisode]):
         expected = torch.zeros(lattice.rows, lattice.columns)
         if lattice.levels > 1:
             # Level 0 is the whole picture, which was looked at first.
-            by_level = [torch.from_numpy(belief.expected(level)) for level in range(1, lattice.levels)]
+            by_level = [belief.expected(level).detach() for level in range(1, lattice.levels)]
             expected = torch.stack(by_level).amax(0)  # (rows, columns) of the lattice
         # Objects of each place: the mean of its cells times their number.
         rows, columns = self.shape

@@ -185,7 +185,7 @@ def _rates_before(first: Gist, log_rates: Tensor, look: Gist) -> Tensor:
     # The overview, of level 0, predicts windows of level 1 in its first step.
     step = min(look.level, STEPS - 1)
     shown = in_lattice[:, step, top:bottom, left:right]
-    return torch.stack([before_of(of_target.numpy(), look) for of_target in shown])
+    return torch.stack([before_of(of_target, look) for of_target in shown])
 
 
 class ZoomExample(NamedTuple):

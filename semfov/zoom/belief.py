@@ -7,7 +7,9 @@ what is left to explore there, and what closer looks are expected to find there.
                                                         ├──► sums over windows ──► `value`    objects that a look finds
     explored windows ──► `unexplored` ──────────────────┘    (`window_sums`)
 
-Nothing is computed until it is asked for, and then only what has changed:
+All of it are tensors on one device. A gradient of a value reaches the networks that predict the rates, and the weights
+of the border; what was first asked for under `torch.no_grad`, as policies do, is a constant. Nothing is computed until
+it is asked for, and then only what has changed:
 
 - `_gists_rated` is the number of gists whose rates are written to the cells; `_predict` writes those of the others.
 - `_sums` remember in which cells they have fallen behind (`mark`), and catch up in `update`. Whoever changes
@@ -18,9 +20,7 @@ from collections.abc import Callable
 from functools import cached_property, partial
 from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -29,15 +29,15 @@ from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.survey import STEPS
-from semfov.zoom.window_sums import CellBox, Cells, CellSlices, WindowSums, extent
+from semfov.zoom.window_sums import CellBox, Cells, CellSlices, WindowSums, extent, lasting
 
 # Fainter rates promise mostly where nothing is, so they are summed apart.
 _CLEAR = 0.1  # expected number of objects from which on a cell clearly promises one
 
 _EVERYWHERE: CellSlices = (slice(None), slice(None))
 
-_CellQuantity = Callable[[int, CellSlices], Cells]
-"""Gives a number for each cell by level, in some rows and columns."""
+_CellQuantity = Callable[[int, CellSlices], Cells | None]
+"""Gives a number for each cell by level, in some rows and columns; None where all are 0."""
 
 
 class Rates(Protocol):
@@ -80,17 +80,23 @@ class ZoomBelief:
         gists: the looks, in the order in which they were added.
         closest_level: s, level of the closest look at each cell, `(rows, columns)`; -1 where none was.
 
-    Private attributes: `_rate` `(levels, rows, columns)` has λ of each cell for looks of each level, and `_rated_level`
-    `(rows, columns)` the level of the look that this is from. `_gists_rated` counts the gists that both know. `_sums`
-    has the sums over windows that were asked for, by quantity and level. `_predictions` has what looks predict, by the
-    `id` of their gists: of present ones, and of those before the last `clear`.
+    Private attributes: `_rate` has λ of each cell `(rows, columns)` by the level of looks, where any cell has one, and
+    `_rated_level` `(rows, columns)` the level of the look that this is from. `_gists_rated` counts the gists that both
+    know. `_sums` has the sums over windows that were asked for, by quantity and level. `_predictions` has what looks
+    predict, by the `id` of their gists: of present ones, and of those before the last `clear`.
 
     Invariant: `closest_level` knows all gists, `_rate` and `_rated_level` the first `_gists_rated`; when these are all,
     `_rated_level` equals `closest_level`. The sums are those of the cells but for windows over cells that were marked.
     """
 
     def __init__(
-        self, lattice: Lattice, evidence: Rates, target: int, blank: Callable[[], Tensor | None] = lambda: None
+        self,
+        lattice: Lattice,
+        evidence: Rates,
+        target: int,
+        blank: Callable[[], Tensor | None] = lambda: None,
+        *,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Begin with no look.
 
@@ -99,6 +105,7 @@ class ZoomBelief:
             evidence: the learned evidence; searches need all of `GlimpseEvidence`.
             target: class from 1; 0 for objects of any class.
             blank: gives the cells where there is nothing to see, `(rows, columns)`; None for none.
+            device: where the gists of the looks and the evidence are.
         """
         self.lattice = lattice
         self.target = target
@@ -106,7 +113,7 @@ class ZoomBelief:
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self.foresight = self._rates.foresight
-        self._targets = torch.tensor([target])
+        self._targets = torch.tensor([target], device=device)
         self.gists: list[Gist] = []
         self._predictions: dict[int, _Prediction] = {}
         self.clear()
@@ -116,10 +123,10 @@ class ZoomBelief:
         known = self._predictions
         self._predictions = {id(gist): known[id(gist)] for gist in self.gists if id(gist) in known}
         shape = self.lattice.rows, self.lattice.columns
-        self._rate = np.zeros((self.lattice.levels, *shape), np.float32)  # λ of each cell for looks of each level
-        self._rated_level = np.full(shape, -1, np.int8)  # level of the look that the rates of a cell are from
+        self._rate: dict[int, Cells] = {}
         self._gists_rated = 0
-        self.closest_level = torch.full(shape, -1, dtype=torch.int8)
+        self._rated_level = lasting(shape, -1, torch.int8, self._targets.device)
+        self.closest_level = lasting(shape, -1, torch.int8, self._targets.device)
         # Made anew when it is asked for: which cells are blank is known after the overview alone.
         self.__dict__.pop("unexplored", None)
         self.gists = []
@@ -129,12 +136,15 @@ class ZoomBelief:
     def visible(self) -> Tensor:
         """Share of each cell where there is something to see, asked for after the overview, `(rows, columns)`."""
         blank = self._blank()
-        return torch.ones(self.lattice.rows, self.lattice.columns) if blank is None else 1 - blank.float()
+        if blank is None:
+            return torch.ones(self.lattice.rows, self.lattice.columns, device=self._targets.device)
+        return 1 - blank.to(self._targets.device, torch.float32)
 
     @cached_property
     def unexplored(self) -> Tensor:
         """Share u of each cell that is left to explore, `(rows, columns)`."""
-        return self.visible.clone()
+        with torch.inference_mode(False):  # what is made in inference mode may not be written to outside
+            return self.visible.clone()
 
     @property
     def evidence(self) -> GlimpseEvidence:
@@ -159,9 +169,7 @@ class ZoomBelief:
             return
         self.gists.append(gist)
         x1, y1, x2, y2 = box = self._box(gist)
-        # The array shares the memory of the tensor, so that writing to it changes the attribute.
-        closest_level = self.closest_level.numpy()[y1:y2, x1:x2]
-        np.maximum(closest_level, gist.level, out=closest_level)
+        self.closest_level[y1:y2, x1:x2].clamp_(min=gist.level)
         self._mark_sums(box)
 
     def discount(self, window: Window) -> None:
@@ -177,10 +185,10 @@ class ZoomBelief:
         y2 = min(y2, self.lattice.rows)
         if x1 >= x2 or y1 >= y2:
             return
-        unexplored = self.unexplored.numpy()[y1:y2, x1:x2]
+        unexplored = self.unexplored[y1:y2, x1:x2]
         # Windows over cells that were explored before need not be summed again.
         if unexplored.any():
-            unexplored[:] = 0
+            unexplored.zero_()
             self._mark_sums((x1, y1, x2, y2))
 
     def restore(self, unexplored: Tensor) -> None:
@@ -189,11 +197,9 @@ class ZoomBelief:
         Args:
             unexplored: `(rows, columns)`, an earlier copy of the attribute.
         """
-        earlier = unexplored.numpy()
-        present = self.unexplored.numpy()
-        differs = earlier != present
+        differs = unexplored != self.unexplored
         if differs.any():
-            np.copyto(present, earlier)
+            self.unexplored.copy_(unexplored)
             self._mark_sums(extent(differs))
 
     def _mark_sums(self, box: CellBox) -> None:
@@ -209,7 +215,6 @@ class ZoomBelief:
         bottom = min(y + rows * gist.scale, self.lattice.rows)
         return x, y, right, bottom
 
-    @torch.no_grad()
     def _predict(self) -> None:
         """Write the rates of new looks to the cells that were not looked at as closely before."""
         new = self.gists[self._gists_rated :]
@@ -220,20 +225,44 @@ class ZoomBelief:
     def _write_rates(self, gist: Gist) -> None:
         """Write the rates of a look to the cells that were not looked at as closely before."""
         x1, y1, x2, y2 = self._box(gist)
-        rate = self._rate[:, y1:y2, x1:x2]
-        rated_level = self._rated_level[y1:y2, x1:x2]
-        before = _rates_before(rate, rated_level, gist) if gist.level > 0 else None
+        cells = slice(y1, y2), slice(x1, x2)
+        rated_level = self._rated_level[cells]
+        before = self._rates_before(cells, gist) if gist.level > 0 else None
         predicted = self._rates_of(gist, before)
         by_cell = _by_cell(predicted, gist.scale, rated_level.shape)
         is_closer = rated_level < gist.level
-        for level, rate_of_level in enumerate(rate):
+        for level in range(self.lattice.levels):
             # A look predicts the octaves above its own level; in the others it is expected to find nothing.
             octave = level - gist.level - 1
             if 0 <= octave < STEPS:
-                np.copyto(rate_of_level, by_cell[octave], where=is_closer)
-            elif rate_of_level.any():  # memory that was never written to is not taken
-                np.copyto(rate_of_level, 0, where=is_closer)
-        rated_level[is_closer] = gist.level
+                if level not in self._rate:
+                    self._rate[level] = lasting(self._rated_level.shape, 0, by_cell.dtype, by_cell.device)
+                rate = self._rate[level][cells]
+                rate.copy_(torch.where(is_closer, by_cell[octave], rate))
+            elif level in self._rate:
+                self._rate[level][cells].masked_fill_(is_closer, 0)
+        rated_level.masked_fill_(is_closer, gist.level)
+
+    def _rates_before(self, cells: CellSlices, gist: Gist) -> Tensor:
+        """Read what looks so far predict for the cells of a new look, as its own prediction takes it.
+
+        Args:
+            cells: rows and columns of the cells.
+            gist: the look.
+
+        Returns:
+            `(1, rows, columns)` of the gist (`before_of`).
+        """
+        rated_level = self._rated_level[cells]
+        nothing = self.unexplored.new_zeros(()).expand(rated_level.shape)
+        levels = range(self.lattice.levels)
+        rates = torch.stack([self._rate[level][cells] if level in self._rate else nothing for level in levels])
+        # Rates of looks that are coarser by more than three octaves are those for three.
+        octaves = (gist.level - rated_level).clamp(0, STEPS - 1)
+        # The sum is the level one octave closer than this look: what its own prediction is about.
+        level_before = rated_level + 1 + octaves
+        rate = rates.gather(0, level_before.long()[None])[0]
+        return before_of(rate, gist)[None]
 
     def _rates_of(self, gist: Gist, before: Tensor | None) -> Cells:
         """Predict the rates of a look, unless they are known: where a camera moves a little, most hints do not change.
@@ -247,10 +276,11 @@ class ZoomBelief:
         """
         known = self._predictions.get(id(gist))
         if known is None or not known.suits(gist, before):
-            rates = self._rates.rates(gist, self._targets, before)[0].exp().numpy()
+            rates = self._rates.rates(gist, self._targets, before)[0].exp()
             known = self._predictions[id(gist)] = _Prediction(gist, before, rates)
         return known.rates
 
+    @torch.no_grad()
     def remaining(self) -> tuple[float, float]:
         """Sum what looks are still expected to find, in each cell by the level that finds most.
 
@@ -261,26 +291,36 @@ class ZoomBelief:
         levels = range(1, self.lattice.levels)
         if not levels:
             return 0.0, 0.0
-        expected = np.maximum.reduce([self.expected(level) for level in levels])
+        expected = torch.stack([self.expected(level) for level in levels]).amax(0)
         clear = float(expected[expected >= _CLEAR].sum())
         return clear, float(expected.sum()) - clear
 
-    def expected(self, level: int, slices: CellSlices = _EVERYWHERE) -> Cells:
+    def expected(self, level: int) -> Cells:
         """Compute how many objects looks of a level are expected to find, :math:`n_k(x)`.
 
         Args:
             level: k.
-            slices: rows and columns of the cells.
 
         Returns:
-            The number of objects in each of these cells.
+            `(rows, columns)`, the number of objects in each cell.
         """
-        self._predict()
-        return self._rate[level, *slices] * self.unexplored.numpy()[slices]
+        expected = self._expected(level, _EVERYWHERE)
+        return torch.zeros_like(self.unexplored) if expected is None else expected
 
-    def _expected_closer(self, level: int, slices: CellSlices) -> Cells:
+    def _expected(self, level: int, slices: CellSlices) -> Cells | None:
+        """Compute what looks of a level are expected to find in some cells; None where no look promises anything."""
+        self._predict()
+        if level not in self._rate:
+            return None
+        rate = self._rate[level][slices]
+        unexplored = self.unexplored[slices]
+        # Gradients need the share that is left now, which later looks write to.
+        return rate * (unexplored.clone() if rate.requires_grad else unexplored)
+
+    def _expected_closer(self, level: int, slices: CellSlices) -> Cells | None:
         """Compute what looks one level closer are expected to find, in cells that no look of this level has shown."""
-        return self.expected(level + 1, slices) * (self.closest_level.numpy()[slices] < level)
+        expected = self._expected(level + 1, slices)
+        return None if expected is None else expected * (self.closest_level[slices] < level)
 
     def value(self, level: int, foresight: float) -> Cells:
         """Value the windows of a level for finding objects (`semfov.zoom.policy.best_find`).
@@ -290,49 +330,24 @@ class ZoomBelief:
             foresight: weight of what looks one level closer are expected to find.
 
         Returns:
-            `(down, across)`, in objects.
+            `(down, across)`, in objects, differentiable in what the evidence predicts. The next call may change it.
         """
-        values = self._sum_over_windows(self.expected, level, self._border_weight)
+        values = self._sum_over_windows(self._expected, level, self._rates.taper)
         if not foresight or level + 1 >= self.lattice.levels:
             return values
-        return values + np.float32(foresight) * self._sum_over_windows(self._expected_closer, level)
+        return values + foresight * self._sum_over_windows(self._expected_closer, level, self._equal_weight)
 
-    def _border_weight(self, span: int) -> Cells:
-        """Weights `(span,)` of the cells along a side of a window, whose border cuts objects."""
-        return self._rates.taper(span).detach().numpy()
+    def _equal_weight(self, span: int) -> Tensor:
+        """Weight the cells along a side of a window alike, `(span,)`."""
+        return torch.ones_like(self._rates.taper(span))
 
-    def _sum_over_windows(
-        self, quantity: _CellQuantity, level: int, weight: Callable[[int], Cells] | None = None
-    ) -> Cells:
+    def _sum_over_windows(self, quantity: _CellQuantity, level: int, weight: Callable[[int], Tensor]) -> Cells:
         """Sum a quantity of the cells over the windows of a level; → `(down, across)`."""
         if (quantity, level) not in self._sums:
-            weights = (weight or _equal_weight)(self.lattice.span(level))
+            weights = weight(self.lattice.span(level))
             shape = self.lattice.rows, self.lattice.columns
             self._sums[quantity, level] = WindowSums(weights, shape, partial(quantity, level))
         return self._sums[quantity, level].update()
-
-
-def _equal_weight(span: int) -> Cells:
-    """Weight the cells along a side of a window alike, `(span,)`."""
-    return np.ones(span, np.float32)
-
-
-def _rates_before(rate: Cells, rated_level: NDArray[np.int8], gist: Gist) -> Tensor:
-    """Read what looks so far predict for the cells of a new look, as its own prediction takes it.
-
-    Args:
-        rate: `(levels, rows, columns)`, rates of the cells for looks of each level.
-        rated_level: `(rows, columns)`, level of the look that the rates of a cell are from.
-        gist: the look.
-
-    Returns:
-        `(1, rows, columns)` of the gist (`before_of`).
-    """
-    # Rates of looks that are coarser by more than three octaves are those for three.
-    octaves = (gist.level - rated_level).clip(0, STEPS - 1)
-    # The sum is the level one octave closer than this look: what its own prediction is about.
-    rate_before = np.choose(rated_level + 1 + octaves, rate)
-    return before_of(rate_before, gist)[None]
 
 
 def _by_cell(predicted: Cells, scale: int, shape: tuple[int, ...]) -> Cells:
@@ -347,26 +362,25 @@ def _by_cell(predicted: Cells, scale: int, shape: tuple[int, ...]) -> Cells:
         return predicted
     rows, columns = shape
     # Squares of a strip reach far beyond the picture.
-    row = np.arange(rows) // scale
-    column = np.arange(columns) // scale
-    return predicted[:, row[:, None], column] / np.float32(scale**2)
+    row = torch.arange(rows, device=predicted.device) // scale
+    column = torch.arange(columns, device=predicted.device) // scale
+    return predicted[:, row[:, None], column] / scale**2
 
 
-def before_of(rate: Cells, gist: Gist) -> Tensor:
+def before_of(rates: Cells, gist: Gist) -> Tensor:
     """Compute the logarithms of the rates that earlier looks gave in a look's cells.
 
     Args:
-        rate: `(rows, columns)` of the lattice in the look, for looks one octave closer than it.
+        rates: `(rows, columns)` of the lattice in the look, for looks one octave closer than it.
         gist: the look.
 
     Returns:
         `(rows, columns)` of the gist; in a gist of larger cells the rates of its cells are added up.
     """
-    before = torch.from_numpy(rate)
     rows, columns = gist.scores.shape[:2]
     scale = gist.scale
     if scale > 1:
-        before = F.pad(before, (0, columns * scale - before.shape[1], 0, rows * scale - before.shape[0]))
+        rates = F.pad(rates, (0, columns * scale - rates.shape[1], 0, rows * scale - rates.shape[0]))
         # PyTorch pools means alone; times the number of cells they are sums.
-        before = F.avg_pool2d(before[None], scale)[0] * scale**2
-    return (before + 1e-6).log()
+        rates = F.avg_pool2d(rates[None], scale)[0] * scale**2
+    return (rates + 1e-6).log()

@@ -13,8 +13,7 @@ from semfov.zoom.carrying import carried, share_left, share_shown
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
-from semfov.zoom.policy import WindowChoice, best_find, jointly
-from semfov.zoom.window_sums import Cells
+from semfov.zoom.policy import WindowChoice, WindowValues, best_find, jointly
 
 _Belief = TypeVar("_Belief", bound=ZoomBelief | None)
 _StepBelief_co = TypeVar("_StepBelief_co", bound=ZoomBelief | None, covariant=True)
@@ -314,7 +313,7 @@ def find_everything(
     batch: int = 1,
     min_gain: float = 0.0,
     forgetting: Forgetting | None = None,
-    known: Callable[[int], Cells] | None = None,
+    known: Callable[[int], WindowValues] | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
 

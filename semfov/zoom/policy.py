@@ -3,23 +3,27 @@
 from collections.abc import Callable
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window
-from semfov.zoom.window_sums import Cells
 
 WindowChoice = tuple[Window, float]  # a window and the value of a look at it
 
+WindowValues = NDArray[np.float32]
+"""Values of looks at the windows of a level, `(down, across)`."""
 
+
+@torch.no_grad()
 def best_find(
     belief: ZoomBelief,
     done: set[Window],
     foresight: float = 0.0,
     *,
     beside: Window | None = None,
-    known: Callable[[int], Cells] | None = None,
+    known: Callable[[int], WindowValues] | None = None,
 ) -> WindowChoice | None:
     r"""Choose the window in which a look is expected to find most objects, :math:`E[n_k(w)] + \kappa \, E[n_{k+1}(w)]`.
 
@@ -39,7 +43,7 @@ def best_find(
     lattice = belief.lattice
     best: WindowChoice | None = None
     for level in range(1, lattice.levels):
-        values = belief.value(level, foresight)
+        values = belief.value(level, foresight).cpu().numpy()
         if known is not None:
             values = values + known(level)
         best = _better(best, values, level, lattice, done, beside)
@@ -48,7 +52,7 @@ def best_find(
 
 def _better(
     best: WindowChoice | None,
-    values: Cells,
+    values: WindowValues,
     level: int,
     lattice: Lattice,
     done: set[Window],
@@ -74,7 +78,7 @@ def _better(
     return best
 
 
-def _share_outside(window: Window, span: int, shape: tuple[int, ...]) -> Cells:
+def _share_outside(window: Window, span: int, shape: tuple[int, ...]) -> WindowValues:
     """Compute the share of each window of `span` cells that lies outside one window; → `shape`, `(down, across)`."""
     x1, y1, x2, y2 = window.cells
     down, across = shape

@@ -9,14 +9,12 @@ cells of the picture                        windows of 3 × 3 cells
 from collections.abc import Callable, Iterator
 from functools import cached_property
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 _BLOCK = 1024  # windows along a side that are summed by one product
 
-Cells = NDArray[np.float32]
+Cells = Tensor
 """Numbers of the cells of a lattice, `(rows, columns)`, or of the windows of a level, `(down, across)`."""
 
 CellBox = tuple[int, int, int, int]
@@ -26,17 +24,17 @@ CellSlices = tuple[slice, slice]
 """Rows and columns of cells, as slices of an array."""
 
 
-def extent(marked: NDArray[np.bool_]) -> CellBox:
+def extent(marked: Tensor) -> CellBox:
     """Find the smallest box around marked cells.
 
     Args:
-        marked: `(rows, columns)`, with at least one marked cell.
+        marked: `(rows, columns)` boolean, with at least one marked cell.
 
     Returns:
         The box.
     """
-    rows = np.flatnonzero(marked.any(1))
-    columns = np.flatnonzero(marked.any(0))
+    rows = marked.any(1).nonzero()
+    columns = marked.any(0).nonzero()
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
@@ -56,11 +54,28 @@ def enclosing(first: CellBox | None, second: CellBox) -> CellBox:
     return min(x1, second[0]), min(y1, second[1]), max(x2, second[2]), max(y2, second[3])
 
 
+@torch.inference_mode(False)
+def lasting(shape: tuple[int, ...], value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Make a tensor of one value that may be written to in every mode of PyTorch, whichever it is now.
+
+    Args:
+        shape: shape of the tensor.
+        value: the value.
+        dtype: its type.
+        device: its device.
+
+    Returns:
+        The tensor.
+    """
+    return torch.full(shape, value, dtype=dtype, device=device)
+
+
 class WindowSums:
     r"""Weighted sums :math:`S(w) = \sum_{x \in w} r(x) \, c(x)` of the cells c of every window w.
 
     The weight of a cell is the product of those of its row and its column in the window, so the sums are products with
     two banded matrices. Beyond the picture there are no cells: a window that is longer than a side starts at 0 alone.
+    The sums are differentiable in the cells, and on the device of the weights.
 
     Invariant: outside `changed`, the sums are those of the present cells.
 
@@ -68,13 +83,13 @@ class WindowSums:
         changed: cells that may have changed since the sums were computed; None for none.
     """
 
-    def __init__(self, weight: Cells, shape: tuple[int, int], read_cells: Callable[[CellSlices], Cells]) -> None:
+    def __init__(self, weight: Cells, shape: tuple[int, int], read_cells: Callable[[CellSlices], Cells | None]) -> None:
         """Prepare the sums; nothing is summed yet.
 
         Args:
             weight: `(span,)`, weights of the cells along a side of a window.
             shape: rows and columns of the cells.
-            read_cells: gives the present cells in some rows and columns.
+            read_cells: gives the present cells in some rows and columns, as a new tensor; None for none but zeros.
         """
         self._span = len(weight)
         self._read_cells = read_cells
@@ -82,15 +97,18 @@ class WindowSums:
         down = max(rows - self._span, 0) + 1
         across = max(columns - self._span, 0) + 1
         self._weight = weight
-        self._sums = np.zeros((down, across), np.float32)
+        # Most levels of a very large picture stay empty, and take no memory.
+        self._sums = weight.new_zeros(()).expand(down, across)
+        self._is_empty = True
         self.changed: CellBox | None = (0, 0, columns, rows)
 
     @cached_property
     def _band(self) -> Cells:
         """The weights of a window that starts at cell n, in column n; one matrix serves both axes, in part."""
-        starts = np.arange(min(max(self._sums.shape), _BLOCK))
-        band = np.zeros((len(starts) + self._span - 1, len(starts)), np.float32)
-        band[starts + np.arange(self._span)[:, None], starts] = self._weight[:, None]
+        starts = torch.arange(min(max(self._sums.shape), _BLOCK), device=self._weight.device)
+        place = torch.arange(self._span, device=self._weight.device)
+        band = self._weight.new_zeros(len(starts) + self._span - 1, len(starts))
+        band[starts + place[:, None], starts] = self._weight[:, None]
         return band
 
     def mark(self, box: CellBox) -> None:
@@ -105,39 +123,37 @@ class WindowSums:
         """Sum the cells of every window that holds a changed one.
 
         Returns:
-            `(down, across)`, the sums of all windows. The next call changes this array.
+            `(down, across)`, the sums of all windows; with gradients a copy of them. The next call changes others.
         """
-        if self.changed is None:
-            return self._sums
-        x1, y1, x2, y2 = self.changed
-        self.changed = None
+        if self.changed is not None:
+            self._sum_changed(self.changed)
+            self.changed = None
+        return self._sums.clone() if self._sums.requires_grad else self._sums
+
+    def _sum_changed(self, box: CellBox) -> None:
+        """Sum the cells of every window that holds a cell of a box."""
+        x1, y1, x2, y2 = box
         reach = self._span - 1
         top = max(y1 - reach, 0)
         left = max(x1 - reach, 0)
         bottom = min(y2, self._sums.shape[0])
         right = min(x2, self._sums.shape[1])
         cells = self._read_cells((slice(top, bottom + reach), slice(left, right + reach)))
-        changed_sums = self._sums[top:bottom, left:right]
-        if not cells.any():
-            # Most levels of a very large picture stay empty, and memory that was never written to is not taken.
-            if changed_sums.any():
-                changed_sums[:] = 0
-            return self._sums
-        # NumPy would start threads for large pictures, and they would wait at full load for the next product.
-        row_sums = self._sums_of_rows(torch.from_numpy(cells), right - left)
-        sums = [
-            torch.from_numpy(self._band[: len(part), :count]).mT @ part
-            for count, part in self._blocks(row_sums, bottom - top)
-        ]
-        changed_sums[:] = torch.cat(sums).numpy()
-        return self._sums
+        if self._is_empty:
+            if cells is None:
+                return
+            self._sums = lasting(self._sums.shape, 0, self._sums.dtype, self._sums.device)
+            self._is_empty = False
+        self._sums[top:bottom, left:right] = 0 if cells is None else self._summed(cells, bottom - top, right - left)
+
+    def _summed(self, cells: Cells, down: int, across: int) -> Tensor:
+        """Sum cells over the windows that start at the first rows and columns, `(down, across)`."""
+        row_sums = self._sums_of_rows(cells, across)
+        return torch.cat([self._band[: len(part), :count].mT @ part for count, part in self._blocks(row_sums, down)])
 
     def _sums_of_rows(self, cells: Tensor, across: int) -> Tensor:
         """Sum the cells of each row over the columns of windows, `(rows, across)`."""
-        sums = [
-            part.mT @ torch.from_numpy(self._band[: len(part), :count])
-            for count, part in self._blocks(cells.mT, across)
-        ]
+        sums = [part.mT @ self._band[: len(part), :count] for count, part in self._blocks(cells.mT, across)]
         return torch.cat(sums, 1)
 
     def _blocks(self, cells: Tensor, windows: int) -> Iterator[tuple[int, Tensor]]:

@@ -1,6 +1,6 @@
 """Belief and policy: sums against plain loops, no look twice, jointly chosen batches."""
 
-import tracemalloc
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ from semfov.zoom.policy import best_find, jointly
 from semfov.zoom.window_sums import WindowSums
 from tests.refusals import refused
 from tests.zoom import plain
+from tests.zoom.memory import MemoryPeak
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def test_cached_window_sums_equal_recomputed_sums():
     generator = np.random.default_rng(0)
     for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
         weight, cells = generator.random(span, np.float32), generator.random(shape, np.float32)
-        kept = WindowSums(weight, shape, cells.__getitem__)
+        kept = WindowSums(torch.from_numpy(weight), shape, lambda slices, cells=cells: torch.from_numpy(cells[slices]))
         for _ in range(6):
             padded = np.pad(cells, [(0, max(span - n, 0)) for n in shape])
             windows = np.lib.stride_tricks.sliding_window_view(padded, (span, span))
@@ -111,7 +112,7 @@ def test_a_belief_that_is_made_anew_predicts_changed_looks_alone(source, evidenc
         predicted.clear()
         for look in seen:
             belief.add(look)
-        return [belief.value(level, 0.5).copy() for level in range(1, lattice.levels)]
+        return [belief.value(level, 0.5).numpy().copy() for level in range(1, lattice.levels)]
 
     belief = ZoomBelief(lattice, evidence, 1)
     for seen, count in ((looks, 3), (looks, 0), (looks[:2], 0), (looks, 1), ([changed, *looks[1:]], 3)):
@@ -172,6 +173,81 @@ def test_rates_are_the_same_whenever_they_are_asked_for(source, evidence):
         np.testing.assert_allclose(waiting.value(level, 0.0), asked.value(level, 0.0), rtol=1e-6)
 
 
+def some_looks(source, convert):
+    """Looks at some windows, with converted tensors, and at last one that points to no closer ones."""
+    looks = source.see([Window.on(source.lattice, action) for action in ((0, 0, 0), (1, 0, 0), (1, 3, 2))])
+    converted = []
+    for look in looks:
+        gist = look.gist
+        scores, size, found = (convert(tensor) for tensor in (gist.scores, gist.size, gist.found))
+        converted.append(replace(look, gist=replace(gist, scores=scores, size=size, found=found)))
+    last = Window.on(source.lattice, (source.lattice.levels - 1, 1, 1))
+    return [*converted, *source.see([last])]
+
+
+def test_gradients_of_values_reach_the_network_and_the_border(source):
+    """The slope along a random direction is that of finite differences, although later looks write to the belief."""
+    torch.manual_seed(3)
+    evidence = GlimpseEvidence(3).double().eval()
+    lattice = source.lattice
+    looks = some_looks(source, lambda tensor: tensor.double() if tensor.is_floating_point() else tensor)
+
+    def summed() -> torch.Tensor:
+        belief = ZoomBelief(lattice, evidence, 1)
+        found = []
+        for look in looks:
+            belief.add(look)
+            found += [belief.value(level, 0.5).square().sum() for level in range(1, lattice.levels)]
+        return torch.stack(found).sum()
+
+    parameters = [*evidence.rate.parameters(), evidence.border]
+    directions = [torch.randn_like(parameter) for parameter in parameters]
+    gradients = torch.autograd.grad(summed(), parameters)
+    assert all(gradient.any() for gradient in gradients)
+    slope = sum((gradient * direction).sum() for gradient, direction in zip(gradients, directions, strict=True))
+    sides = []
+    with torch.no_grad():
+        for shift in (1e-5, -2e-5):
+            for parameter, direction in zip(parameters, directions, strict=True):
+                parameter.add_(direction, alpha=shift)
+            sides.append(summed())
+    torch.testing.assert_close(slope, (sides[0] - sides[1]) / 2e-5, rtol=1e-5, atol=0)
+
+
+def test_a_belief_is_on_the_device_of_its_looks(source, evidence, device):
+    lattice = source.lattice
+    plain_belief = ZoomBelief(lattice, evidence, 1)
+    belief = ZoomBelief(lattice, copy.deepcopy(evidence).to(device), 1, device=device)
+    looks = some_looks(source, lambda tensor: tensor.to(device))
+    for look, plain_look in zip(looks, some_looks(source, torch.clone), strict=True):
+        belief.add(look)
+        plain_belief.add(plain_look)
+        for level in range(1, lattice.levels):
+            value = belief.value(level, 0.5)
+            assert value.device.type == device.type
+            torch.testing.assert_close(value.cpu(), plain_belief.value(level, 0.5), rtol=1e-3, atol=1e-5)
+        assert belief.remaining() == pytest.approx(plain_belief.remaining(), rel=1e-3, abs=1e-4)
+    chosen = jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 3)
+    expected = jointly(lambda taken: best_find(plain_belief, taken, 0.5), plain_belief, set(), 3)
+    assert [window for window, _ in chosen] == [window for window, _ in expected]
+
+
+def test_a_belief_that_began_in_inference_mode_goes_on_outside(source, evidence):
+    lattice = source.lattice
+    first, *others = some_looks(source, torch.clone)
+    with torch.inference_mode():
+        belief = ZoomBelief(lattice, evidence, 1)
+        belief.add(first)
+        belief.value(1, 0.5)
+    anew = ZoomBelief(lattice, evidence, 1)
+    anew.add(first)
+    for look in others:
+        belief.add(look)
+        anew.add(look)
+        for level in range(1, lattice.levels):
+            assert torch.equal(belief.value(level, 0.5), anew.value(level, 0.5))
+
+
 def test_a_search_looks_where_most_objects_are_expected(detector, picture, evidence):
     """At the windows that finding all objects of the class looks at, whose values are expected numbers of objects."""
     agent = ZoomAgent(WindowEye(detector), evidence)
@@ -191,13 +267,12 @@ def test_a_picture_with_too_many_cells_in_all_or_along_a_side_is_refused(size):
 @pytest.mark.parametrize("size", [(52 << 14, 1), (1, 52 << 14), (3, 50_000), (900, 700)])
 def test_strips_are_valued_in_half_a_gigabyte(size):
     lattice = Lattice.over(size, (416, 416))
-    tracemalloc.start()
-    belief = ZoomBelief(lattice, GlimpseEvidence(3).eval().requires_grad_(False), 1)
-    belief.add(overview_look(lattice))
-    assert best_find(belief, set(), belief.foresight) is not None
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 2**29
+    evidence = GlimpseEvidence(3).eval().requires_grad_(False)
+    with MemoryPeak() as peak:
+        belief = ZoomBelief(lattice, evidence, 1)
+        belief.add(overview_look(lattice))
+        assert best_find(belief, set(), belief.foresight) is not None
+    assert peak.bytes < 2**29
 
 
 def overview_look(lattice):

@@ -87,7 +87,7 @@ def test_a_search_expects_the_objects_that_an_exploration_lists_and_those_that_l
     listed, _ = probable_objects(looks, belief.lattice, target, certainty or Certainty.of([0.0, 1.0]))
     unseen = 0.0
     if certainty is not None:
-        levels = torch.stack([torch.from_numpy(belief.expected(level)) for level in range(1, belief.lattice.levels)])
+        levels = torch.stack([belief.expected(level).detach() for level in range(1, belief.lattice.levels)])
         of_cells = levels.amax(0)
         is_clear = of_cells >= 0.1
         unseen = 0.5 * float((of_cells * torch.where(is_clear, 1.0, 0.25)).sum())

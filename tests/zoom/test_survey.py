@@ -94,7 +94,7 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
     for target, rates in ((0, evidence.survey.rates(look.gist)), (2, evidence.rates(look.gist, torch.tensor([2])))):
         belief = ZoomBelief(LATTICE, evidence, target)
         belief.add(look)
-        expected = torch.stack([torch.from_numpy(belief.expected(level)) for level in range(1, LATTICE.levels)])
+        expected = torch.stack([belief.expected(level) for level in range(1, LATTICE.levels)])
         torch.testing.assert_close(expected, rates[0].exp()[: len(expected), : LATTICE.rows, : LATTICE.columns])
         assert belief.foresight == (0.125 if target == 0 else 0.35)
     with pytest.raises(InputError, match=r"targets: expected classes from 1 on, got \[0, 2\]"):

@@ -1,12 +1,13 @@
 """Sums over windows: those of one product for short sides, of blocks for long ones."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
 
 from semfov.zoom import window_sums
 from semfov.zoom.window_sums import WindowSums
+from tests.zoom.memory import MemoryPeak
 
 
 def plain(cells, weight):
@@ -26,7 +27,7 @@ def test_sums_of_blocks_are_those_of_the_definition(monkeypatch, shape, span, bl
     rng = np.random.default_rng(0)
     cells = rng.random(shape, np.float32)
     weight = rng.random(span, np.float32)
-    sums = WindowSums(weight, shape, lambda slices: cells[slices])
+    sums = WindowSums(torch.from_numpy(weight), shape, lambda slices: torch.from_numpy(cells[slices]))
     np.testing.assert_allclose(sums.update(), plain(cells, weight), rtol=1e-5)
     x, y = shape[1] // 2, shape[0] // 2
     cells[y, x:] += 1
@@ -36,24 +37,41 @@ def test_sums_of_blocks_are_those_of_the_definition(monkeypatch, shape, span, bl
 
 def test_a_long_strip_takes_memory_in_proportion_to_its_cells():
     shape = 8, 200_000
-    cells = np.ones(shape, np.float32)
-    tracemalloc.start()
-    sums = WindowSums(np.ones(8, np.float32), shape, lambda slices: cells[slices])
-    assert tracemalloc.get_traced_memory()[1] < 16 * cells.nbytes
-    tracemalloc.stop()
-    assert (sums.update() == 64).all()
+    cells = torch.ones(shape)
+    sums = WindowSums(torch.ones(8), shape, lambda slices: cells[slices])
+    with MemoryPeak() as peak:
+        found = sums.update()
+    assert peak.bytes < 16 * cells.nbytes
+    assert (found == 64).all()
 
 
 def test_empty_cells_take_no_memory_and_sums_that_become_empty_are_0():
-    cells = np.zeros((900, 900), np.float32)
-    tracemalloc.start()
-    sums = WindowSums(np.ones(400, np.float32), cells.shape, lambda slices: cells[slices])
-    assert not sums.update().any()
-    assert tracemalloc.get_traced_memory()[1] < 2 * 501**2 * 4
-    tracemalloc.stop()
+    cells = torch.zeros(900, 900)
+    with MemoryPeak() as peak:
+        sums = WindowSums(torch.ones(400), (900, 900), lambda slices: cells[slices] if cells.any() else None)
+        assert not sums.update().any()
+    assert peak.bytes < 501**2 * 4
     cells[450, 450] = 1
     sums.mark((450, 450, 451, 451))
     assert sums.update().sum() == 400**2
     cells[450, 450] = 0
     sums.mark((450, 450, 451, 451))
     assert not sums.update().any()
+
+
+def test_sums_are_differentiable_in_cells_and_weights():
+    generator = torch.Generator().manual_seed(0)
+    inputs = [
+        torch.rand(shape, dtype=torch.float64, generator=generator, requires_grad=True)
+        for shape in ((6, 7), (4, 3), (3,))
+    ]
+
+    def summed(cells: Tensor, changed: Tensor, weight: Tensor) -> Tensor:
+        present = [cells]
+        sums = WindowSums(weight, (6, 7), lambda slices: present[-1][slices])
+        sums.update()
+        present.append(torch.cat([torch.cat([changed, cells[:4, 3:]], 1), cells[4:]]))
+        sums.mark((0, 0, 3, 4))
+        return sums.update()
+
+    assert torch.autograd.gradcheck(summed, inputs)
