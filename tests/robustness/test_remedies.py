@@ -3,8 +3,6 @@
 import ast
 import importlib
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import fields
 from inspect import Parameter, signature
@@ -189,9 +187,8 @@ def test_measures_are_in_the_modules_that_are_named():
         assert hasattr(importlib.import_module(attribute_words.METRICS[name]), name)
 
 
-def test_the_modules_of_measures_need_no_import_of_their_own():
-    code = "import semfov; print(semfov.metrics.scanpath.nss.__name__)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "nss\n"
+def test_the_modules_of_measures_need_no_import_of_their_own(fresh):
+    assert fresh("import semfov; print(semfov.metrics.scanpath.nss.__name__)") == "nss\n"
     modules = {path.stem for path in Path(semfov.metrics.__path__[0]).glob("[!_]*.py")}
     assert {*dir(semfov.metrics)} == modules
 
