@@ -72,16 +72,17 @@ def test_gain_is_summed_over_all_cells(model, dtype, device):
     assert got.shape == (3, 20)
     assert got.dtype == dtype
     assert got.device.type == device.type
+    centres, probabilities = GRID.centres.tolist(), belief.class_probabilities().tolist()
+    closest, gains = belief.closest.tolist(), got.tolist()
     for episode in range(3):
         for fixation in range(20):
             total = 0.0
             for cell in range(20):
-                now = math.dist(GRID.centres[cell].tolist(), GRID.centres[fixation].tolist()) / 50
-                before = float(belief.closest[episode, cell])
-                wrong = 1 - float(belief.class_probabilities()[episode, cell].max())
-                sharper = math.exp(-max(now / 0.2 - 1, 0)) - math.exp(-max(before / 0.2 - 1, 0))
+                now = math.dist(centres[cell], centres[fixation]) / 50
+                wrong = 1 - max(probabilities[episode][cell])
+                sharper = math.exp(-max(now / 0.2 - 1, 0)) - math.exp(-max(closest[episode][cell] / 0.2 - 1, 0))
                 total += _CORRECTED * wrong * max(sharper, 0)
-            assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-4)
+            assert gains[episode][fixation] == pytest.approx(total, abs=1e-4)
     # A second look at the same cell gains nothing.
     assert float(got[visited].abs().max()) < 1e-6
 
