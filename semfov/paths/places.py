@@ -1,5 +1,8 @@
 """Places of a picture at which many fixations are expected: the peaks of a density."""
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -26,29 +29,45 @@ def places_of(cells: Tensor, size: tuple[int, int], *, around: bool) -> list[Pla
     Returns:
         The places, by their shares.
     """
-    centres = _cell_centres(cells, size)  # (N, 2)
-    # In reaches of a place, so that 1 is its border.
-    distance = _distances(centres, size[0] if around else None) / (REACH * max(size))  # (N, N)
+    rows, columns = cells.shape
+    surroundings = _surroundings(rows, columns, size, around)
+    centres = surroundings.centres
     density = cells.flatten()  # (N,), as the shares and what is free
-    share = (distance <= 1).to(cells) @ density
-    weighted_share = (1 - distance).clamp(min=0).to(cells) @ density
+    share = surroundings.is_within.to(cells) @ density
+    weighted_share = surroundings.weight.to(cells) @ density
     places: list[Place] = []
     is_free = torch.ones(len(centres), dtype=torch.bool)
     while bool(is_free.any()):  # all of them, since a later place can have a larger share
         best = int(torch.where(is_free, weighted_share, -1.0).argmax())
         x, y = centres[best].tolist()
         places.append({"x": pixels(x - 0.5), "y": pixels(y - 0.5), "share": digits(float(share[best]))})
-        is_free &= distance[best] > 2
+        is_free &= surroundings.is_apart[best]
     return sorted(places, key=lambda place: -place["share"])
 
 
-def _cell_centres(cells: Tensor, size: tuple[int, int]) -> Tensor:
-    """Compute the centres of cells `(rows, columns)` in pixels, edges at integers, `(rows · columns, 2)`."""
-    rows, columns = cells.shape
+class _Surroundings(NamedTuple):
+    """What lies around each of N cells: their centres `(N, 2)`, and matrices `(N, N)` of pairs of cells.
+
+    A place at a cell has the cells that are within its reach, with weights that fall to 0 at its border; other places
+    are apart, at least two reaches away.
+    """
+
+    centres: Tensor
+    is_within: Tensor
+    weight: Tensor
+    is_apart: Tensor
+
+
+@lru_cache(maxsize=1)  # a picture has a density for each of the first fixations
+def _surroundings(rows: int, columns: int, size: tuple[int, int], around: bool) -> _Surroundings:
+    """Compute what lies around the cells of a picture of `(width, height)` pixels."""
     width, height = size
     x = (torch.arange(columns) + 0.5) * (width / columns)
     y = (torch.arange(rows) + 0.5) * (height / rows)
-    return torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
+    centres = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], -1).flatten(0, 1)
+    # In reaches of a place, so that 1 is its border.
+    distance = _distances(centres, width if around else None) / (REACH * max(size))
+    return _Surroundings(centres, distance <= 1, (1 - distance).clamp(min=0), distance > 2)
 
 
 def _distances(points: Tensor, around: float | None) -> Tensor:
