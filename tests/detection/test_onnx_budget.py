@@ -41,8 +41,8 @@ from semfov.detection import onnx_session
 from semfov.errors import DataError
 
 OnnxSession = onnx_session.OnnxSession
-onnx_session._MOST_SECONDS = 1.0
 for path in sorted(Path(sys.argv[1]).iterdir()):
+    onnx_session._MOST_SECONDS = 10.0 if path.stem == "functions that end" else 0.5
     if os.fork():
         os.wait()
         continue
@@ -69,7 +69,7 @@ def test_small_files_that_ask_for_much_are_refused_within_a_gigabyte(tmp_path):
     done = subprocess.run([sys.executable, "-c", LOAD_ALL, tmp_path], capture_output=True, text=True, check=True)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert {name for name, _, _ in lines} == HOSTILE.keys()
-    # Some end within the second where the processor is fast.
+    # Others end within half a second where the processor is fast.
     assert "functions that end" in {name for name, told, _ in lines if told is None}
     reasons = ("at most", "not done after", "need more than")
     assert [told for _, told, _ in lines if told and not any(reason in told for reason in reasons)] == []
