@@ -218,8 +218,8 @@ def test_a_compiled_sensor_takes_other_sizes(convention):
     for height, width in ((40, 50), (41, 53), (60, 50)):
         image, gaze = draw(1, 2, height, width, dtype=torch.float32), torch.tensor([9.0, 8.0])
         close(compiled(image, gaze), sensor(image, gaze), 1e-6)
-        with torch.no_grad():
-            close(compiled(image, gaze), sensor(image, gaze), 1e-6)
+    with torch.no_grad():
+        close(compiled(image, gaze), sensor(image, gaze), 1e-6)
 
 
 def test_module_equals_the_function():
