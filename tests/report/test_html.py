@@ -234,12 +234,18 @@ def drawn(name, seed=0):
     return gaze_part(prediction, prediction.scanpaths(5, seed=seed))
 
 
-@pytest.fixture
-def opened(chromium, hostile, tmp_path):  # noqa: F811
-    """The page of two pictures."""
+@pytest.fixture(scope="module")
+def gaze_page(hostile, tmp_path_factory):
+    """The file of a page of two pictures."""
     pictures = [drawn(hostile), drawn("b.png", seed=1)]
-    path = write_html(tmp_path / "gaze.html", gaze_page_html(f"where people look in {hostile}", pictures))
-    with watched(chromium, path) as page:
+    page = gaze_page_html(f"where people look in {hostile}", pictures)
+    return write_html(tmp_path_factory.mktemp("gaze") / "gaze.html", page)
+
+
+@pytest.fixture
+def opened(chromium, gaze_page):  # noqa: F811
+    """The page of two pictures, as it is when it has been opened."""
+    with watched(chromium, gaze_page) as page:
         yield page
 
 
