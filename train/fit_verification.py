@@ -17,6 +17,7 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from semfov.belief.verification import TRUE_CELLS
 from semfov.errors import DataError, InputError
@@ -42,7 +43,7 @@ class FitVerificationConfig(VerificationConfig):
         cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
     """
 
-    unused = ("workers", "scheduler")
+    unused: ClassVar[tuple[str, ...]] = ("workers", "scheduler")
     data: DataConfig = field(default_factory=DataConfig)
     search_model: str | None = None
     out: Path = Path("runs/fit_verification")
