@@ -12,7 +12,6 @@ class AcquisitionTester(GraphTester):
     """For functions of a belief and of the distance from each cell to the closest fixation."""
 
     batched = (0, 1)
-    one_trace = False
     autocast = 0.0
 
     def inputs(self):
