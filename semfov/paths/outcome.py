@@ -331,14 +331,15 @@ class Outcome(ABC):
 
         None where the target was found, is surely absent (below a probability of 0.1), or where nothing is like it.
         """
-        if not self.is_doubtful:
+        decision = self.decision
+        if decision is None or not self.is_doubtful:
             return None
         places = [(look.box, look.place) for look in self.closer]
         # A score does not compare with the probability of a place that was looked at closely.
         if not places or self.unseen is not None:
             others = self._candidates_not_examined()
             # No place is more probable than the picture; a rare target makes both improbable.
-            most = self.decision.probability if self.unseen is not None else 1.0
+            most = decision.probability if self.unseen is not None else 1.0
             places += zip(others.boxes, others.scores.clamp(max=most).tolist(), strict=True)
         return max(places, key=lambda place: place[1], default=None)
 

@@ -201,8 +201,8 @@ def _check_groups(values: Mapping[object, object], types: Mapping[str, SettingTy
             or not (isinstance(hint, type) and issubclass(hint, CheckedSettings))
         ):
             continue
-        is_group = isinstance(value, dict) and all(isinstance(inner, str) for inner in value)
-        check(is_group, _in_messages(name), "settings by name, or a file of them", repr(value))
+        if not isinstance(value, dict) or not all(isinstance(inner, str) for inner in value):
+            raise InputError(f"{_in_messages(name)}: expected settings by name, or a file of them, got {value!r}")
         _check_groups(value, types, f"{name}.")
 
 

@@ -13,8 +13,6 @@ from semfov.io.ranges import NOUNS, CheckedSettings, Form
 _FLAGS = ("true", "false", "yes", "no", "True", "False")
 """Words that may follow a flag as its value."""
 
-_NOUNS: dict[object, str] = {**NOUNS, Path: "the name of a file or folder"}
-
 
 class SettingType:
     """Type of a setting whose value is one word, which the parser takes as it stands.
@@ -44,7 +42,7 @@ class SettingType:
 
     def expected(self) -> str | None:
         """Say what a value must be; None for types that need more words."""
-        return _NOUNS.get(self.hint)
+        return "the name of a file or folder" if self.hint is Path else NOUNS.get(self.hint)
 
 
 class FlagType(SettingType):
