@@ -1,8 +1,9 @@
-"""Make the film of the README from the photographs that come with the package, and two pictures of other pages.
+"""Make the film of the README from the photographs that come with the package, and pictures of other pages.
 
 python -m eval.readme_picture
 python -m eval.readme_picture --zoom    # the picture of docs/zoom.md
 python -m eval.readme_picture --gaze    # the picture of docs/guides/gaze-prediction.md
+python -m eval.readme_picture --flight  # the film of docs/guides/live.md
 """
 
 import argparse
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from eval.flight_film import flight_frames, fly, round_trip, table_of_photographs
 from semfov import ActivePerception, example
 from semfov.io.files import replacing
 from semfov.paths import Record
@@ -26,6 +28,10 @@ from semfov.viz.opening import opening_frames
 _PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 _SECONDS_A_LOOK = 0.9
 _SECONDS_AT_THE_ENDS = (2.0, 4.0)
+_ROUTE = ((360, 290), (870, 250), (870, 740), (340, 740))  # over the beach, the lifeboat, the aeroplane and the farm
+_CAMERA = (640, 440)  # width and height of its frames
+_FLIGHT_FRAMES = 90
+_SECONDS_A_FRAME = 0.1
 
 
 def _make_film(path: Path) -> None:
@@ -40,6 +46,17 @@ def _make_film(path: Path) -> None:
     seconds[0], seconds[-1] = _SECONDS_AT_THE_ENDS
     with replacing(path) as temporary, temporary.open("wb") as file:
         write_webp(frames, file, seconds, 70, effort=6)
+
+
+def _make_flight(path: Path) -> None:
+    """Draw what is known while a camera flies over photographs, of which it shows about a quarter at a time."""
+    table = table_of_photographs()
+    poses = round_trip(_ROUTE, _CAMERA, _FLIGHT_FRAMES, turn=3.0)
+    sights = [*fly(ActivePerception.recommended(), table, poses, _CAMERA, "person")]
+    frames = flight_frames(table, sights, "people", width=640)
+    seconds = [_SECONDS_A_FRAME] * len(frames)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        write_webp(frames, file, seconds, 45, effort=6)
 
 
 def _make_gaze_picture(path: Path) -> None:
@@ -71,6 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m eval.readme_picture", description=__doc__.splitlines()[0])
     parser.add_argument("--zoom", action="store_true", help="make the picture of docs/zoom.md")
     parser.add_argument("--gaze", action="store_true", help="make the picture of docs/guides/gaze-prediction.md")
+    parser.add_argument("--flight", action="store_true", help="make the film of docs/guides/live.md")
     parser.add_argument("--out", type=Path, help="file to write (none: the picture's file in docs/pictures)")
     options = parser.parse_args(arguments)
     name = "looking.webp"
@@ -81,6 +99,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.gaze:
         name = "gaze.png"
         make = _make_gaze_picture
+    if options.flight:
+        name = "flight.webp"
+        make = _make_flight
     path = options.out or _PICTURES / name
     make(path)
     print(path)
