@@ -13,6 +13,7 @@ from semfov import ActivePerception, example
 from semfov.agents.window_episode import LIKELY
 from semfov.motion import Motion
 from semfov.observation.matching import inside_frame
+from semfov.paths import WindowMoment
 from semfov.report.episode import pillow
 
 _Bytes = NDArray[np.uint8]
@@ -105,6 +106,7 @@ def fly(
     for pose in poses:
         pixels = cv2.warpAffine(picture, pose.matrix[:2], size, flags=cv2.INTER_LINEAR, borderValue=_TABLE)
         moment = live.step(pixels)
+        assert isinstance(moment, WindowMoment)
         tracks = moment.tracks[moment.tracks.probability.numpy() >= LIKELY]
         to_picture = pose.inverse()
         yield Sight(
