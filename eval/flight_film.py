@@ -32,13 +32,13 @@ _FOUND: _Colour = (0, 128, 96)  # of the words about what was found
 _CAPTION = 36  # height in pixels of the line below the picture
 
 
-class Sight(NamedTuple):
+class FilmFrame(NamedTuple):
     """What is known at a frame of a flight, in pixels of the picture.
 
     Attributes:
         frame: `(4, 2)`, corners of the frame.
         window: `(4, 2)`, corners of the window that was looked at.
-        boxes: `(N, 4)`, the objects that are probable, also those that have left the frame.
+        boxes: `(N, 4)`, the objects that are probably there, in the frame or not, where they probably are.
         numbers: their numbers, which stay.
         in_view: `(N,)` boolean, those in the frame.
     """
@@ -89,7 +89,7 @@ def round_trip(points: Sequence[tuple[float, float]], size: tuple[int, int], cou
 
 def fly(
     agent: ActivePerception, picture: _Bytes, poses: Sequence[Motion], size: tuple[int, int], target: str
-) -> Iterator[Sight]:
+) -> Iterator[FilmFrame]:
     """Let an agent look once at each frame of a flight; it is not told where the camera is.
 
     Args:
@@ -107,9 +107,9 @@ def fly(
         pixels = cv2.warpAffine(picture, pose.matrix[:2], size, flags=cv2.INTER_LINEAR, borderValue=_TABLE)
         moment = live.step(pixels)
         assert isinstance(moment, WindowMoment)
-        tracks = moment.tracks[moment.tracks.probability.numpy() >= LIKELY]
+        tracks = moment.tracks[moment.tracks.existence >= LIKELY]
         to_picture = pose.inverse()
-        yield Sight(
+        yield FilmFrame(
             frame=_corners(to_picture, (0, 0, *size)),
             window=_corners(to_picture, moment.looks[-1].region),
             boxes=to_picture.boxes(tracks.boxes),
@@ -125,12 +125,12 @@ def _corners(motion: Motion, box: Sequence[float]) -> _Floats:
     return np.asarray(motion.points(corners).numpy())
 
 
-def flight_frames(picture: _Bytes, sights: Sequence[Sight], what: str, width: int) -> list[Image.Image]:
+def flight_frames(picture: _Bytes, film_frames: Sequence[FilmFrame], what: str, width: int) -> list[Image.Image]:
     """Draw what is known at each frame in the picture: bright in the frame, dim where it was before, else dark.
 
     Args:
         picture: `(H, W, 3)` bytes.
-        sights: what is known at each frame.
+        film_frames: what is known at each frame.
         what: the objects in words, such as `people`.
         width: width of the film in pixels.
 
@@ -141,14 +141,14 @@ def flight_frames(picture: _Bytes, sights: Sequence[Sight], what: str, width: in
     base = Image.fromarray(picture).resize((width, round(picture.shape[0] * scale)), Image.Resampling.LANCZOS)
     lightness = np.full((base.height, base.width, 1), _UNVISITED)
     frames = []
-    for number, sight in enumerate(sights):
-        in_frame = _cover(base.size, sight.frame * scale)
+    for number, film_frame in enumerate(film_frames):
+        in_frame = _cover(base.size, film_frame.frame * scale)
         shades = lightness + (1 - lightness) * in_frame
         lightness = np.maximum(lightness, _VISITED * in_frame)
         view = Image.fromarray(np.rint(np.asarray(base) * shades).astype(np.uint8))
-        view = _with_lines(view, sight, scale)
-        _write_numbers(view, sight, scale)
-        frames.append(_with_caption(view, number, sight, what))
+        view = _with_lines(view, film_frame, scale)
+        _write_numbers(view, film_frame, scale)
+        frames.append(_with_caption(view, number, film_frame, what))
     return frames
 
 
@@ -159,16 +159,16 @@ def _cover(size: tuple[int, int], corners: _Floats) -> _Floats:
     return np.asarray(mask.reduce(_FINE), np.float64)[..., None] / 255
 
 
-def _with_lines(view: Image.Image, sight: Sight, scale: float) -> Image.Image:
+def _with_lines(view: Image.Image, film_frame: FilmFrame, scale: float) -> Image.Image:
     """Draw the objects, the window and the frame."""
     # What no line touches stays as it is: a pixel of its own colour, many times.
     fine = view.resize((view.width * _FINE, view.height * _FINE), Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(fine)
-    for box, is_in_view in zip(sight.boxes.tolist(), sight.in_view.tolist(), strict=True):
+    for box, is_in_view in zip(film_frame.boxes.tolist(), film_frame.in_view.tolist(), strict=True):
         place = [edge * scale * _FINE for edge in box]
         draw.rectangle(place, outline=_IN_VIEW if is_in_view else _OUT_OF_VIEW, width=2 * _FINE)
-    _draw_outline(draw, sight.frame * scale, (255, 255, 255), _FINE)
-    _draw_outline(draw, sight.window * scale, _WINDOW, 3 * _FINE)
+    _draw_outline(draw, film_frame.frame * scale, (255, 255, 255), _FINE)
+    _draw_outline(draw, film_frame.window * scale, _WINDOW, 3 * _FINE)
     return fine.reduce(_FINE)
 
 
@@ -183,18 +183,18 @@ def _fine(corners: _Floats) -> list[tuple[float, float]]:
     return [(x * _FINE, y * _FINE) for x, y in corners.tolist()]
 
 
-def _write_numbers(view: Image.Image, sight: Sight, scale: float) -> None:
+def _write_numbers(view: Image.Image, film_frame: FilmFrame, scale: float) -> None:
     """Write the number of each object in view above its box."""
     draw = ImageDraw.Draw(view)
     font = ImageFont.load_default(11)
-    for number, box, is_in_view in zip(sight.numbers, sight.boxes.tolist(), sight.in_view.tolist(), strict=True):
+    for number, box, is_in_view in zip(film_frame.numbers, film_frame.boxes.tolist(), film_frame.in_view.tolist(), strict=True):
         if is_in_view:
             x = box[0] * scale
             y = box[1] * scale - 13
             draw.text((x, y), str(number), fill="white", font=font, stroke_width=1, stroke_fill="black")
 
 
-def _with_caption(view: Image.Image, number: int, sight: Sight, what: str) -> Image.Image:
+def _with_caption(view: Image.Image, number: int, film_frame: FilmFrame, what: str) -> Image.Image:
     """Add a line with the number of the frame and of the objects."""
     frame = Image.new("RGB", (view.width, view.height + _CAPTION), "white")
     frame.paste(view)
@@ -202,6 +202,6 @@ def _with_caption(view: Image.Image, number: int, sight: Sight, what: str) -> Im
     font = ImageFont.load_default(22)
     y = view.height + 5
     draw.text((8, y), f"frame {number + 1}", fill="black", font=font)
-    counts = f"{len(sight.numbers)} {what} known, {int(sight.in_view.sum())} in view"
+    counts = f"{len(film_frame.numbers)} {what} known, {int(film_frame.in_view.sum())} in view"
     draw.text((130, y), counts, fill=_FOUND, font=font)
     return frame

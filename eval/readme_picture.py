@@ -52,8 +52,8 @@ def _make_flight(path: Path) -> None:
     """Draw what is known while a camera flies over photographs, of which it shows about a quarter at a time."""
     table = table_of_photographs()
     poses = round_trip(_ROUTE, _CAMERA, _FLIGHT_FRAMES, turn=3.0)
-    sights = [*fly(ActivePerception.recommended(), table, poses, _CAMERA, "person")]
-    frames = flight_frames(table, sights, "people", width=640)
+    film_frames = [*fly(ActivePerception.recommended(), table, poses, _CAMERA, "person")]
+    frames = flight_frames(table, film_frames, "people", width=640)
     seconds = [_SECONDS_A_FRAME] * len(frames)
     with replacing(path) as temporary, temporary.open("wb") as file:
         write_webp(frames, file, seconds, 45, effort=6)
