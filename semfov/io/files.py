@@ -58,6 +58,9 @@ def discard_unfinished() -> None:
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file atomically: a context manager that replaces `path` once its block has ended without an error.
 
+    The new file has the permissions of the one that it replaces, or those that the process gives new files. Behind a
+    symbolic link the file is replaced that it points to.
+
     Args:
         path: the file.
 
@@ -69,25 +72,40 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(path)
     check_data(bool(path.name), f"cannot write {str(path)!r}", "the name of a file", "none")
-    temporary = _beside(path, f"{secrets.token_hex(4)}.part")
+    target = Path(os.path.realpath(path)) if os.path.islink(path) else path
+    temporary = _beside(target, f"{secrets.token_hex(4)}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(path.parent.resolve())
+        mode = _mode_of(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(target.parent.resolve())
         # Known before it exists: a signal may end the process while the file is created.
         _unfinished.add(temporary)
-        temporary.touch(0o600, exist_ok=False)
+        if mode is None:
+            temporary.touch(exist_ok=False)  # with the umask of the process
+            mode = _mode_of(temporary)
+        else:
+            temporary.touch(0o600, exist_ok=False)
         yield temporary
         # The content is on the disk before the name is: else a loss of power could leave an empty file.
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
+        if mode is not None and _mode_of(temporary) != mode:  # some file systems refuse to change it
+            temporary.chmod(mode)
+        temporary.replace(target)
     except OSError as error:
         raise DataError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
             temporary.unlink()
         _unfinished.discard(temporary)
+
+
+def _mode_of(path: Path) -> int | None:
+    """Read the permissions of a file; None where there is none."""
+    try:
+        return stat.S_IMODE(path.stat().st_mode)
+    except FileNotFoundError:
+        return None
 
 
 def _beside(path: Path, end: str) -> Path:

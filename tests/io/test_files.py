@@ -46,6 +46,45 @@ def test_a_process_that_ends_within_a_write_leaves_the_old_file_alone(tmp_path):
     assert path.read_text() == "new"
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs the permissions of POSIX")
+def test_a_file_keeps_its_permissions_and_a_new_one_has_those_of_the_umask(tmp_path):
+    private = tmp_path / "private.csv"
+    private.write_text("old")
+    private.chmod(0o640)
+    write_bytes(private, b"new")
+    assert private.stat().st_mode & 0o777 == 0o640
+    for umask in (0o077, 0o022, 0o002):
+        before = os.umask(umask)
+        try:
+            write_bytes(tmp_path / f"{umask}.csv", b"new")
+            (tmp_path / f"{umask}.txt").write_text("as other programs write it")
+        finally:
+            os.umask(before)
+        assert (tmp_path / f"{umask}.csv").stat().st_mode == (tmp_path / f"{umask}.txt").stat().st_mode
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs symbolic links")
+def test_behind_a_link_the_file_is_written_that_it_points_to(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    target = tmp_path / "elsewhere" / "target.csv"
+    link = tmp_path / "link.csv"
+    link.symlink_to("elsewhere/target.csv")
+    for content in (b"first", b"second"):  # before it exists, and when it does
+        write_bytes(link, content)
+        assert link.is_symlink()
+        assert target.read_bytes() == content
+    second = tmp_path / "second.csv"
+    second.symlink_to(link)
+    write_bytes(second, b"third")
+    assert (link.is_symlink(), second.is_symlink(), target.read_bytes()) == (True, True, b"third")
+    circle = tmp_path / "circle.csv"
+    circle.symlink_to(circle)
+    with pytest.raises(DataError, match=r"cannot write .*circle\.csv"):
+        write_bytes(circle, b"")
+    assert circle.is_symlink()
+    assert [path.name for path in tmp_path.rglob("*.part")] == []
+
+
 def test_paths_that_name_no_file_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"cannot write .*a\.json"), replacing(tmp_path / "file" / "a.json"):
