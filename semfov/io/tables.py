@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Sequence
 from typing import overload
 
@@ -41,6 +42,25 @@ def digits(value: float | None) -> float | None:
     (0.1235, 8.803e-06)
     """
     return None if value is None else float(f"{value:.4g}")
+
+
+def share(value: float | None) -> float | None:
+    """Round a probability from which others are computed to six places; near 0 or 1 four digits of the rest stay.
+
+    Args:
+        value: the probability, above 0 and below 1; None for none.
+
+    Returns:
+        The probability, above 0 and below 1, or None.
+
+    >>> share(0.123456789), share(2.34567e-7), share(1 - 2.34567e-7)
+    (0.123457, 2.346e-07, 0.9999997654)
+    """
+    if value is None:
+        return None
+    rarer = min(value, 1 - value)
+    digits_of_rarer = 3 - math.floor(math.log10(rarer)) if 0 < rarer < 1 else 0
+    return round(value, max(6, digits_of_rarer))
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

@@ -22,7 +22,7 @@ from semfov.data.windowed import LargePicture
 from semfov.detection.exchange import CocoResult, category_ids, coco_results, named_detections
 from semfov.errors import InputError, check, needing
 from semfov.io.files import write_text
-from semfov.io.tables import csv_text, digits, pixels
+from semfov.io.tables import csv_text, digits, pixels, share
 from semfov.paths.georeference import Geometry, PlaceOnEarth, box_on_earth, georeference
 from semfov.paths.look import RecordedLook, confident_detections
 from semfov.paths.outcome import Outcome
@@ -169,7 +169,7 @@ class Conversion(Outcome, OtherWords):
             "score": None if is_probability else digits(decision.probability),
             "confirm": digits(decision.confirm),
             "prior": self.prior,
-            "assumed": None if self.assumed is None else round(self.assumed, 6),
+            "assumed": share(self.assumed),
             "place_probability": digits(self.place_probability) if is_probability else None,
             **self._decided_place(),
         }

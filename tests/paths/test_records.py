@@ -20,6 +20,7 @@ from semfov.decision import CloseUp, Decision
 from semfov.detection import Placement
 from semfov.head.views import Views
 from semfov.io.storage import read, write_file
+from semfov.io.tables import csv_text
 from semfov.paths import FoveaMoment, HeadPath, Record, WindowMoment, ZoomPath
 from semfov.paths.fovea import moment_look
 from semfov.paths.head import head_looks
@@ -304,6 +305,16 @@ def test_what_the_probability_assumes_is_said_where_it_matters():
         replace(absent, decision=replace(zoom_path().decision, probability=0.4)),
     ]
     assert [record.words.assumption() for record in silent] == [""] * len(silent)
+
+
+@pytest.mark.parametrize("assumed", [2e-7, 3.5e-12, 0.25, 1 - 2e-7])
+def test_rare_and_sure_shares_are_read_again_from_tables(assumed):
+    record = replace(zoom_path(), prior=assumed, assumed=assumed)
+    written = record.to_dict()["assumed"]
+    assert written == pytest.approx(assumed, rel=1e-3, abs=0)
+    assert 1 - written == pytest.approx(1 - assumed, rel=1e-3, abs=0)
+    in_csv = float(csv_text([[written]]))
+    assert record.probability_at(in_csv) == pytest.approx(record.decision.probability, rel=1e-3)
 
 
 @pytest.mark.parametrize("make", [scanpath, zoom_path, moment, window_moment])
