@@ -251,6 +251,8 @@ def _signals(advice: str) -> Iterator[None]:
         yield
         return
 
+    stops: list[BaseException] = []
+
     def end(number: int, frame: FrameType | None) -> None:
         for ending in _ENDINGS:
             signal.signal(ending, _leave)
@@ -258,7 +260,9 @@ def _signals(advice: str) -> Iterator[None]:
             # An exception from here would pass through the start of a native module, and some abort the process.
             os.write(sys.stderr.fileno(), f"{_ENDINGS[number]}{advice}\n".encode())
             _leave(number, frame)
-        raise KeyboardInterrupt if number == signal.SIGINT else _Terminated(number)
+        stop = KeyboardInterrupt() if number == signal.SIGINT else _Terminated(number)
+        stops.append(stop)
+        raise stop
 
     # Under nohup SIGHUP is ignored, and the command is to outlive its terminal.
     signals = [number for number in _ENDINGS if signal.getsignal(number) != signal.SIG_IGN]
@@ -268,6 +272,16 @@ def _signals(advice: str) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        if stops and _is_lost(stops[0], sys.exception()):
+            raise stops[0] from None
+
+
+def _is_lost(stop: BaseException, error: BaseException | None) -> bool:
+    """Tell whether the exception of a signal was lost: native code that it came through makes another one of it."""
+    if isinstance(stop, _Terminated):
+        return error is not stop
+    # Ctrl-C may have ended a stream in good order, whose own errors are told.
+    return isinstance(error, Exception) and not isinstance(error, SemfovError | OSError)
 
 
 def _leave(number: int, _: object) -> None:
