@@ -224,8 +224,14 @@ def _results(
     tasks: Sequence[_Task],
     tell: Callable[[_Task], object],
     starting: AbstractContextManager[object] | None = None,
+    *,
+    stays_open: bool = True,
 ) -> Iterator[tuple[_Task, _Result]]:
-    """Give tasks to an executor, the first ones within `starting`, and yield them with their results as they finish."""
+    """Give tasks to an executor, the first ones within `starting`, and yield them with their results as they finish.
+
+    If the executor `stays_open` after them, tasks that have not begun are cancelled when the work is broken off. In one
+    that ends then, they end with it: Python 3.11 prints a traceback where processes end and such tasks are cancelled.
+    """
     finished: SimpleQueue[Future[_Result]] = SimpleQueue()
     running: dict[Future[_Result], _Task] = {}
     waiting = iter(tasks)
@@ -247,8 +253,9 @@ def _results(
             tell(task)
             submit(1)
     finally:
-        for future in running:
-            future.cancel()
+        if stays_open:
+            for future in running:
+                future.cancel()
 
 
 _shared: ContextVar[tuple[ExitStack, dict[int, Executor]] | None] = ContextVar("shared processes", default=None)
@@ -264,7 +271,8 @@ def _in_processes(
 ) -> Iterator[tuple[_Task, _Result]]:
     try:
         with _executor(processes, len(tasks)) as executor:
-            yield from _results(executor, job, tasks, tell, _deaf_children())
+            is_shared = _shared.get() is not None
+            yield from _results(executor, job, tasks, tell, _deaf_children(), stays_open=is_shared)
     except BrokenProcessPool:
         raise SemfovError(
             f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "

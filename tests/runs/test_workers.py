@@ -56,7 +56,7 @@ def work(_, task):
 
 def main(config):
     for _ in run_tasks(
-        work, [0, 1, 2], where=2, make=str, settings=(config.folder,), title="sleeping", unit="nap"
+        work, range(20), where=2, make=str, settings=(config.folder,), title="sleeping", unit="nap"
     ):
         pass
 
