@@ -21,8 +21,8 @@ ROOT = PACKAGE.parent
 
 # A subpackage imports only from itself and from the subpackages before it.
 SUBPACKAGES = [
-    "version", "words", "attribute_words", "errors", "threads", "io", "data", "kinds", "settings", "motion", "sensor",
-    "detection",
+    "version", "words", "attribute_words", "errors", "threads", "precision", "io", "data", "kinds", "settings",
+    "motion", "sensor", "detection",
     "observation", "dirichlet", "belief", "observers", "gaze", "acquisition", "policies", "saliency", "eye",
     "episode", "decision", "zoom", "tracking", "head", "paths", "strategy", "agents", "live", "model_folder", "presets",
     "agent", "metrics", "viz", "report", "runs", "cli", "__main__", "baselines", "human", "envs", "fit",

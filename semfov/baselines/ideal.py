@@ -10,7 +10,7 @@ from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation import FovealObservationModel, visibility
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 
 # Where nothing is visible the answer is a guess: with this signal each of n equal cells is right with 1/n.
 _LEAST_SIGNAL = 1e-4

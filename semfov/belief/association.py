@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check_shape
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 
 
 def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:

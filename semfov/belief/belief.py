@@ -11,7 +11,7 @@ from torch import Tensor
 from semfov.belief.fusion import check_parameters
 from semfov.errors import InputError, check, values_known
 from semfov.observation import dirichlet
-from semfov.observation.precision import without_autocast
+from semfov.precision import without_autocast
 
 _TOGETHER = 1 << 22  # elements of the rows that an accelerator computes at once
 

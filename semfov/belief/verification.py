@@ -13,8 +13,8 @@ from semfov.io.pretrained import PretrainedForEye, fit_again_command
 from semfov.io.schema import Field, Schema
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
-from semfov.observation.precision import without_autocast
 from semfov.observation.thresholds import THRESHOLDS, DecidingModule, Thresholds, thresholds_of, thresholds_record
+from semfov.precision import without_autocast
 
 CLOSER_FEATURES = 7  # number of features of a closer look (`closer_features`)
 _MATCHED = 0.3  # least overlap (intersection over union) of a detection with a box at which it shows the same object

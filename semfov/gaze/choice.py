@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, values_known
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 
 _Noise = Callable[[int, Tensor], Tensor]
 """Maps the number of a gaze shift and the numbers of A episodes `(A,)` to random numbers `(A, X·Y)` in [0, 1)."""

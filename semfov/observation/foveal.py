@@ -20,10 +20,10 @@ from semfov.observation.dirichlet import floor
 from semfov.observation.fitting import fit_tables
 from semfov.observation.linear_map import kept_map, linear_map
 from semfov.observation.mle import Method
-from semfov.observation.precision import without_autocast
 from semfov.observation.presence import PRESENCE, Presence, presence_of
 from semfov.observation.statistics import DirichletStatistics
 from semfov.observation.thresholds import THRESHOLDS, thresholds_of, thresholds_record
+from semfov.precision import without_autocast
 
 _MOST_TEMPERING = 100
 _MOST_DISTANCE = 10  # larger ones are taken for pixels: no fixation lies ten longer sides from a box of its image

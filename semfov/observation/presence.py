@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_tensor
 from semfov.io.schema import Field
-from semfov.observation.precision import exact_product
 from semfov.observation.thresholds import DecidingModule, Thresholds
+from semfov.precision import exact_product
 
 SHARES = Field(("K",), low=1e-6, high=1 - 1e-6, optional=True)
 """Schema of the shares, by class, of the searches of a fit whose target was there, in the file of a model."""

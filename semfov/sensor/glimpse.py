@@ -8,6 +8,7 @@ from torch import Tensor
 
 from semfov.data.inputs import as_positions
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
+from semfov.precision import without_autocast
 from semfov.sensor.base import stacked_views
 
 CONTEXT = 3.0
@@ -177,7 +178,8 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: _Padding
     if _can_skip_zeros(image, part, box):
         canvas = _product_in_bands(rows, part, columns, box.tolist(), (left, top))
     else:
-        canvas = rows @ part @ columns.mT
+        with without_autocast(part):
+            canvas = rows @ part @ columns.mT
     return canvas + value if value else canvas
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup, values_known
+from semfov.precision import without_autocast
 from semfov.sensor.constants import constant
 from semfov.sensor.lines import Lines, Taps, banded, separable
 from semfov.threads import one_thread_if_small
@@ -91,10 +92,12 @@ def reduce(image: Tensor, convention: Convention) -> Tensor:
         # Imported when first needed: Kornia takes a quarter of a second.
         from kornia.geometry import transform
 
-        return transform.pyrdown(image.contiguous())
+        with without_autocast(image):
+            return transform.pyrdown(image.contiguous())
     height, width = image.shape[-2:]
     down, across = _reducing(height, width, convention, image.dtype, image.device)
-    return separable(image, down, across)
+    with without_autocast(image):
+        return separable(image, down, across)
 
 
 def pyrup(image: Tensor, shape: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -140,11 +143,13 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
     if _runs_in_kornia(image, convention, size):
         from kornia.geometry import transform
 
-        return transform.pyrup(image.contiguous())
+        with without_autocast(image):
+            return transform.pyrup(image.contiguous())
     height, width = size
     before = (image.shape[-2], image.shape[-1])
     columns, rows = expanding(before, (height, width), convention, image.dtype, image.device)
-    return separable(image, columns, rows)
+    with without_autocast(image):
+        return separable(image, columns, rows)
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from semfov.errors import check
 from semfov.io.state import StatedModule
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 
 FACTS = (
     "score",

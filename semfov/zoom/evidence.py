@@ -16,9 +16,9 @@ from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import Settings, check_same_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Schema, perceptron
-from semfov.observation.precision import without_autocast
 from semfov.observation.presence import SHARES
 from semfov.observation.thresholds import THRESHOLDS, DecidingModule, Thresholds, thresholds_of, thresholds_record
+from semfov.precision import without_autocast
 from semfov.zoom.certainty import Certainty
 from semfov.zoom.closer import USUAL_WINDOW
 from semfov.zoom.hint_maps import CROWD, features, hint_maps, memory_maps, neighbourhood_mean, tapered, through

@@ -51,6 +51,20 @@ def test_views_of_half_precision_show_the_same_place(name, dtype):
     torch.testing.assert_close(view.float(), expected, atol=rounding, rtol=0)
 
 
+@pytest.mark.parametrize("has_gradients", [False, True])
+@pytest.mark.parametrize("size", [(20, 600), (400, 500)], ids=str)
+@pytest.mark.parametrize("name", SENSORS)
+def test_automatic_mixed_precision_changes_no_view(name, size, has_gradients):
+    """Half precision would lose the details that the sensor shows; of large pictures no view was made at all."""
+    image = rand(1, 3, *size).requires_grad_(has_gradients)
+    gaze = torch.tensor([301.0, 9.0])
+    expected = SENSORS[name](image, gaze)
+    with torch.autocast("cpu", torch.bfloat16):
+        view = SENSORS[name](image, gaze)
+    assert view.dtype == torch.float32
+    torch.testing.assert_close(view, expected, atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize("kind", [torch.float64, torch.int64, torch.int16], ids=str)
 @pytest.mark.parametrize("name", SENSORS)
 def test_fixations_of_any_type(name, kind):

@@ -12,7 +12,7 @@ from semfov.belief.likelihood import cells_of_detections, likelihood_ratios
 from semfov.belief.observers.base import WEAK_PRIOR, Evidence, Observer, faded, own
 from semfov.detection.detections import Detections
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 
 
 @dataclass(frozen=True)

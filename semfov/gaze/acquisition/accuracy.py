@@ -9,7 +9,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import acuity
 from semfov.gaze.acquisition.lookahead import at_levels
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 
 _CORRECTED = 0.3  # c, by least squares 0.32 in explorations of photographs
 

@@ -13,7 +13,7 @@ from semfov.belief.grid import Grid
 from semfov.errors import InputError, check, check_shape, check_whole, values_known
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation.foveal import FovealObservationModel
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 from semfov.threads import one_thread_if_small
 
 _BLOCK = 1 << 16  # elements that are worked on at once, which stay in the processor's cache

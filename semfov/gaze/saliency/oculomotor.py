@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
-from semfov.observation.precision import exact_product
+from semfov.precision import exact_product
 
 _LENGTHS = (0.0, 0.015, 0.03, 0.05, 0.075, 0.105, 0.145, 0.2, 0.27, 0.36, 0.5, 0.7, 1.0)
 """Distances, in longer sides of the picture, between which the tables are interpolated."""
