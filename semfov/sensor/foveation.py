@@ -8,8 +8,9 @@ of a large image without its finest band (`_foveate_large`).
 
 import warnings
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from numbers import Real
-from typing import get_args
+from typing import Self, get_args
 
 import torch
 from torch import Tensor, nn
@@ -289,9 +290,10 @@ class Foveation(Sensor):
 
     Args:
         sigma: width of the fovea in pixels of the image that it is called with (a `semfov.Eye` brings pictures to one
-            size before, its `reference`); a tensor with gradients stays in the graph.
+            size before, its `reference`); a tensor with gradients stays in the graph. It is in the module's state if it
+            is an `nn.Parameter`; another one stays with the caller, and one that was computed cannot be deep-copied.
         levels: number of bands of the pyramid.
-        growth: factor by which the window of each coarser band is wider; a tensor with gradients stays in the graph.
+        growth: factor by which the window of each coarser band is wider; a tensor with gradients as for `sigma`.
         convention: convention of the pyramid, `kornia` or `opencv`.
         learnable: make σ a learnable parameter (its logarithm is learned, so that σ stays positive).
 
@@ -327,6 +329,17 @@ class Foveation(Sensor):
         else:
             self.given_sigma = None
             self.log_sigma = nn.Parameter(torch.tensor(float(sigma)).log(), requires_grad=learnable)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """Copy the sensor; raises `InputError` for a σ or a growth that was computed, which PyTorch does not copy."""
+        for name, value in (("sigma", self.given_sigma), ("growth", self.growth)):
+            is_computed = isinstance(value, Tensor) and not value.is_leaf
+            remedy = f"one that was computed with gradients; make the copy anew, with {name}={name}.detach() or without"
+            check(not is_computed, name, "a number, a parameter or another leaf where a sensor is copied", remedy)
+        copied = type(self).__new__(type(self))
+        memo[id(self)] = copied
+        copied.__setstate__(deepcopy(self.__dict__, memo))
+        return copied
 
     @property
     def sigma(self) -> Tensor:

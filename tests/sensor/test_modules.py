@@ -55,6 +55,27 @@ class TestMultiScaleFovea(TestFoveation):
         return MultiScaleFovea(16, 3)
 
 
+def test_a_sensor_with_a_computed_width_is_copied_as_far_as_pytorch_copies_it():
+    """An optimiser's average of weights copies modules; a tensor that was computed belongs to a graph."""
+    leaf = torch.tensor(12.0, requires_grad=True)
+    image = rand(1, 3, 48, 64)
+    for sensor in (Foveation(leaf), Foveation(torch.nn.Parameter(leaf.detach())), Foveation(9.0, growth=leaf)):
+        copied = copy.deepcopy(sensor)
+        close(copied(image, GAZES[:1]), sensor(image, GAZES[:1]))
+        assert copied.sigma is not sensor.sigma
+        with torch.no_grad():
+            copied.sigma.fill_(1.0)
+        assert sensor.sigma.item() > 1
+    assert [*Foveation(torch.nn.Parameter(leaf.detach())).state_dict()] == ["given_sigma", "_extra_state"]
+    refused("^sigma: expected .* leaf where a sensor is copied, got one that was computed", copy.deepcopy,
+            Foveation(leaf * 1))  # fmt: skip
+    refused("^growth: expected .* leaf where a sensor is copied, got one that was computed", copy.deepcopy,
+            torch.nn.Sequential(Foveation(5.0, growth=leaf * 1)))  # fmt: skip
+    twice = torch.nn.ModuleList([Foveation(9.0)] * 2)
+    first, second = copy.deepcopy(twice)
+    assert first is second
+
+
 of_each_sensor = pytest.mark.parametrize(
     ("sensor", "prepare"),
     [
