@@ -22,7 +22,8 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
     """Bring arguments into the form that the parser understands.
 
     Names of options may have dashes, a flag needs no value, several words or numbers no brackets, and `none` is the
-    empty list. Words that belong to no option may stand before, between and after the options.
+    empty list. Words that belong to no option may stand before, between and after the options. Files of settings come
+    first, and then those of groups of settings: what is typed wins, wherever it stands.
 
     Args:
         arguments: the words of the command line.
@@ -30,28 +31,36 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         options: the options of the parser, with underscores, such as `--stop_below`.
 
     Returns:
-        The words for the parser. Those that belong to no option stand together, where the first of them was: a file of
-        settings before them gives way to them, and one after them does not.
+        The words for the parser. Those that belong to no option stand together, where the first of them was.
 
     Raises:
         InputError: an option that takes one value is given twice, or one that takes a file is given no name.
     """
     types = setting_types(config)
     usual: list[str] = []
+    files: list[str] = []
+    groups: list[str] = []
     free: list[str] = []  # of which the parser takes only those that stand together
     place = 0  # of the first of these among the others
     words = deque(arguments)
     while words:
         word = words.popleft()
         if word == "--":  # what follows it are no options
-            return [*usual, word, *free, *words]
+            return [*files, *groups, *usual, word, *free, *words]
         option = _option_of(word)
         if option in options:
             kind = types.get(option[2:], _NO_SETTING)
-            _check_once(option, kind, usual)
+            _check_once(option, kind, [*groups, *usual])
             parts = [name.removeprefix(f"{option[2:]}.") for name in types if name.startswith(f"{option[2:]}.")]
             _check_group(word, parts, words)
-            usual += _with_value(word, kind, words)
+            option_words = _with_value(word, kind, words)
+            has_value = option_words != [option]
+            if has_value and option == "--config":
+                files += option_words
+            elif has_value and parts:
+                groups += option_words
+            else:
+                usual += option_words
         elif word.startswith("-") and word != "-":
             # An item of a dictionary, as `--sensor.settings.fovea`, is no option of its own, but has a value.
             is_item = option.rpartition(".")[0] in options and "=" not in word
@@ -60,7 +69,7 @@ def usual_form(arguments: Sequence[str], config: type[Settings], options: Contai
         else:
             place = place if free else len(usual)
             free.append(word)
-    return [*usual[:place], *free, *usual[place:]]
+    return [*files, *groups, *usual[:place], *free, *usual[place:]]
 
 
 _NO_SETTING = SettingType(None)

@@ -475,10 +475,40 @@ def test_messages_name_options_as_the_command_does():
 
 def test_options_are_written_as_in_other_commands():
     given = ["--stop-below", "0.2", "--looks", "--draw", "path,views", "--config", "a.yaml", "--config", "b.yaml"]
-    usual = ["--stop_below", "0.2", "--looks=true", "--draw=[path,views]", "--config", "a.yaml", "--config", "b.yaml"]
+    usual = ["--config", "a.yaml", "--config", "b.yaml", "--stop_below", "0.2", "--looks=true", "--draw=[path,views]"]
     known = ["--stop_below", "--looks", "--draw", "--config"]
     assert usual_form(given, options.SearchOptions, known) == usual
     assert usual_form(["--looks", "--looks"], options.SearchOptions, known) == ["--looks=true", "--looks=true"]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        "--passes 3 --config {file}",
+        "--config {file} --passes 3",
+        "a.jpg --config={file} --passes=3",
+        "--passes 3 a.jpg --config {file}",
+    ],
+)
+def test_what_is_typed_wins_over_a_file_of_settings_wherever_it_stands(given, tmp_path):
+    file = tmp_path / "settings.yaml"
+    file.write_text("passes: 2\nclasses: [cup]\npictures: [b.jpg]\n")
+    parser = make_parser(options.SearchOptions, None, ("pictures", "pictures"))
+    words = usual_form(given.format(file=file).split(), options.SearchOptions, parser._option_string_actions)
+    parsed = parser.parse_args(words)
+    assert parsed.passes == 3
+    assert [str(picture) for picture in parsed.pictures] == ["a.jpg" if "a.jpg" in given else "b.jpg"]
+
+
+@pytest.mark.parametrize("first", ["group", "part"])
+def test_an_option_wins_over_the_file_of_its_group(first, tmp_path):
+    file = tmp_path / "data.yaml"
+    file.write_text("limit: 7\nmin_instances: 4\n")
+    pair = [["--data", str(file)], ["--data.limit", "3"]]
+    given = [word for words in (pair if first == "group" else pair[::-1]) for word in words]
+    parser = make_parser(FitDetectorConfig, None)
+    parsed = parser.parse_args(usual_form(given, FitDetectorConfig, parser._option_string_actions))
+    assert (parsed.data.limit, parsed.data.min_instances) == (3, 4)
 
 
 @pytest.mark.parametrize(
