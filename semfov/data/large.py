@@ -13,7 +13,7 @@ from torch import Tensor
 from semfov.data.images import PhotographPicture, open_pillow, opening, to_bytes, upright_size
 from semfov.data.inputs import Color, ImageLike, as_image, as_pixels, check_local
 from semfov.data.tone import White, check_white, stated_limits
-from semfov.data.windowed import BY_WINDOWS, Box, ChosenBands, LargePicture
+from semfov.data.windowed import Box, ChosenBands, LargePicture, check_bands, check_no_bands, has_windows
 from semfov.errors import DataError, check, lookup
 
 
@@ -65,43 +65,22 @@ def open_large(
         DataError: the file cannot be read.
     """
     check_white(white)
-    _check_bands(bands)
+    check_bands(bands)
     if isinstance(source, LargePicture):
         check(white is None and bands is None, "white", "None for a picture that is open; give it to open_large", white)
         return source
     if isinstance(source, str | PathLike):
-        if not _has_windows(source):
-            _check_no_bands(bands)
+        if not has_windows(source):
+            check_no_bands(bands)
         return _open_file(source, white, bands)
-    _check_no_bands(bands)
+    check_no_bands(bands)
     return ArrayPicture(_bytes_of(source, color, white))
-
-
-def _has_windows(path: str | PathLike[str]) -> bool:
-    """Tell by its name whether a file is a TIFF or a raster, which are read by windows and have bands."""
-    return Path(path).suffix.lower() in BY_WINDOWS
-
-
-def _check_no_bands(bands: ChosenBands) -> None:
-    """Raise `InputError` for bands of a picture that is neither a TIFF nor a raster."""
-    expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
-    check(bands is None, "bands", expected, bands)
-
-
-def _check_bands(bands: ChosenBands) -> None:
-    """Raise `InputError` for what are no numbers of bands."""
-    if bands is None:
-        return
-    numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
-    are_numbers = all(type(number) is int and number >= 1 for number in numbers)
-    expected = "the number of a band, or three for red, green and blue, from 1"
-    check(len(numbers) in (1, 3) and are_numbers, "bands", expected, bands)
 
 
 def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBands) -> LargePicture:
     """Open a file by the readers of its kind, and note how its values are shown."""
     check_local(path, "picture")
-    if _has_windows(path):
+    if has_windows(path):
         from semfov.data.rasters import open_by_windows
 
         picture: LargePicture = open_by_windows(path, white=white, bands=bands)
@@ -167,7 +146,7 @@ def picture_size(source: LargePicture | ImageLike) -> tuple[int, int]:
 
 def _size_of_file(path: Path) -> tuple[int, int]:
     """Read `(width, height)` of a picture from its head, by the reader of its kind."""
-    if _has_windows(path):
+    if has_windows(path):
         # A white, whichever, lets floats in. A file of another kind than its name says is Pillow's.
         with suppress(DataError):
             return open_large(path, white=1.0).size

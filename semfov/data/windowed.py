@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,27 @@ BY_WINDOWS = (".tif", ".tiff", *RASTERS)
 """Ends of the names of files that may be read by windows, and whose bands can be chosen."""
 
 _LARGE = 1 << 24  # pictures with more pixels have copies
+
+
+def has_windows(path: str | PathLike[str]) -> bool:
+    """Tell by its name whether a file is a TIFF or a raster, which are read by windows and have bands."""
+    return Path(path).suffix.lower() in BY_WINDOWS
+
+
+def check_no_bands(bands: ChosenBands) -> None:
+    """Raise `InputError` for bands of a picture that is neither a TIFF nor a raster."""
+    expected = "None but for TIFFs and rasters (choose the channels of an array yourself, array[..., [3, 2, 1]])"
+    check(bands is None, "bands", expected, bands)
+
+
+def check_bands(bands: ChosenBands) -> None:
+    """Raise `InputError` for what are no numbers of bands."""
+    if bands is None:
+        return
+    numbers = [*bands] if isinstance(bands, tuple | list) else [bands]
+    are_numbers = all(type(number) is int and number >= 1 for number in numbers)
+    expected = "the number of a band, or three for red, green and blue, from 1"
+    check(len(numbers) in (1, 3) and are_numbers, "bands", expected, bands)
 
 
 def _strips(box: Box, reduction: int) -> list[Box]:

@@ -372,6 +372,19 @@ def test_bands_are_chosen_by_their_numbers(tmp_path, layout):
     refused("bands: expected numbers from 1 to 5", open_large, tmp_path / "a.tif", bands=6)
 
 
+def test_a_file_is_read_as_a_whole_by_the_bands_that_are_chosen(tmp_path):
+    values = np.concatenate([pixels(), pixels(seed=1)[..., :2]], -1)
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack", planarconfig="contig")
+    for bands, places in (((4, 3, 2), [3, 2, 1]), (5, [4, 4, 4])):
+        got = read_image(tmp_path / "a.tif", bands=bands)
+        assert np.array_equal((got * 255).round().permute(1, 2, 0).numpy(), values[..., places])
+    refused("bands: expected numbers from 1 to 5", read_image, tmp_path / "a.tif", bands=6)
+    refused("bands: expected the number of a band", read_image, tmp_path / "a.tif", bands=(1, 2))
+    refused("bands: expected None but for TIFFs", read_image, tmp_path / "a.png", bands=1)
+    refused("bands: expected None for the pixels as they are stored", read_image, tmp_path / "a.tif", bands=1,
+            oriented=False)  # fmt: skip
+
+
 def test_no_data_are_no_values_of_a_range(tmp_path):
     values = np.full((96, 128), -9999, np.float32)
     values[:, 64:] = pixels(96, 64)[..., 0] / 10
