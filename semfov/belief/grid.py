@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -95,7 +96,7 @@ class Grid:
         size: `(width, height)` of one image in pixels, or a tensor `(B, 2)` with one row for each image of a batch.
 
     Raises:
-        InputError: a number is not positive, or the shape of `size` is wrong.
+        InputError: a number of cells is not whole, one is not positive or not finite, or the shape of `size` is wrong.
 
     >>> grid = Grid(4, 2, (640, 480))
     >>> grid.centres[5]
@@ -107,10 +108,13 @@ class Grid:
     size: tuple[float, float] | Tensor
 
     def __post_init__(self) -> None:
-        check(self.columns >= 1 and self.rows >= 1, "columns, rows", "at least 1", (self.columns, self.rows))
+        numbers = (self.columns, self.rows)
+        are_whole = all(isinstance(number, Integral) and number >= 1 for number in numbers)
+        check(are_whole, "columns, rows", "whole numbers from 1", numbers)
         size = torch.as_tensor(self.size)
         check_shape(size, "size", 2)
-        check(bool((size > 0).all()), "size", "a positive width and height", self.size)
+        is_area = (size > 0) & (size < float("inf"))
+        check(bool(is_area.all()), "size", "a positive width and height", self.size)
 
     def __len__(self) -> int:
         """Count the cells, X·Y."""

@@ -1,5 +1,6 @@
 """The foveal observation model: how a detector scores objects of each class at each distance from the fovea."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from os import PathLike
@@ -135,6 +136,8 @@ class FovealObservationModel(Pretrained):
         super().__init__()
         check_tensor(alpha, "alpha")
         check(not isinstance(classes, str), "classes", "a sequence of names", repr(classes))
+        repeated = [name for name, count in Counter(classes).items() if count > 1]
+        check(not repeated, "classes", "names that are all different", f"{repeated} more than once")
         components = len(classes) + 1
         borders = _checked_borders(edges, alpha)
         levels = len(borders) + 1

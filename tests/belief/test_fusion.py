@@ -261,7 +261,11 @@ def test_shapes_and_numbers_that_do_not_fit_are_refused():
         with pytest.raises(InputError, match=rf"^{argument}: expected a tensor of shape"):
             fuse(torch.ones(beta), torch.ones(likelihood), torch.ones(footprint))
     refused(".", lambda: Grid(0, 3, (10, 10)))
-    refused(".", lambda: Grid(3, 3, (10, 0)))
+    for columns, rows in ((2.5, 2), (2, 2.0), (3, -1), (float("inf"), 2)):
+        refused("columns, rows: expected whole numbers from 1", lambda cells=(columns, rows): Grid(*cells, (10, 10)))
+    for side in (0, -1, float("inf"), float("nan")):
+        refused("size: expected a positive width and height", lambda side=side: Grid(3, 3, (10, side)))
+    assert len(Grid(np.int64(2), 3, (10, 10))) == 6
     refused(".", lambda: Grid(3, 3, (10, 10, 10)))
     refused(".", lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(1, 4), "all"))
 

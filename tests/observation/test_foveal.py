@@ -320,6 +320,8 @@ def test_settings_of_an_eye_are_checked_too():
     [
         lambda: FovealObservationModel(table()[:, :2], EDGES, CLASSES),
         lambda: FovealObservationModel(table() * 0, EDGES, CLASSES),
+        lambda: FovealObservationModel(table(), EDGES, [CLASSES[0], *CLASSES[:2]]),
+        lambda: FovealObservationModel.identity(["cup", "cup"], [0.1]),
         lambda: FovealObservationModel(table() * torch.nan, EDGES, CLASSES),
         lambda: FovealObservationModel(table(), [0.3, 0.2], CLASSES),
         lambda: FovealObservationModel(table(), [0.0, 0.2], CLASSES),
