@@ -3,6 +3,7 @@
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Iterable, Sequence
 from glob import glob
 from itertools import chain
@@ -57,6 +58,11 @@ class PictureSource(NamedTuple):
     scene: Picture | None = None
     place: Path = Path("example")
     shown: _Shown = _Shown()  # never changed
+
+    @property
+    def is_escaped(self) -> bool:
+        """Whether the name of the file has characters that results do not have."""
+        return self.file is not None and self.name != str(self.file)
 
     def picture(self) -> FlatPicture:
         """Open the picture, with the values and bands that are to be shown."""
@@ -171,7 +177,15 @@ def picture_sources(options: PictureOptions | GazeOptions | CompareOptions) -> l
             source = PictureSource(printable(str(file)), file, place=place, shown=shown)
             # A picture that is named twice, such as by its name and by its folder, is looked at once.
             sources.setdefault(os.path.abspath(file), source)
+    _warn_of_escapes([source.name for source in sources.values() if source.is_escaped])
     return [*sources.values()]
+
+
+def _warn_of_escapes(names: Sequence[str]) -> None:
+    """Warn of names of files that no table can hold as they are."""
+    if names:
+        text = f"{len(names)} with control characters or bytes that are not UTF-8 in the name, such as {names[0]}"
+        warnings.warn(f"pictures: {text}; results have these escapes: rename them to find them again", stacklevel=3)
 
 
 def _names_of_pictures(words: Iterable[str]) -> list[str]:

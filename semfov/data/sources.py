@@ -80,10 +80,12 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
         raise DataError(f"picture: no such file or folder: {source}; check the path")
     if not source.is_dir():
         return [source]
-    visible = _visible_files(source, recursive=recursive)
+    entries = _visible_entries(source, recursive=recursive)
+    visible = [path for path in entries if not path.is_dir()]
     files = sorted(path for path in visible if path.suffix.lower() in PHOTOGRAPHS)
     if recursive:
         files = _of_others(files, source)
+        _warn_of_links(source, [path for path in entries if path.is_symlink() and path.is_dir()])
     photographs(visible, str(source))  # warns of the other files
     _warn_of_mosaics(source)
     if not files:
@@ -99,10 +101,21 @@ def _without_photographs(folder: Path, *, recursive: bool, frames: bool) -> str:
     return f"picture: expected photographs (.jpg, .png, .tif, …) in {folder}, {hint}, got none"
 
 
-def _visible_files(folder: Path, *, recursive: bool) -> list[Path]:
-    """List the files of a folder but those whose names begin with a dot, such as ._a.jpg, which Apple writes."""
+def _visible_entries(folder: Path, *, recursive: bool) -> list[Path]:
+    """List what is in a folder, without names that begin with a dot, such as ._a.jpg, which Apple writes."""
     paths = folder.rglob("*") if recursive else folder.iterdir()
-    return [path for path in paths if not _is_hidden(path.relative_to(folder)) and not path.is_dir()]
+    return [path for path in paths if not _is_hidden(path.relative_to(folder))]
+
+
+def _warn_of_links(source: Path, folders: Sequence[Path]) -> None:
+    """Warn of folders behind symbolic links, which are not searched: they may lead back, or to another disk."""
+    if not folders:
+        return
+    name = printable(str(min(folders)))
+    text = f"{len(folders)} folders behind symbolic links, such as {name}, are left out; name them"
+    if len(folders) == 1:
+        text = f"1 folder behind a symbolic link, {name}, is left out; name it"
+    warnings.warn(f"{source}: {text}, to look there", stacklevel=3)
 
 
 def _is_hidden(path: Path) -> bool:

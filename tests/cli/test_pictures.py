@@ -396,6 +396,7 @@ def test_a_broken_picture_is_reported_and_the_others_are_written(run, photo, tmp
     assert [each["name"] for each in episodes_of(tmp_path / "page.html")] == ["a.png", "c.png"]
 
 
+@pytest.mark.filterwarnings("always:.*results have these escapes")
 def test_any_fault_of_one_picture_is_a_skip_with_its_reason(run, photo, tmp_path, agent, monkeypatch):
     """Names that are not UTF-8, links to nothing, and errors that nobody expected; nothing steers the terminal."""
     folder = tmp_path / "photos"
@@ -429,6 +430,8 @@ def test_any_fault_of_one_picture_is_a_skip_with_its_reason(run, photo, tmp_path
     ):
         assert re.search(rf"skipped \S+{said}", printed.err)
     assert "\x1b" not in printed.out + printed.err
+    told = "warning: pictures: 3 with control characters or bytes that are not UTF-8 in the name, such as "
+    assert f"{told}{folder / 'b'}\\udcff.png; results have these escapes" in printed.err
     result = json.loads((tmp_path / "boxes.json").read_text(encoding="utf-8"))
     assert [Path(each["picture"]).name for each in result["pictures"]] == [
         "a.png", "b\\udcff.png", "c\\x1b[31m.png", "d\n.png",

@@ -40,6 +40,26 @@ def video(tmp_path):
     return path
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs symbolic links")
+def test_folders_behind_links_are_left_out_with_a_warning(tmp_path):
+    folder = tmp_path / "photos"
+    (folder / "low").mkdir(parents=True)
+    (tmp_path / "others").mkdir()
+    for path in (folder / "a.png", folder / "low" / "b.png", tmp_path / "others" / "c.png"):
+        Image.new("RGB", (8, 6)).save(path)
+    (folder / "linked.png").symlink_to(folder / "a.png")  # links to files are followed
+    expected = ["a.png", "linked.png", "b.png"]
+    assert [path.name for path in picture_files(folder, recursive=True)] == expected
+    (folder / "elsewhere").symlink_to(tmp_path / "others")
+    with pytest.warns(UserWarning, match=r"1 folder behind a symbolic link, \S+elsewhere, is left out; name it"):
+        assert [path.name for path in picture_files(folder, recursive=True)] == expected
+    (folder / "low" / "back").symlink_to(folder)
+    with pytest.warns(UserWarning, match=r"2 folders behind symbolic links, such as \S+elsewhere, are left out"):
+        assert [path.name for path in picture_files(folder, recursive=True)] == expected
+    assert [path.name for path in picture_files(folder / "elsewhere", recursive=True)] == ["c.png"]
+    assert len(picture_files(folder)) == 2  # without --recursive no folder is searched
+
+
 def test_pictures_of_a_file_and_of_a_folder(tmp_path):
     for name in ("b.png", "a.jpg"):
         Image.new("RGB", (8, 6), "red").save(tmp_path / name)
