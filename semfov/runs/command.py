@@ -108,7 +108,7 @@ def make_parser(
         exit_on_error=True,
         allow_abbrev=False,  # --conf would be --config
     )
-    parser.add_argument("--config", action="config", help="YAML file with settings; options after it override it.")
+    parser.add_argument("--config", action="config", help="YAML file with settings; typed options override it.")
     no_options = {*config.unused}
     if positional is not None:
         name, text = positional
