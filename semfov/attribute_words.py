@@ -27,9 +27,12 @@ PACKAGE = by_word(
         "semfov.data, which reads pictures, COCO's annotations and fixations": (
             "CocoDetection DataLoader Dataset dataset datasets load_dataset"
         ),
-        "semfov.sensor, whose modules take pictures": (
-            "Fovea Foveate Transform Transforms augmentation fovea transforms"
+        "semfov.Foveation, a module, or semfov.foveate": "Fovea Foveate fovea",
+        "semfov.sensor, whose modules take pictures": "Transform Transforms augmentation transforms",
+        "semfov.Foveation, semfov.FovealObservationModel and semfov.observers, which are modules of PyTorch": (
+            "layers modules nn"
         ),
+        "semfov.head.PanTiltCamera, from which yours derives": "Camera PTZCamera PanTiltCamera PtzCamera",
         "semfov.viz, or record.report(path)": "draw visualization visualize",
         "semfov.load_detector(name or file), or semfov.ActivePerception.recommended(name)": (
             "AutoDetectionModel AutoModel Detector YOLO from_pretrained get_model load_model pipeline"
@@ -64,6 +67,9 @@ AGENT = by_word(
         "semfov.ActivePerception.from_pretrained(folder)": "load",
         "semfov.fit_detector(model, photographs, annotations)": "finetune fit",
         "a new call, as an agent keeps nothing of earlier pictures": "clear close reset",
+        "semfov.paths.Drafts(agent.gaze(first), agent.gaze(second)), or `semfov compare FOLDER` in a shell": (
+            "benchmark compare diff evaluate"
+        ),
         "semfov.run(folder, target)": "find_folder find_in_folder run_folder search_folder",
         "record.belief_map(-1), of looks by a fovea or a head": "belief beliefs posterior",
         "agent.explore(picture, policy=…), or semfov.rollout with one of yours": "act policy select_action",
@@ -99,6 +105,7 @@ DECISION = by_word(
 LIVE = by_word(
     {
         "live.step(frame)": "detect forward next predict process push read run track update",
+        "a new agent.live(target), which knows nothing of earlier frames": "clear reset restart",
         "the release of your own capture, as nothing else is open": "close release stop",
         "the moment that live.step(frame) returns": "boxes decision objects tracks",
     }
@@ -189,6 +196,31 @@ LOOK = by_word(
     }
 )
 
+MOMENT = {**RECORD, **dict.fromkeys(["fixation", "gaze"], "moment[-1].fixation")}
+"""Those of a frame whose windows are looked at."""
+
+BELIEF = by_word(
+    {
+        "belief.class_probabilities(), or belief.probability(target)": (
+            "logits mean posterior posteriors prob probs softmax"
+        ),
+        "semfov.dirichlet.entropy(belief.beta), or that of belief.class_probabilities()": "entropy uncertainty",
+        "observer(belief, detections, fixation, grid), which returns the new belief": "fuse observe step update",
+        "belief.map(lambda tensor: tensor.to(device))": "cpu cuda double float half to",
+    }
+)
+
+MODEL = by_word(
+    {
+        "model.save(path)": "export save_pretrained",
+        "len(model.classes)": "n_classes nc num_classes",
+        "model.classes": "class_names labels names",
+    }
+)
+"""Of models that are fitted and saved."""
+
+POLICIES = by_word({"semfov.policies.policy_names(task)": "POLICIES all available known list list_policies names"})
+
 METRICS = by_word(
     {
         "semfov.metrics.scanpath": (
@@ -197,7 +229,9 @@ METRICS = by_word(
         ),
         "semfov.metrics.calibration": "Calibration ECE calibration_error ece reliability",
         "semfov.metrics.average_precision": ("AP AveragePrecision MeanAveragePrecision ap ap50 mAP map map50"),
-        "semfov.metrics.episodes": "area_under_roc cumulative_performance roc_auc standard_error",
+        "semfov.metrics.episodes": (
+            "CP CumulativePerformance area_under_roc cp cumulative_performance roc_auc standard_error"
+        ),
     }
 )
 
@@ -213,6 +247,7 @@ GAZE_PREDICTION = by_word(
         "gaze.density.numpy()": "array cpu numpy tensor",
         "gaze.density": "fixation_map heat_map heatmap map probability saliency saliency_map",
         "semfov.paths.Drafts(gaze, other)": "ab diff difference versus",
+        "agent.find_all(picture, target)": "detect find find_all search",
         "gaze.density.log()": "log_density log_probability logits",
         "gaze.scanpaths(people)": "fixations sample sample_scanpaths scanpath",
         "gaze.visits(areas)": "noticed seen_by time_to_first_fixation ttff viewers",

@@ -1,6 +1,7 @@
 """Active perception of a camera or a video: one look at every frame, and evidence that fades between frames."""
 
 import sys
+from typing import NoReturn
 
 from numpy.typing import ArrayLike
 
@@ -9,7 +10,7 @@ from semfov.agents.picture import OpenedPicture
 from semfov.attribute_words import LIVE, OtherWords, Room
 from semfov.data.inputs import FRAME, ImageLike, as_image
 from semfov.data.tone import White, check_white
-from semfov.errors import check
+from semfov.errors import InputError, check, checked_keywords
 from semfov.motion import Motion
 from semfov.paths import Moment
 from semfov.settings import How, StreamSettings
@@ -82,6 +83,19 @@ class LivePerception(OtherWords):
             return (self.how,)
         return ("windows",) if self._photographs else ("fovea", "windows")
 
+    def __call__(self, *arguments: object, **options: object) -> NoReturn:
+        """Refuse a call of the stream itself with the name of its method.
+
+        Args:
+            *arguments: any.
+            **options: any.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError("a stream is not called itself: live.step(frame) takes its frames")
+
+    @checked_keywords
     def step(self, frame: ImageLike, passed: float = FRAME, pose: Motion | ArrayLike | None = None) -> Moment:
         """Look at the next frame.
 

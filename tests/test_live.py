@@ -387,3 +387,16 @@ def test_a_target_is_found_while_the_camera_moves(step):
         moment = live.step(frame, pose=[[1.0, 0.0, float(-step * number)], [0.0, 1.0, 0.0]])
         outcomes.append(None if moment.decision is None else moment.decision.outcome)
     assert outcomes[-1] == "found"
+
+
+def test_a_stream_says_how_it_is_called():
+    live = agent_with(Semantic(3)).live("green")
+    refused(r"live\.step\(frame\) takes its frames", live, scene(8))
+    refused("did you mean passed=", live.step, scene(8), dt=0.1)
+    refused("did you mean passed=", live.step, scene(8), timestamp=0.1)
+    with pytest.raises(AttributeError, match=r"use a new agent\.live\(target\)"):
+        _ = live.reset
+    moment = agent_with(Semantic(3)).live("green", how="windows").step(scene(8))
+    with pytest.raises(AttributeError, match=r"use moment\[-1\]\.fixation"):
+        _ = moment.fixation
+    assert moment[-1].fixation == moment.window.fixation[:2]

@@ -155,7 +155,7 @@ def test_models_of_searches_say_what_they_were_fitted_to(name):
 
 def test_the_words_of_other_libraries_for_files_are_refused_with_ours(tmp_path):
     model = semfov.FovealObservationModel.identity(["cup"], [0.2])
-    with pytest.raises(AttributeError, match=r"no save_pretrained; use save\(FILE.safetensors\)"):
+    with pytest.raises(AttributeError, match=r"no attribute 'save_pretrained'; use model.save\(path\)"):
         model.save_pretrained(tmp_path)
     assert not hasattr(model, "missing")
     torch.save(model.state_dict(), tmp_path / "alpha.pt")

@@ -8,6 +8,7 @@ from typing import Any, Self, TypeVar
 import torch
 from torch import Tensor
 
+from semfov.attribute_words import BELIEF, OtherWords
 from semfov.belief.fusion import check_parameters
 from semfov.errors import InputError, check, values_known
 from semfov.observation import dirichlet
@@ -36,7 +37,7 @@ def with_fields(instance: _DataClass, change: Callable[[Any], Any]) -> _DataClas
     return replace(instance, **{name: changed(getattr(instance, name)) for name in names})  # type: ignore[type-var]
 
 
-class Belief(ABC):
+class Belief(OtherWords, ABC):
     """Base of all beliefs about the cells of an image, for a batch of episodes.
 
     A subclass implements `probability`, and is a dataclass of tensors `(B, ...)`, of other beliefs, also in tuples, and
@@ -52,6 +53,8 @@ class Belief(ABC):
     """
 
     closest: Tensor
+
+    _other_words = BELIEF
 
     @abstractmethod
     def probability(self, target: int | Tensor) -> Tensor:
@@ -152,6 +155,11 @@ class Belief(ABC):
         rows = iter(tensors)
         return self.map(lambda tensor: tensor.index_copy(0, index, next(rows)))
 
+    def __repr__(self) -> str:
+        """Write the shapes of the tensors, as their numbers would fill the screen."""
+        shapes = [f"{name}: {tuple(value.shape)}" for name, value in vars(self).items() if isinstance(value, Tensor)]
+        return f"{type(self).__name__}({', '.join(shapes)})"
+
     def detach(self) -> Self:
         """Detach every tensor from the graph, so that no gradient flows through the belief.
 
@@ -167,7 +175,7 @@ class Belief(ABC):
         return with_fields(self, detached)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DirichletBelief(Belief):
     r"""A Dirichlet belief about the class of every cell, :math:`P(C^x) \sim \mathrm{Dir}(\beta^x)`.
 

@@ -18,7 +18,7 @@ from semfov.data.images import SWAPPED, file_orientation, upright_boxes
 from semfov.data.large import picture_size
 from semfov.data.reading import read_image
 from semfov.data.scene import Annotation, Coverage, Scene, Scenes, legal_targets
-from semfov.errors import DataError, check, check_data
+from semfov.errors import DataError, check, check_data, checked_keywords
 from semfov.io.files import check_regular, inside, json_sha256, sha256
 
 _log = logging.getLogger(__name__)
@@ -74,6 +74,7 @@ class CocoScenes(Scenes):
 
     ids: list[Any]
 
+    @checked_keywords
     def __init__(
         self,
         root: str | PathLike[str],

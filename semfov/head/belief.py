@@ -38,7 +38,7 @@ class _SceneEvidence(Evidence):
         raise InputError("looks: expected a single look; looks of a head cannot be joined, as their poses may differ")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SceneBelief(Belief):
     """Belief about the S cells of a scene, of which each takes that of the view whose gaze came closest to it.
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from semfov.attribute_words import MODEL, missing
 from semfov.errors import DataError, InputError, check, lookup, reason_of
 from semfov.io.compatibility import Settings, check_grid, check_same_detector, check_sensor
 from semfov.io.files import JsonObject
@@ -69,9 +70,9 @@ class Pretrained(StatedModule):
         write_file(path, self._tensors(), record)
 
     def __getattr__(self, name: str) -> Any:
-        """Find a part of the module; the word of other libraries for `save` is refused with ours."""
-        if name == "save_pretrained":
-            raise AttributeError(f"a {self.title} has no save_pretrained; use save(FILE.safetensors)")
+        """Find a part of the module; words of other libraries are refused with ours."""
+        if name in MODEL:
+            raise missing(f"a {self.title}", name, MODEL)
         return super().__getattr__(name)
 
     def digest(self) -> str:

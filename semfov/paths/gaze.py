@@ -531,13 +531,13 @@ class GazePrediction(OtherWords):
         write_bytes(path, content.getvalue())
         return path
 
+    @checked_keywords
     def describe(self) -> str:
         """Describe the prediction in one line."""
         first = ", then ".join(f"({place['x']:z.0f}, {place['y']:z.0f})" for place in self.first_fixations())
-        limit = ""
-        if self.seen is not None:
-            limit = f", after {amount(self.seen, 'fixation')} seen by the fovea"
-        return f"people look first at {first}{limit}"
+        if self.seen is None:
+            return f"people look first at {first}"
+        return f"people look first at {first}, after {amount(self.seen, 'fixation')} seen by the fovea"
 
     def __str__(self) -> str:
         """Return the description, and the places where most fixations are expected."""

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from semfov.attribute_words import MOMENT
 from semfov.data.classes import amount, plural
 from semfov.detection import Objects
 from semfov.detection.objects import NO_TRACK
@@ -508,6 +509,7 @@ class WindowMoment(ZoomPath, Moment):
     tracks: Tracks = field(default_factory=Tracks.none)
     photograph: Tensor | None = MadeWhenRead(None)  # type: ignore[assignment]
 
+    _other_words = MOMENT
     _words = WindowMomentWords
     _format = Format(
         "window moment",

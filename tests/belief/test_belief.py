@@ -1,10 +1,12 @@
 """Beliefs of every kind of observer: batches, indexing, mapping and fading, and looks that are joined."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
 
-from semfov import Detections, DirichletBelief, Grid, InputError
+from semfov import Detections, DirichletBelief, FovealObservationModel, Grid, InputError
 from semfov.belief.belief import Belief, dirichlet_belief
 from semfov.belief.observers import AnyOf, Semantic, SemanticMap, SemanticSearch
 from tests import small
@@ -287,3 +289,25 @@ def test_parameters_fade_towards_the_prior():
     torch.testing.assert_close(faded.beta, 0.75 * torch.full_like(belief.beta, 0.3) + 0.25 * belief.beta)
     assert observer.fade(belief, look, 1, torch.zeros(2, 12, dtype=torch.bool)) is belief
     torch.testing.assert_close((-6 * faded.closest).exp(), (-6 * belief.closest).exp() / 4)
+
+
+def test_a_printed_belief_has_shapes_and_no_numbers():
+    observer = SemanticSearch(FovealObservationModel.identity(["cup"], [0.2], miss_odds=torch.ones(2, 2)))
+    for belief in (DirichletBelief(torch.ones(2, 100, 3)), observer.start(2, Grid(10, 10, (64, 48)), torch.ones(1))):
+        assert repr(belief).startswith(f"{type(belief).__name__}(beta: {tuple(belief.beta.shape)}, closest: (2, 100)")
+        assert len(repr(belief)) < 200
+        assert "tensor" not in repr(belief[:1])
+
+
+@pytest.mark.parametrize(
+    ("word", "remedy"),
+    [
+        ("probs", "belief.class_probabilities()"),
+        ("entropy", "semfov.dirichlet.entropy(belief.beta)"),
+        ("update", "observer(belief, detections, fixation, grid)"),
+        ("to", "belief.map(lambda tensor: tensor.to(device))"),
+    ],
+)
+def test_words_of_others_for_a_belief_are_answered(word, remedy):
+    with pytest.raises(AttributeError, match=re.escape(remedy)):
+        getattr(DirichletBelief(torch.ones(1, 4, 3)), word)

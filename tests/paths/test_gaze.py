@@ -127,6 +127,8 @@ def test_visits_of_areas_are_those_of_drawn_viewers(gaze):
     assert visits["left"].viewers > visits["corner"].viewers > 0
     assert visits["sliver"] == (0, None)
     assert str(visits["sliver"]) == "seen by no viewer"
+    refused(r"gaze\.share\(areas\) and gaze\.visits\(areas\)", gaze.describe, areas)
+    refused(r"gaze\.share\(areas\) and gaze\.visits\(areas\)", gaze.describe, areas=areas)
     with pytest.raises(AttributeError, match=r"use gaze\.visits\(areas\)"):
         _ = gaze.ttff
     for seconds in (0, [3], True):

@@ -14,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 
 import semfov
-from semfov import ActivePerception, attribute_words, words
+from semfov import ActivePerception, FovealObservationModel, Grid, attribute_words, words
 from semfov.cli.commands import SUBCOMMANDS
 from semfov.cli.main import _option_names
 from semfov.cli.options import FindOptions
@@ -37,6 +37,10 @@ ATTRIBUTES = (
     attribute_words.GAZE_PREDICTION,
     attribute_words.LOOK,
     attribute_words.METRICS,
+    attribute_words.MOMENT,
+    attribute_words.BELIEF,
+    attribute_words.MODEL,
+    attribute_words.POLICIES,
 )
 REMEDIES = {
     *(remedy for table in (*ATTRIBUTES, words._OTHER_PLACES) for remedy in table.values()),
@@ -68,7 +72,9 @@ PASSED_ON = {
 def things():
     """What the first names of remedies stand for."""
     agent = small.agent(small.Fixed(("cup", "wine glass")), grid=(4, 3), sigma=10.0, reference=64.0)
-    model = FixationDensity({"backbone8": 3}).eval()
+    density = FixationDensity({"backbone8": 3}).eval()
+    live = agent.live("cup", how="windows")
+    observer = agent.searching.observer
     record = agent.search(PIXELS, "cup", how="fovea", shifts=1)
     return {
         "semfov": semfov,
@@ -77,8 +83,12 @@ def things():
         "objects": record.objects,
         "decision": record.decision,
         "look": record[0],
-        "live": agent.live("cup"),
-        "gaze": GazePrediction(model, {"map": torch.zeros(1, 39, 52)}, (104, 78), torch.zeros(3, 78, 104)),
+        "live": live,
+        "moment": live.step(PIXELS),
+        "observer": observer,
+        "belief": observer.start(1, Grid(4, 3, (44, 30)), torch.zeros(1)),
+        "model": FovealObservationModel.identity(["cup"], [0.2]),
+        "gaze": GazePrediction(density, {"map": torch.zeros(1, 39, 52)}, (104, 78), torch.zeros(3, 78, 104)),
     }
 
 
@@ -135,6 +145,12 @@ def test_what_a_remedy_names_is_there(remedy, things):
         ("objects", "sort", "objects[objects.scores.argsort(descending=True)]"),
         ("gaze", "diff", "semfov.paths.Drafts(gaze, other)"),
         ("look", "boxes", "look.detections; record.objects has those of all looks together"),
+        ("gaze", "find", "agent.find_all(picture, target)"),
+        ("agent", "compare", "semfov.paths.Drafts(agent.gaze(first), agent.gaze(second))"),
+        ("model", "num_classes", "len(model.classes)"),
+        ("semfov", "Fovea", "semfov.Foveation"),
+        ("semfov", "nn", "semfov.observers"),
+        ("semfov", "PanTiltCamera", "semfov.head.PanTiltCamera"),
         ("record", "save_video", "use save"),
         ("record", "to_coco_annotations", "use to_coco"),
         ("objects", "get_scores", "use objects.scores"),
@@ -163,6 +179,19 @@ def test_words_of_others_are_answered_with_ours(thing, word, remedy, things):
 def test_options_of_others_are_answered_with_ours(method, option, remedy, things):
     with pytest.raises(InputError, match=re.escape(remedy)):
         getattr(things["agent"], method)(PIXELS, **{option: 1})
+
+
+@pytest.mark.parametrize("make", [ActivePerception.recommended, ActivePerception.published, ActivePerception.raw])
+def test_a_detector_is_the_name_that_an_agent_is_made_from(make):
+    with pytest.raises(InputError, match="did you mean name="):
+        make(detector="yolox-nano")
+
+
+def test_names_of_policies_and_arguments_of_scenes_are_told():
+    with pytest.raises(AttributeError, match=re.escape("use semfov.policies.policy_names(task)")):
+        _ = semfov.policies.names
+    with pytest.raises(InputError, match="'classes'; expected root, annotations, classes"):
+        semfov.CocoScenes("photographs", "instances.json")
 
 
 @pytest.mark.parametrize(
@@ -195,7 +224,7 @@ def test_the_modules_of_measures_need_no_import_of_their_own(fresh):
 
 def test_remedies_are_read():
     """So that the test above cannot pass because nothing is found in them."""
-    roots = ("semfov", "agent", "record", "objects", "decision", "look", "live", "gaze")
+    roots = ("semfov", "agent", "record", "objects", "decision", "look", "live", "gaze", "belief", "model", "moment")
     named = re.compile(r"`|--[a-z]")
     silent = [remedy for remedy in REMEDIES if not named.search(remedy) and not [*expressions(remedy, roots)]]
     assert len(silent) < 26 < len(REMEDIES) - 50

@@ -24,7 +24,7 @@ class _AnyEvidence(Evidence):
     inner: tuple[Evidence, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class _AnyBelief(Belief):
     """Belief about any of several classes with weights w, P(x) = 1 - Π_k (1 - w_k p_k(x)), whichever is asked for."""
 

@@ -43,7 +43,7 @@ class SearchEvidence(Evidence):
     evidence: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SearchBelief(DirichletBelief):
     """A Dirichlet belief of a search, which goes on only if it has not fixated its target.
 
