@@ -62,7 +62,7 @@ class Detections:
     Attributes:
         boxes: `(..., L, 4)`, `(x1, y1, x2, y2)` in pixels of the detector's input image.
         scores: `(..., L, K+1)`, score vectors that sum to 1; index 0 is background, 1..K are the detector's classes.
-        mask: `(..., L)`, true where a row is a detection and false where it is padding.
+        mask: `(..., L)`, true where a row is a detection and false where it is padding; None takes every row for one.
         confidence: `(..., L)`, the detector's own score of the best class, 0 for padding; None takes the largest score
             of a class from the vectors.
         highest: `(..., K+1)`, the highest score of each class in the whole image, in the vectors of candidates that are
@@ -82,13 +82,16 @@ class Detections:
 
     boxes: Tensor
     scores: Tensor
-    mask: Tensor
+    mask: Tensor = None  # type: ignore[assignment]  # `__post_init__` replaces None
     confidence: Tensor = None  # type: ignore[assignment]  # `__post_init__` replaces None
     highest: Tensor = None  # type: ignore[assignment]  # likewise
 
     def __post_init__(self) -> None:
         check_shape(self.boxes, "boxes", None, 4)
         check_shape(self.scores, "scores", None, None)
+        if self.mask is None:
+            every_row = torch.ones(self.boxes.shape[:-1], dtype=torch.bool, device=self.boxes.device)
+            object.__setattr__(self, "mask", every_row)
         check(self.mask.dtype == torch.bool, "mask", "a boolean tensor", self.mask.dtype)
         lead = self.mask.shape
         have_lead = self.boxes.shape[:-1] == lead and self.scores.shape[:-1] == lead

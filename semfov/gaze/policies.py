@@ -108,8 +108,13 @@ class Policy(nn.Module):
             The acquisition function.
 
         Raises:
-            InputError: the function needs a target or a setting, and has none, or has one of another type.
+            InputError: the function needs a target or a setting, and has none, or has one of another type; or what is
+                given are the arguments of the function that a policy makes.
         """
+        values = "the values of the cells are policy(target, grid)(belief, visited)"
+        check(
+            isinstance(grid, Grid), "grid", "a grid, as a policy is called with a target", f"{type_of(grid)}; {values}"
+        )
         likelihoods = None if self.drawn_looks is None else self.drawn_looks(self.model)
         arguments = self._arguments({"target": target, "model": self.model, "grid": grid, "likelihoods": likelihoods})
         try:
@@ -139,6 +144,8 @@ def _function_class(function: str | type[AcquisitionFunction]) -> type[Acquisiti
         expected = "a class of acquisition functions"
         check(issubclass(function, AcquisitionFunction), "function", expected, function.__name__)
         return function
+    expected = "the name of an acquisition function, or its class, to be made for each target"
+    check(isinstance(function, str), "function", expected, type_of(function))
     # All names, the baselines included, are listed for the message alone.
     return FUNCTIONS[function if function in FUNCTIONS else lookup(function, FUNCTIONS, "policy")]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 
@@ -50,11 +51,15 @@ def read_areas(areas: AreasLike, size: tuple[int, int], names: Sequence[str] = (
     {'logo': (10.0, 20.0, 200.0, 80.0)}
     """
     boxes: Mapping[str, object] = boxes_of(areas)
-    are_by_picture = [isinstance(value, Mapping) for value in boxes.values()]
-    if boxes and all(are_by_picture):
+    if boxes and all(map(_holds_boxes, boxes.values())):
         boxes = _boxes_in_picture(boxes, names)
     check(0 < len(boxes) <= _MOST, "areas", f"1 to {_MOST} areas by name", len(boxes))
     return {name: _checked(name, box, size) for name, box in boxes.items()}
+
+
+def _holds_boxes(value: object) -> bool:
+    """Tell whether a value holds boxes by name, and is not a box whose edges have names."""
+    return isinstance(value, Mapping) and not any(isinstance(edge, Real) for edge in value.values())
 
 
 def _boxes_in_picture(boxes_by_picture: Mapping[str, object], names: Sequence[str]) -> Mapping[str, object]:
@@ -117,7 +122,8 @@ def _checked(name: object, box: object, size: tuple[int, int]) -> Area:
     argument = f"areas[{name!r}]"
     edges = _numbers_of(box)
     if edges is None or len(edges) != 4:
-        raise InputError(f"{argument}: expected four numbers: left, top, right and bottom edge in pixels, got {box}")
+        form = "four numbers: left, top, right and bottom edge in pixels"
+        raise InputError(f"{argument}: expected {form}, got {box} (right = left + width)")
     left, top, right, bottom = edges
     width, height = size
     lies_inside = 0 <= left < right <= width and 0 <= top < bottom <= height

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
-from semfov.errors import check, checked_keywords
+from semfov.errors import check, checked_keywords, type_of
 from semfov.paths.areas import Area, AreasLike, percent, read_areas
 from semfov.paths.gaze import GazePrediction
 
@@ -47,10 +47,18 @@ class Drafts:
         drafts = Drafts(agent.gaze("before.png"), agent.gaze("after.png"))
         drafts.shares({"logo": (10, 20, 200, 80)})["logo"].difference
         drafts.plot()
+
+    Raises:
+        InputError: a draft is no prediction.
     """
 
     first: GazePrediction
     second: GazePrediction
+
+    def __post_init__(self) -> None:
+        for draft, argument in ((self.first, "first"), (self.second, "second")):
+            is_prediction = isinstance(draft, GazePrediction)
+            check(is_prediction, argument, "a prediction, agent.gaze(picture)", type_of(draft))
 
     @property
     def names(self) -> tuple[str, str]:

@@ -227,3 +227,31 @@ def test_bad_input(inner, looks):
         refused(".", Semantic, 3, **options)
     refused("tempering", likelihoods, looks, FIXATIONS, GRID, tempering=0)
     refused("tempering", Semantic(4, tempering=0).weigh, looks, FIXATIONS, GRID)
+
+
+def test_an_observer_is_called_with_a_look_of_each_episode(looks):
+    observer = Semantic(4)
+    belief = observer.start(2, GRID, looks.scores)
+    refused("^belief: .*got a Tensor", observer, looks.scores, looks, FIXATIONS, GRID)
+    refused(
+        r"^detections: .*got a Tensor; .*semfov\.Detections\(boxes, scores\)",
+        observer,
+        belief,
+        looks.scores,
+        FIXATIONS,
+        GRID,
+    )
+    refused("^grid: .*got a tuple", observer, belief, looks, FIXATIONS, (4, 3))
+    refused("^fixation: expected a tensor", observer, belief, looks, (3.0, 4.0), GRID)
+    refused("^fixation: expected one for each of 2 looks, got 1", observer, belief, looks[:2], FIXATIONS[:1], GRID)
+    refused(
+        "^detections: expected a look for each of 3 episodes, got 2",
+        observer,
+        observer.start(3, GRID, looks.scores),
+        looks[:2],
+        FIXATIONS[:2],
+        GRID,
+    )
+    refused(
+        "^detections: expected a look for each of 2 episodes, got 1", observer, belief, looks[:1], FIXATIONS[:1], GRID
+    )

@@ -299,3 +299,12 @@ def test_highest_scores_stay_with_their_images():
     rows = looks[torch.tensor([0, 1]), torch.tensor([0, 3])]
     assert torch.equal(rows.highest, torch.maximum(looks.scores[0, 0], looks.scores[1, 3]))
     refused("highest", replace, looks, highest=seen[:1])
+
+
+def test_without_a_mask_every_row_is_a_detection():
+    of_rows = detections([3, 3])
+    plain = Detections(of_rows.boxes, of_rows.scores)
+    assert plain.count.tolist() == [3, 3]
+    torch.testing.assert_close(plain.confidence, of_rows.confidence)
+    torch.testing.assert_close(plain.highest, of_rows.highest)
+    refused("the same leading dimensions", Detections, of_rows.boxes, of_rows.scores[:1])

@@ -157,7 +157,10 @@ def test_wrong_arguments_of_choices_and_policies_are_refused(model):
         type("Own", (AcquisitionFunction,), own)
     assert "own" not in FUNCTIONS
     refused("^function", Policy, nn.Linear, model)
-    refused("^unknown policy", Policy, 3, model)
+    refused("^function: expected the name of an acquisition function, or its class", Policy, 3, model)
+    refused("^function.*got a TargetPosterior", Policy, acquisition.TargetPosterior(1))
+    visited = torch.zeros(1, CELLS, dtype=torch.bool)
+    refused(r"^grid: .*policy\(target, grid\)\(belief, visited\)", Policy("kl", model), torch.ones(1, 2), visited)
     refused("^samples", Policy, "kl", model, samples=True)
     refused("unknown task 'find'; known: search, exploration", policy_names, "find")
     for name, meant in [("two-peak", "two-peaks"), ("predicitve", "predictive")]:

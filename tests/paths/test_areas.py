@@ -70,6 +70,10 @@ def test_areas_are_read_from_texts_mappings_and_files(tmp_path):
         (":1,2,3,4", "areas: expected areas by name"),
         ("a:1,2,3,4 a:1,2,3,5", "areas: expected a name for each area, got 'a' twice"),
         ("", "areas: expected 1 to 100 areas"),
+        (
+            {"logo": {"x": 6, "y": 4, "width": 16, "height": 12}},
+            r"^areas\['logo'\]: expected four numbers.*left \+ width",
+        ),
         ({"logo": (30, 20, 10, 40)}, r"areas\['logo'\]: expected left < right .*right = left \+ width"),
         ({"logo": (10, 20, 65, 40)}, r"in a picture of 64 × 48 px .*got 10,20,65,40"),
         ({"logo": (float("nan"), 20, 30, 40)}, r"areas\['logo'\]"),

@@ -124,3 +124,8 @@ def test_what_one_draft_alone_has_is_half_transparent_in_the_difference():
     ground, _ = plot_difference(drafts).axes[0].images
     assert ground.get_array().shape == (156, 208, 3)
     assert (ground.get_array().min(), ground.get_array().max()) == pytest.approx((0.5, 0.5), abs=1e-3)
+
+
+def test_drafts_are_predictions():
+    refused(r"^first: expected a prediction, agent\.gaze\(picture\), got a str", Drafts, "a.jpg", "b.jpg")
+    refused("^second: ", Drafts, draft("a.png", 0.4), None)

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from semfov.belief.belief import Belief, DirichletBelief, with_fields
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
-from semfov.errors import InputError
+from semfov.errors import InputError, check, check_shape, type_of
 from semfov.observation.thresholds import Thresholds
 
 _Kind = TypeVar("_Kind")
@@ -196,8 +196,27 @@ class Observer(nn.Module, ABC):
 
         Returns:
             The new belief.
+
+        Raises:
+            InputError: an argument is of another type, or the numbers of episodes, looks and fixations differ.
         """
+        _check_looks(belief, detections, fixation, grid)
         return self.update(belief, self.weigh(detections, fixation, grid, target))
+
+
+def _check_looks(belief: Belief, detections: Detections, fixation: Tensor, grid: Grid) -> None:
+    """Check the types of what an observer is called with, and that there is a look for each episode."""
+    is_belief = isinstance(belief, Belief)
+    check(is_belief, "belief", "a belief, such as observer.start(batch, grid, like)", type_of(belief))
+    are_detections = isinstance(detections, Detections)
+    remedy = "give what a detector or an eye returns, or semfov.Detections(boxes, scores)"
+    check(are_detections, "detections", "detections", f"{type_of(detections)}; {remedy}")
+    check_shape(fixation, "fixation", None, 2)
+    check(isinstance(grid, Grid), "grid", "a grid, such as semfov.Grid(10, 10, (width, height))", type_of(grid))
+    looks = detections.mask.shape[0]
+    check(fixation.shape[0] == looks, "fixation", f"one for each of {looks} looks", fixation.shape[0])
+    episodes = belief.closest.shape[0]
+    check(looks == episodes, "detections", f"a look for each of {episodes} episodes", looks)
 
 
 def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
