@@ -313,6 +313,15 @@ class Detector(StatedModule, ABC):
             f"{self.name}, which has no parameters; an ONNX file keeps the precision of its export",
         )
 
+    def extra_repr(self) -> str:
+        """Write the name, the number of classes and the size of the input.
+
+        Returns:
+            The words for the `repr` of the module.
+        """
+        width, height = self.input_size
+        return f"{self.name!r}, {len(self.classes)} classes, input {width} × {height} px"
+
     def settings(self) -> dict[str, object]:
         """List the settings that the detections depend on, for the keys of caches and the metadata of fitted models.
 

@@ -107,6 +107,10 @@ class OnnxDetector(Detector):
         self._maps: _Maps | None = None
         self._map_session = session
 
+    def extra_repr(self) -> str:
+        """Write the name, the number of classes, the size of the input and the head."""
+        return f"{super().extra_repr()}, head {self.head}"
+
     def propose(self, canvas: Tensor) -> Candidates:
         """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         return self._propose(_checked_floats(canvas), 0.0)

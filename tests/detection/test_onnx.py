@@ -424,3 +424,9 @@ def test_what_wraps_a_model_is_named(make_small):
         (Trained(small), "model"),
     ]:
         refused(rf"detector: expected .*give the YoloV3 in it, which is its \.{inner};", load_detector, wrapper)
+
+
+def test_a_printed_detector_has_its_name_its_input_and_its_head():
+    assert repr(load_detector("yolox-nano")) == (
+        "OnnxDetector('yolox-nano', 80 classes, input 416 × 416 px, head yolox)"
+    )
