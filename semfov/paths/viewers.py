@@ -25,13 +25,14 @@ class AreaVisits(NamedTuple):
 
     Attributes:
         viewers: share of the viewers with at least one fixation in the area.
-        seconds: median of the time at which their first fixation in it begins (time to first fixation); None where
-            nobody sees it. The eyes are in the middle when the picture appears, so an area there is seen at 0.
+        seconds: of these viewers alone, the median of the time at which their first fixation in it begins (time to
+            first fixation); None where nobody sees it. The eyes are in the middle when the picture appears, so an area
+            there is seen at 0.
 
     >>> str(AreaVisits(0.36, 0.84))
-    'seen by 36 % of viewers, first after 0.8 s'
+    'seen by 36 % of viewers, by these first after 0.8 s'
     >>> str(AreaVisits(1.0, 0.0))
-    'seen by 100 % of viewers, first at once'
+    'seen by 100 % of viewers, by these first at once'
     """
 
     viewers: float
@@ -41,7 +42,11 @@ class AreaVisits(NamedTuple):
         """Say both in a few words."""
         if self.seconds is None:
             return "seen by no viewer"
-        return f"seen by {percent(self.viewers)} of viewers, first {self.when}"
+        return f"seen by {percent(self.viewers)} of viewers, by these first {self.when}"
+
+    def __repr__(self) -> str:
+        """Write both in words, so that the time stands beside the share of viewers that it is of."""
+        return f"{type(self).__name__}: {self}"
 
     @property
     def when(self) -> str:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semfov.gaze.saliency import FixationDensity
-from semfov.paths.viewers import drawn_starts
+from semfov.paths.viewers import AreaVisits, drawn_starts
 
 MEAN, SPREAD = (0.45, 0.55), (0.1, 0.08)  # shares of the sides
 SIZE = (640, 480)
@@ -44,3 +44,9 @@ def test_first_fixations_stay_in_pictures_of_any_size(model, size):
     starts = drawn_starts(model, torch.full((1, 1), -1e6), size, 1000, torch.Generator().manual_seed(0))
     assert bool((starts >= -0.5).all())
     assert bool((starts < torch.tensor(size) - 0.5).all())
+
+
+def test_a_time_stands_beside_the_share_of_viewers_that_it_is_of():
+    visits = AreaVisits(0.02, 1.841)
+    assert repr({"logo": visits}) == "{'logo': AreaVisits: seen by 2 % of viewers, by these first after 1.8 s}"
+    assert visits == (0.02, 1.841)
