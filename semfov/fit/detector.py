@@ -30,6 +30,7 @@ from semfov.threads import available_cores
 
 _MOST_FAULTS = 5  # largest number of photographs that a message names
 _MOST_CLASSES = 8  # largest number of classes that a message names
+_PATIENCE = 10  # minutes of a fit from which on the plan names what makes it shorter
 
 _log = logging.getLogger(__name__)
 
@@ -181,9 +182,10 @@ def _print_plan(run: Looking, stages: Mapping[str, Mapping[str, float]]) -> None
     """Print what is to be done, and about how long it takes; stages are seconds by task."""
     minutes = math.ceil(sum(sum(tasks.values()) for tasks in stages.values()) / 60)
     looks = len(run.scenes) * math.prod(run.cells)
+    shorter = "; --data.limit N takes only N photographs, and less time" if minutes > _PATIENCE else ""
     print(
         f"{len(run.scenes)} photographs, {len(run.scenes.classes)} classes: {looks:,} looks and {len(FITS)} fits, "
-        f"about {minutes} minute{'s' if minutes != 1 else ''}",
+        f"about {minutes} minute{'s' if minutes != 1 else ''}{shorter}",
         flush=True,
     )
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from contextvars import ContextVar
 from time import monotonic
-from typing import Any, TypeVar
+from typing import Any, TextIO, TypeVar
 
 from tqdm import tqdm
 
@@ -41,7 +41,7 @@ class WholeBar:
         self._began = monotonic()
         self._tasks = dict[str, float]()
         form = "{desc} {percentage:3.0f} % |{bar}| {elapsed} < {left}{postfix}"
-        self._bar = _Bar(self, total=1.0, desc=title, bar_format=form, dynamic_ncols=True, mininterval=_pause())
+        self._bar = _Bar(self, total=1.0, desc=title, bar_format=form, **_place())
         self._closed = threading.Event()
         threading.Thread(target=self._tick, daemon=True).start()
 
@@ -134,12 +134,35 @@ def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> tq
     bar = _open_bar.get()
     if bar is not None:
         return bar.task(title, total)
-    return tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden, mininterval=_pause())
+    return tqdm(total=total, desc=title, unit=unit, disable=hidden, **_place())
 
 
-def _pause() -> float:
-    """Seconds between two drawings of a bar: in a log, which keeps each of them, there are few."""
-    return 0.1 if sys.stderr.isatty() else _SELDOM
+def _place() -> dict[str, Any]:
+    """Options of a bar for where it is drawn: on a terminal often, and in a log as few lines, as it keeps each."""
+    if sys.stderr.isatty():
+        return {"dynamic_ncols": True, "mininterval": 0.1}
+    return {"file": _LinesOfLog(sys.stderr), "mininterval": _SELDOM}
+
+
+class _LinesOfLog:
+    """A log that has a line for each drawing of a bar, which would return to the beginning of its line otherwise.
+
+    Args:
+        log: the file.
+    """
+
+    def __init__(self, log: TextIO) -> None:
+        self._log = log
+
+    def write(self, text: str) -> None:
+        """Write a drawing as a line; what only moves the cursor is left out."""
+        line = text.strip()
+        if line and line.isprintable():
+            self._log.write(f"{line}\n")
+
+    def flush(self) -> None:
+        """Flush the log."""
+        self._log.flush()
 
 
 def track(items: Iterable[_Item], title: str, unit: str) -> Iterator[_Item]:

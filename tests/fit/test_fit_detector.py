@@ -29,7 +29,7 @@ from semfov.belief import Verification
 from semfov.belief.observers import Semantic, SemanticMap, SemanticSearch
 from semfov.cli.main import main as command
 from semfov.detection.class_names import COCO_CLASSES
-from semfov.fit.detector import _check_photographs, _seconds_of_looks, _with_classes
+from semfov.fit.detector import _check_photographs, _print_plan, _seconds_of_looks, _with_classes
 from semfov.fit.detector_report import Difference
 from semfov.fit.folder import FITS as PART_FITS
 from semfov.fit.folder_report import thin_classes
@@ -552,12 +552,23 @@ def test_a_bar_fills_no_log(capsys):
     for _ in track(range(5), "alone", "unit"):
         time.sleep(0.12)
     alone = capsys.readouterr().err
-    assert alone.count("alone") == 2
-    assert "5/5" in alone
+    first, last = alone.splitlines()
+    assert "\r" not in alone
+    assert first.startswith("alone:")
+    assert "0/5" in first
+    assert "5/5" in last
     with WholeBar("all", {"one": {"a": 1}}) as whole, whole.stage("one"):
         for _ in track(range(5), "a", "unit"):
             time.sleep(0.12)
     assert capsys.readouterr().err.count("all") <= 4  # it opens, its stage begins and ends, and it is done
+
+
+def test_a_long_plan_names_what_makes_it_shorter(capsys):
+    run = SimpleNamespace(scenes=EmbeddedScenes(COCO_CLASSES, count=2), cells=(3, 2))
+    _print_plan(run, {"looking": {"looking": 400.0}, "windows": {"fit": 199.0}})
+    assert capsys.readouterr().out.endswith("about 10 minutes\n")
+    _print_plan(run, {"looking": {"looking": 400.0}, "windows": {"fit": 201.0}})
+    assert "about 11 minutes; --data.limit N takes only N photographs" in capsys.readouterr().out
 
 
 def test_the_time_left_is_that_of_all_work_and_not_of_one_task(monkeypatch, capsys):
