@@ -187,7 +187,9 @@ def _write_numbers(view: Image.Image, film_frame: FilmFrame, scale: float) -> No
     """Write the number of each object in view above its box."""
     draw = ImageDraw.Draw(view)
     font = ImageFont.load_default(11)
-    for number, box, is_in_view in zip(film_frame.numbers, film_frame.boxes.tolist(), film_frame.in_view.tolist(), strict=True):
+    for number, box, is_in_view in zip(
+        film_frame.numbers, film_frame.boxes.tolist(), film_frame.in_view.tolist(), strict=True
+    ):
         if is_in_view:
             x = box[0] * scale
             y = box[1] * scale - 13

@@ -16,8 +16,8 @@ from tqdm import tqdm
 from eval.human.drawn_pictures import KINDS, web_page_with_photograph
 from eval.human.viewing import write_tables
 from semfov.data.inputs import as_image
+from semfov.data.picture_files import picture_files
 from semfov.data.reading import read_image
-from semfov.data.sources import picture_files
 from semfov.detection.load import load_detector
 from semfov.errors import check
 from semfov.gaze.saliency.fixation_density import FixationDensity

@@ -17,7 +17,7 @@ from torch import Tensor
 from semfov.agent import ActivePerception
 from semfov.cli.options import CheckOptions
 from semfov.data.large import open_large
-from semfov.data.sources import picture_files
+from semfov.data.picture_files import picture_files
 from semfov.data.windowed import resized
 from semfov.errors import DataError, check, printable
 from semfov.paths import Record

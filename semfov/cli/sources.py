@@ -18,8 +18,9 @@ from semfov.cli.options import CompareOptions, GazeOptions, PictureOptions, whit
 from semfov.data.examples import example_scene
 from semfov.data.inputs import ImageLike
 from semfov.data.large import open_large, picture_size
+from semfov.data.picture_files import VIDEOS, photographs, picture_files
 from semfov.data.scenes import CLASSES
-from semfov.data.sources import VIDEOS, Picture, photographs, picture_files
+from semfov.data.sources import Picture
 from semfov.data.tone import White
 from semfov.data.windowed import LargePicture
 from semfov.errors import DataError, InputError, SemfovError, check, printable, reason_of

@@ -18,8 +18,8 @@ from semfov.belief.observers import Observer
 from semfov.data import Scenes, class_index
 from semfov.data.large import open_large
 from semfov.data.mosaics import Mosaics
+from semfov.data.picture_files import PHOTOGRAPHS
 from semfov.data.pictures import Pictures
-from semfov.data.sources import PHOTOGRAPHS
 from semfov.detection.objects import SCORE_THRESHOLD
 from semfov.episode import StoredLooks
 from semfov.errors import DataError, InputError, check, check_options, check_whole, type_of

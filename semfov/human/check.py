@@ -12,7 +12,7 @@ from semfov.cli.options import CheckOptions
 from semfov.data.classes import amount
 from semfov.data.fixations import Fixations
 from semfov.data.large import picture_size
-from semfov.data.sources import PHOTOGRAPHS, picture_files
+from semfov.data.picture_files import PHOTOGRAPHS, picture_files
 from semfov.errors import DataError, InputError, SemfovError, check, printable
 from semfov.human.density_check import damage_lines, suspicions_by_content
 from semfov.human.fixations.reading import DATA_SETS, frame_of, read_by, reader_of

@@ -24,7 +24,7 @@ from semfov.cli.options import FindOptions, SearchOptions
 from semfov.cli.search import with_target
 from semfov.cli.sources import picture_sources
 from semfov.cli.truth import Truth
-from semfov.data.sources import picture_files
+from semfov.data.picture_files import picture_files
 from semfov.observation.thresholds import Thresholds
 from tests.colours import write_network
 from tests.refusals import unusable

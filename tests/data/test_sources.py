@@ -18,7 +18,8 @@ from PIL import Image
 import semfov
 from semfov.data import sources
 from semfov.data.images import _FORMATS
-from semfov.data.sources import PHOTOGRAPHS, open_stream, picture_files
+from semfov.data.picture_files import PHOTOGRAPHS, picture_files
+from semfov.data.sources import open_stream
 from semfov.errors import DataError
 from semfov.report.episode import jpeg
 from tests import small
@@ -114,7 +115,8 @@ def test_a_pipe_with_the_name_of_a_picture_is_not_waited_for(tmp_path, fresh):
     os.mkfifo(tmp_path / "b.png")
     code = f"""
 import signal
-from semfov.data.sources import *
+from pathlib import Path
+from semfov.data.picture_files import picture_files
 signal.alarm(60)
 print(len(picture_files(Path({str(tmp_path)!r}), recursive=True)))
 """

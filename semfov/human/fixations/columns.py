@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from semfov.data.sources import PHOTOGRAPHS, VIDEOS
+from semfov.data.picture_files import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, check, check_data, type_of
 from semfov.human.fixations.encodings import read_recording
 from semfov.human.fixations.smi import Events, has_events

@@ -5,7 +5,7 @@ import re
 from bisect import bisect_right
 from typing import NamedTuple
 
-from semfov.data.sources import PHOTOGRAPHS, VIDEOS
+from semfov.data.picture_files import PHOTOGRAPHS, VIDEOS
 from semfov.errors import DataError, check_data
 from semfov.human.fixations.encodings import file_name
 
