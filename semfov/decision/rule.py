@@ -23,7 +23,10 @@ OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 GO_ON, FOUND, ABSENT, UNDECIDED = range(len(OUTCOMES))
 
 MOST_CLOSER = 2
-"""Number of closer looks after which a place is found that is probable enough; by default a search makes no more."""
+"""Number of closer looks after which a place is found that is probable enough.
+
+It is the default for the largest number of closer looks with a fovea; windows have others (`semfov.settings`).
+"""
 
 _NEARLY = 0.9  # share of the largest probability of any cell from which on a fixated cell counts as the target's
 EVEN_CHANCE = 0.5  # presence below which a picture rather lacks the target: without a find it is absent

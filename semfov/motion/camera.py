@@ -6,8 +6,8 @@
 The step is the motion from the key frame to the present frame, with the motion to the last frame taken off. Where the
 present frame fits neither the key frame nor the last one, it becomes the key frame. The key frame before is then kept
 as `_lost` for some frames, and each of them is compared with it, too: `CameraStep.recovered` says where it was found.
-Where only the last frame fits, that one becomes the key frame, and the anchor is the key frame before: it tells whether
-the scene has been exchanged little by little. Invariant: the key frame is not before the anchor.
+Where only the last frame fits, that one becomes the key frame, and the anchor stays the first key frame of the scene: it
+tells whether the scene has been exchanged little by little. Invariant: the key frame is not before the anchor.
 """
 
 from itertools import product

@@ -1,4 +1,4 @@
-"""Closer looks of a search in a large picture: the boxes they are made at, and the windows that show these."""
+"""Closer looks of a search by windows: the places of photographs, and the windows that show a place closely."""
 
 import math
 from functools import cached_property, reduce
