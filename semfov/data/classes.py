@@ -1,4 +1,4 @@
-"""Class names, matched between annotation files, detectors and other tables by spelling, number and synonyms."""
+"""Class names, matched between annotation files, detectors and other tables by spelling and number."""
 
 import re
 from collections.abc import Sequence, Set
@@ -12,7 +12,8 @@ from torch import Tensor
 
 from semfov.errors import InputError, check
 
-# COCO's classes, each with words that people use for it; a word may stand for several classes.
+# COCO's classes, each with words that people use for it. A word is not accepted as a name: the message for an unknown
+# class suggests the classes that it stands for (`_similar_classes`).
 _TABLE = """
 person: man, men, woman, women, boy, girl, child, children, kid, baby, human, pedestrian, face, player, rider
 bicycle: bike, cycle, push bike, mountain bike, tricycle

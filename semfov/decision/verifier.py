@@ -373,7 +373,7 @@ class Verifier(PlaceVerifier[LookType]):
         fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
         prior = self.places.prior
         place = prior.at_place(fitted_place, fitted_presence)
-        # The look that told of the picture before would count twice.
+        # The look that told of the picture before, such as the whole of a photograph, would count twice.
         is_new = not self.places.shows_nothing_new(candidate)
         return Judgement(place, prior(fitted_presence) if is_new else self.places.presence, box)
 

@@ -69,6 +69,8 @@ class _Searches:
 
     def confirming(self, place: float, bounds: Bounds) -> Thresholds:
         """Return the lowest `confirm` with few enough false alarms, for a `place`."""
+        # False alarms never rise with `confirm`, as nothing but a find ends a search here. So a scan from below would
+        # choose the same (`semfov.fit.verification.choose_confirm`).
         confirm = 1.0
         for candidate in _CONFIRMS:
             if self.false_alarms(Thresholds(candidate, 0.0, place)) > bounds.false_alarms:

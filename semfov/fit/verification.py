@@ -307,7 +307,7 @@ def choose_confirm(searches: Sequence[VerifiedSearch], false_alarms: float, sure
         surest: upper limit of the threshold, even if more are found.
 
     Returns:
-        The threshold `confirm`.
+        The threshold `confirm`; `surest` if none has few enough.
     """
     absent = [search for search in searches if not search.present]
     for confirm in _LEVELS:

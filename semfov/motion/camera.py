@@ -6,7 +6,7 @@
 The step is the motion from the key frame to the present frame, with the motion to the last frame taken off. Where the
 present frame fits neither the key frame nor the last one, it becomes the key frame. The key frame before is then kept
 as `_lost` for some frames, and each of them is compared with it, too: `CameraStep.recovered` says where it was found.
-Where only the last frame fits, that one becomes the key frame, and the anchor stays the first key frame of the scene: it
+Where only the last frame fits, that one becomes the key frame. The anchor stays the first key frame of the scene: it
 tells whether the scene has been exchanged little by little. Invariant: the key frame is not before the anchor.
 """
 
@@ -171,7 +171,7 @@ class CameraMotion:
     first frames behind them are doubted.
 
     Args:
-        patience: number of frames for which what was seen before a disturbance is kept.
+        patience: number of frames, from the first disturbed one on, for which what was seen before is kept.
 
     Attributes:
         flow: follows parts of the last frame into the present one that move on their own.

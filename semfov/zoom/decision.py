@@ -314,7 +314,7 @@ def decisions_of(
         thresholds   of presence: its `stop_below` ends searches, and its `confirm` finds where no closer look is made
         places       of places after closer looks: its `confirm` finds. None for no closer looks
 
-    The setting `stop_below` replaces that of presence. The setting `confirm` replaces that of places, and where no
+    Places take the `stop_below` of presence, too, which the setting replaces. The setting `confirm` replaces that of places, and where no
     closer look is made that of presence. In files of models `stop_below` is named `give_up`.
 
     Args:
